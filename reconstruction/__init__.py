@@ -1,0 +1,27 @@
+"""From a video to a simulation-ready scene bundle in the registry.
+
+`reconstruct` is the whole pipeline (see `reconstruction.pipeline`); `PipelineConfig` holds its options. Both are loaded
+on first use, so that importing the package stays light.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from reconstruction.config import PipelineConfig
+    from reconstruction.pipeline import Reconstruction, reconstruct
+
+__all__ = ["PipelineConfig", "Reconstruction", "reconstruct"]
+_HOME = {
+    "PipelineConfig": "reconstruction.config",
+    "Reconstruction": "reconstruction.pipeline",
+    "reconstruct": "reconstruction.pipeline",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name on first use (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'reconstruction' has no attribute {name!r}; it has {', '.join(__all__)}")
+    import importlib
+
+    return getattr(importlib.import_module(_HOME[name]), name)

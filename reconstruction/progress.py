@@ -2,6 +2,8 @@
 
 from typing import Protocol
 
+from reconstruction.profiling import Usage
+
 
 class Progress(Protocol):
     """What a stage may report while it works."""
@@ -16,8 +18,24 @@ class Progress(Protocol):
         """One line worth telling the user: a decision, a fallback, something dropped."""
 
 
+class StageListener(Progress, Protocol):
+    """A progress sink that is also told when stages begin and end."""
+
+    def begin_stage(self, name: str, number: int, total: int, cached: bool) -> None:
+        """A stage begins, or is taken from the cache."""
+
+    def end_stage(self, name: str, usage: Usage | None) -> None:
+        """A stage is done; `usage` is None if it came from the cache."""
+
+
 class NoProgress:
     """Discards everything."""
+
+    def begin_stage(self, name: str, number: int, total: int, cached: bool) -> None:
+        """See `StageListener.begin_stage`."""
+
+    def end_stage(self, name: str, usage: Usage | None) -> None:
+        """See `StageListener.end_stage`."""
 
     def start(self, total: int, label: str) -> None:
         """See `Progress.start`."""

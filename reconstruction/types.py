@@ -121,7 +121,7 @@ class WorldFrame:
     def apply_to(self, posed: PosedFrames) -> PosedFrames:
         """Return the frames with cameras and points in world space, in metres."""
         m = self.world_from_sfm
-        scale, rotation, _ = split_similarity(m)
+        _, rotation, _ = split_similarity(m)
 
         def move(poses: np.ndarray) -> np.ndarray:
             out = poses.copy()
@@ -129,7 +129,6 @@ class WorldFrame:
             out[:, :3, 3] = poses[:, :3, 3] @ m[:3, :3].T + m[:3, 3]
             return out
 
-        del scale
         return replace(
             posed,
             world_from_camera=move(posed.world_from_camera),

@@ -1,0 +1,32 @@
+# make demo   set up, reconstruct the shipped video, and show what came out
+# make test   set up and run the tests (a few minutes); make test-slow runs the long ones
+VENV ?= .venv
+PYTHON_IN_VENV = $(VENV)/bin/python
+
+.PHONY: setup demo test test-slow lint format build clean
+
+setup:
+	@VENV=$(VENV) tools/setup.sh
+
+demo: setup
+	@$(PYTHON_IN_VENV) tools/demo.py
+
+test: setup
+	$(PYTHON_IN_VENV) -m pytest
+
+test-slow: setup
+	$(PYTHON_IN_VENV) -m pytest -m "slow and not gpu"
+
+lint: setup
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+
+format: setup
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+build: setup
+	$(PYTHON_IN_VENV) -m pip wheel --no-deps -w dist .
+
+clean:
+	rm -rf build dist .pytest_cache .ruff_cache

@@ -1,0 +1,169 @@
+"""The stage cache: finished stages are kept under the fingerprint of what went in, and written whole or not at all.
+
+A stage's fingerprint is the SHA-256 over its name, VERSION and source, its config, and the fingerprints of the stages
+before it (the first one has the input's digest). On disk a stage is `<work>/<NN>_<stage>-<fingerprint>/`, written as a
+temporary sibling and renamed when complete, so a killed run leaves nothing that looks finished. Two fingerprints of
+each stage are kept, so going back and forth between two options costs nothing.
+"""
+
+import dataclasses
+import hashlib
+import importlib
+import json
+import logging
+import os
+import shutil
+from pathlib import Path
+from typing import Any, TypeVar
+
+from reconstruction import artifacts
+from registry.errors import EnvironmentMissing
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+KEPT_PER_STAGE = 2
+_MANIFEST = "manifest.json"
+# What several stages compute with; a change there invalidates all of them.
+_SHARED_MODULES = ("reconstruction.types", "reconstruction.artifacts", "reconstruction.rasterize", "registry.geometry")
+
+
+def canonical_json(value: Any) -> str:
+    """Serialise dataclasses and plain values so that equal values give equal text."""
+
+    def default(item: Any) -> Any:
+        if dataclasses.is_dataclass(item) and not isinstance(item, type):
+            return dataclasses.asdict(item)
+        if isinstance(item, Path):
+            return str(item)
+        raise TypeError(f"a config may not hold a {type(item).__name__}")
+
+    return json.dumps(value, sort_keys=True, default=default, separators=(",", ":"), allow_nan=False)
+
+
+def source_digest(module_name: str) -> str:
+    """Digest the Python source of a module or package, so that changed code never reuses old results."""
+    module = importlib.import_module(module_name)
+    root = Path(module.__file__)
+    files = sorted(root.parent.rglob("*.py")) if root.name == "__init__.py" else [root]
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def fingerprint(stage: str, module_name: str, config: Any, upstream: tuple[str, ...]) -> str:
+    """Fingerprint a stage: 16 hex digits over everything that its result depends on."""
+    version = importlib.import_module(module_name).VERSION
+    sources = [source_digest(name) for name in (module_name, *_SHARED_MODULES)]
+    parts = [stage, str(version), *sources, canonical_json(config), *upstream]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def digest_input(path: Path) -> str:
+    """SHA-256 of a video file, or of the names and bytes of the files in a folder of images."""
+    digest = hashlib.sha256()
+    files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.is_file())
+    for file in files:
+        if not path.is_file():
+            digest.update(file.name.encode() + b"\0")
+        with file.open("rb") as stream:
+            for block in iter(lambda: stream.read(1 << 20), b""):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+class StageStore:
+    """Finished stages of one input on disk."""
+
+    def __init__(self, work_dir: Path) -> None:
+        """Open or create the store; leftovers of dead processes are removed."""
+        self.work_dir = work_dir
+        try:
+            work_dir.mkdir(parents=True, exist_ok=True)
+            self._sweep()
+        except OSError as error:
+            raise EnvironmentMissing(
+                f"cannot write to the work folder {work_dir}: {error.strerror or error}. Choose another with --work-dir."
+            ) from error
+
+    def _folder(self, number: int, stage: str, key: str) -> Path:
+        return self.work_dir / f"{number:02d}_{stage}-{key}"
+
+    def has(self, number: int, stage: str, key: str) -> bool:
+        """Tell whether the stage is finished under this fingerprint."""
+        return (self._folder(number, stage, key) / _MANIFEST).is_file()
+
+    def load(self, cls: type[T], number: int, stage: str, key: str) -> T:
+        """Load a finished stage's result and mark it as used."""
+        folder = self._folder(number, stage, key)
+        os.utime(folder)
+        return artifacts.load(cls, folder)
+
+    def manifest(self, number: int, stage: str, key: str) -> dict:
+        """Return what was recorded when the stage finished: time, memory, notes, config."""
+        return json.loads((self._folder(number, stage, key) / _MANIFEST).read_text())
+
+    def scratch(self, stage: str) -> Path:
+        """Make an empty folder for a stage's temporary files; `discard` it when done."""
+        folder = self.work_dir / f"tmp-{os.getpid()}-{stage}-scratch"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return folder
+
+    def discard(self, folder: Path) -> None:
+        """Remove a scratch folder."""
+        shutil.rmtree(folder, ignore_errors=True)
+
+    def save(self, value: Any, number: int, stage: str, key: str, record: dict) -> None:
+        """Write a finished stage atomically, then drop its oldest siblings."""
+        target = self._folder(number, stage, key)
+        partial = self.work_dir / f"tmp-{os.getpid()}-{stage}"
+        shutil.rmtree(partial, ignore_errors=True)
+        try:
+            artifacts.save(value, partial)
+            (partial / _MANIFEST).write_text(canonical_json(record))
+            _sync_folder(partial)
+            if target.exists():  # Another process finished the same work first, or a damaged leftover.
+                shutil.rmtree(target)
+            os.rename(partial, target)
+        except OSError as error:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise EnvironmentMissing(
+                f"{stage}: cannot write its result to {self.work_dir}: {error.strerror or error}. "
+                f"Free some space or choose another disk with --work-dir; finished stages are kept."
+            ) from error
+        self._prune(number, stage, keep=target)
+
+    def _prune(self, number: int, stage: str, keep: Path) -> None:
+        siblings = [p for p in self.work_dir.glob(f"{number:02d}_{stage}-*") if p != keep]
+        siblings.sort(key=lambda p: p.stat().st_mtime, reverse=True)
+        for old in siblings[KEPT_PER_STAGE - 1 :]:
+            shutil.rmtree(old, ignore_errors=True)
+
+    def _sweep(self) -> None:
+        for leftover in self.work_dir.glob("tmp-*"):
+            owner = leftover.name.split("-")[1]
+            if not (owner.isdigit() and _is_alive(int(owner))):
+                logger.info("removing %s, left by a run that ended early", leftover)
+                shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _is_alive(pid: int) -> bool:
+    if pid == os.getpid():
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _sync_folder(folder: Path) -> None:
+    for file in folder.iterdir():
+        descriptor = os.open(file, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

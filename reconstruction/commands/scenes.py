@@ -1,0 +1,135 @@
+"""`simrecon list`, `show`, `verify`, `remove`: what is in the registry."""
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+
+from registry import SceneBundle, SceneRecord, SceneRegistry
+
+
+def add_parsers(verbs: argparse._SubParsersAction) -> None:
+    """Register the verbs."""
+    from reconstruction.cli import add_common
+
+    def add(name: str, text: str, run: object, scene: bool = True) -> argparse.ArgumentParser:
+        parser = verbs.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        if scene:
+            parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
+        add_common(parser)
+        parser.set_defaults(run=run)
+        return parser
+
+    add("list", "list the scenes of the registry", run_list, scene=False)
+    add("show", "show what a scene holds: objects, relations, scale, stability, files", run_show)
+    verify = add("verify", "check every file of a scene against its hash and its schema", run_verify)
+    verify.add_argument("--physics", action="store_true", help="also simulate 10 s and recompute the report card")
+    remove = add("remove", "remove a scene and its files from the registry", run_remove)
+    remove.add_argument("--yes", action="store_true", help="do not ask")
+
+
+def run_list(arguments: argparse.Namespace) -> int:
+    """Print one line a scene."""
+    registry = SceneRegistry(arguments.registry)
+    records = registry.list()
+    if arguments.json:
+        print(json.dumps([_record_json(r) for r in records], indent=2))
+        return 0
+    if not records:
+        print(f"no scenes in {registry.root} yet; make one with: simrecon reconstruct VIDEO")
+        return 0
+    width = max(len(r.scene_id) for r in records)
+    for record in records:
+        stable = record.metrics.get("stable_rate")
+        shown = "" if stable is None else f"  stable {stable:.0%}"
+        print(
+            f"SimRecon/{record.scene_id:<{width}}  {record.n_objects:3d} objects{shown}  "
+            f"{record.created_utc[:16]}  {record.source_file}"
+        )
+    return 0
+
+
+def run_show(arguments: argparse.Namespace) -> int:
+    """Print one scene."""
+    registry = SceneRegistry(arguments.registry)
+    record = registry.get(arguments.scene)
+    bundle = registry.load(arguments.scene)
+    if arguments.json:
+        print(json.dumps({"record": _record_json(record), "scene": bundle.scene}, indent=2))
+    else:
+        print(describe_scene(record, bundle))
+    return 0
+
+
+def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
+    """Say what was found, how sure it is, and where the files are."""
+    scene = bundle.scene
+    names = {b["id"]: b["label"] for b in scene["base"]} | {o["id"]: o["label"] for o in scene["objects"]}
+    parents = {e["child"]: e for e in scene["graph"]["edges"]}
+    lines = [f"{len(scene['objects'])} objects, {len(scene['base'])} base surfaces"]
+    for item in sorted(scene["objects"], key=lambda o: o["id"]):
+        edge = parents.get(item["id"])
+        relation = "" if edge is None else f"{edge['relation'].replace('_', ' ')} {names[edge['parent']]} ({edge['parent']})"
+        size = " x ".join(f"{100 * side:.0f}" for side in item["scale"])
+        kind = "movable" if item["dynamic"] else "fixed"
+        lines.append(
+            f"  {item['id']:3d}  {item['label']:<10} {size + ' cm':<18} {item['mass_kg']:7.2f} kg  {kind:<8}"
+            f"{relation:<32} seen {item['provenance']['observed_fraction']:.0%}"
+        )
+    scale = scene["scale"]
+    lines.append(f"scale: {scale['method']}, sure to {100 * scale['uncertainty']:.0f} % (1 sigma). {scale.get('detail', '')}")
+    physics = scene["report"]["physics"]
+    if "stable_rate" in physics:
+        lines.append(
+            f"physics: {physics['stable_rate']:.0%} of the movable objects stay put for 10 s; deepest overlap "
+            f"{physics['spawn_penetration_mm']:.1f} mm; {physics['floating_rate']:.0%} float"
+        )
+    for note in scene["report"].get("notes", []):
+        lines.append(f"note: {note}")
+    lines.append(f"files: {record.path}")
+    return "\n".join(lines)
+
+
+def run_verify(arguments: argparse.Namespace) -> int:
+    """Verify one scene."""
+    registry = SceneRegistry(arguments.registry)
+    report = registry.verify(arguments.scene)
+    result = asdict(report)
+    if arguments.physics and report.ok:
+        from registry.simulation import physics_report, specs_from_bundle
+
+        result["physics"] = physics_report(specs_from_bundle(registry.load(arguments.scene)))
+    if arguments.json:
+        print(json.dumps(result, indent=2, default=str))
+    else:
+        for problem in report.problems:
+            print(problem)
+        print(f"{arguments.scene}: {'all files are as published' if report.ok else 'damaged; reconstruct it again'}")
+        if "physics" in result:
+            physics = result["physics"]
+            print(
+                f"physics: stable {physics['stable_rate']:.0%}, deepest overlap {physics['spawn_penetration_mm']:.2f} mm, "
+                f"floating {physics['floating_rate']:.0%}"
+            )
+    return 0 if report.ok else 1
+
+
+def run_remove(arguments: argparse.Namespace) -> int:
+    """Remove one scene, after asking where a person is there to answer."""
+    registry = SceneRegistry(arguments.registry)
+    record = registry.get(arguments.scene)
+    if not arguments.yes and sys.stdin.isatty():
+        answer = input(f"remove {record.scene_id} ({record.n_objects} objects, {record.path})? [y/N] ")
+        if answer.strip().lower() not in ("y", "yes"):
+            print("kept")
+            return 0
+    registry.remove(arguments.scene)
+    print(json.dumps({"removed": arguments.scene}) if arguments.json else f"removed {arguments.scene}")
+    return 0
+
+
+def _record_json(record: SceneRecord) -> dict:
+    data = asdict(record)
+    data["path"] = str(record.path)
+    data["env_id"] = f"SimRecon/{record.scene_id}"
+    return data

@@ -1,0 +1,141 @@
+"""The configuration of a whole run: one nested config per stage, and the presets.
+
+Every field can be set from the command line as `--set stage.field=value`; `simrecon reconstruct --list-options`
+prints them all with their meaning.
+"""
+
+import dataclasses
+import inspect
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from reconstruction.assembly import ASSEMBLY_PRESETS, AssemblyConfig
+from reconstruction.assets import ASSETS_PRESETS, AssetsConfig
+from reconstruction.depth import DEPTH_PRESETS, DepthConfig
+from reconstruction.frames import FRAMES_PRESETS, FramesConfig
+from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig
+from reconstruction.poses import POSES_PRESETS, PosesConfig
+from reconstruction.scene_graph import SCENE_GRAPH_PRESETS, SceneGraphConfig
+from reconstruction.surface import SURFACE_PRESETS, SurfaceConfig
+from reconstruction.world import WORLD_PRESETS, WorldConfig
+from registry.errors import UsageError
+
+Preset = Literal["fast", "default", "quality"]
+PRESET_NAMES: tuple[str, ...] = typing.get_args(Preset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineConfig:
+    """Everything that shapes the result of a run."""
+
+    frames: FramesConfig = field(default_factory=FramesConfig)
+    poses: PosesConfig = field(default_factory=PosesConfig)
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    world: WorldConfig = field(default_factory=WorldConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    instances: InstancesConfig = field(default_factory=InstancesConfig)
+    assets: AssetsConfig = field(default_factory=AssetsConfig)
+    scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
+    assembly: AssemblyConfig = field(default_factory=AssemblyConfig)
+
+    @classmethod
+    def from_preset(cls, name: str) -> "PipelineConfig":
+        """Return the preset `fast`, `default` or `quality`."""
+        if name not in PRESET_NAMES:
+            raise UsageError(f"unknown preset {name!r}; there are {', '.join(PRESET_NAMES)}")
+        return cls(
+            frames=FRAMES_PRESETS[name],
+            poses=POSES_PRESETS[name],
+            depth=DEPTH_PRESETS[name],
+            world=WORLD_PRESETS[name],
+            surface=SURFACE_PRESETS[name],
+            instances=INSTANCES_PRESETS[name],
+            assets=ASSETS_PRESETS[name],
+            scene_graph=SCENE_GRAPH_PRESETS[name],
+            assembly=ASSEMBLY_PRESETS[name],
+        )
+
+    def with_seed(self, seed: int) -> "PipelineConfig":
+        """Return the config with `seed` in every stage that draws random numbers."""
+        changed = {}
+        for stage in dataclasses.fields(self):
+            config = getattr(self, stage.name)
+            if any(f.name == "seed" for f in dataclasses.fields(config)):
+                changed[stage.name] = dataclasses.replace(config, seed=seed)
+        return dataclasses.replace(self, **changed)
+
+    def with_option(self, text: str) -> "PipelineConfig":
+        """Return the config with one `stage.field=value` changed.
+
+        Raises:
+            UsageError: the stage or field does not exist, or the value has the wrong type.
+        """
+        path, equals, value = text.partition("=")
+        stage, dot, name = path.strip().partition(".")
+        if not equals or not dot:
+            raise UsageError(f"--set {text}: expected stage.field=value, for example --set depth.side_px=640")
+        stages = [f.name for f in dataclasses.fields(self)]
+        if stage not in stages:
+            raise UsageError(f"--set {text}: no stage {stage!r}; the stages are {', '.join(stages)}")
+        config = getattr(self, stage)
+        hints = typing.get_type_hints(type(config))
+        if name not in hints:
+            raise UsageError(f"--set {text}: {stage} has no option {name!r}; it has {', '.join(sorted(hints))}")
+        try:
+            changed = dataclasses.replace(config, **{name: _parse(hints[name], value.strip())})
+        except (ValueError, TypeError) as error:
+            raise UsageError(f"--set {text}: {error}") from error
+        return dataclasses.replace(self, **{stage: changed})
+
+
+def _parse(hint: Any, text: str) -> Any:
+    """Read a command-line value as the type of a config field."""
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        choices = {str(c): c for c in typing.get_args(hint)}
+        if text not in choices:
+            raise ValueError(f"{text!r} is not one of {', '.join(choices)}")
+        return choices[text]
+    if origin in (typing.Union, types.UnionType):
+        if text.lower() == "none":
+            return None
+        return _parse(next(a for a in typing.get_args(hint) if a is not type(None)), text)
+    if origin is tuple:
+        inner = typing.get_args(hint)[0]
+        return tuple(_parse(inner, part.strip()) for part in text.split(",") if part.strip())
+    if hint is bool:
+        if text.lower() not in ("true", "false"):
+            raise ValueError(f"{text!r} is neither true nor false")
+        return text.lower() == "true"
+    if hint in (int, float, str, Path):
+        return hint(text)
+    raise ValueError(f"options of type {hint} cannot be set from the command line")
+
+
+def describe_options() -> str:
+    """List every option with its default and meaning, for people."""
+    lines = []
+    for stage in dataclasses.fields(PipelineConfig):
+        config = getattr(PipelineConfig(), stage.name)
+        docs = _field_docs(type(config))
+        lines.append(f"{stage.name}:")
+        for item in dataclasses.fields(config):
+            text = " ".join(docs.get(item.name, "").split())
+            lines.append(f"  {stage.name}.{item.name}={getattr(config, item.name)}  {text}")
+    return "\n".join(lines)
+
+
+def _field_docs(cls: type) -> dict[str, str]:
+    """Read the docstrings under a dataclass's fields (Python drops them at run time)."""
+    import ast
+    import textwrap
+
+    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+    docs = {}
+    for node, after in zip(body, body[1:]):
+        if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            docs[node.target.id] = str(after.value.value)
+    return docs

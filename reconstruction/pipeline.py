@@ -1,0 +1,233 @@
+"""From a video to a registered scene: the stages in order, wired, cached and measured. The first file to read.
+
+    frames -> poses -> depth -> world -> surface -> instances -> assets -> scene_graph -> assembly -> publish
+
+Each stage is a function from artifacts to an artifact (`reconstruction.types`) with its own config. Depth comes before
+the world frame because the depth maps' normals are what tells gravity; from `surface` on everything is in metres,
++z up, floor at z = 0. `Run` remembers each stage's result under the fingerprint of what went into it.
+"""
+
+import importlib
+import logging
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from reconstruction.cache import StageStore, digest_input, fingerprint
+from reconstruction.config import PipelineConfig
+from reconstruction.overrides import Overrides
+from reconstruction.profiling import Usage, UsageMeter
+from reconstruction.progress import NO_PROGRESS, Progress, StageListener
+from reconstruction.types import (
+    AssembledScene,
+    AssetSet,
+    DepthMaps,
+    FrameSet,
+    InstanceSet,
+    PosedFrames,
+    SceneGraph,
+    Surface,
+    WorldFrame,
+)
+from registry import SceneRecord, SceneRegistry
+from registry.errors import UsageError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: where its code is, what it makes, and which stages it reads."""
+
+    name: str
+    module: str
+    produces: type
+    needs: tuple[str, ...]
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage("frames", "reconstruction.frames", FrameSet, ()),
+    Stage("poses", "reconstruction.poses", PosedFrames, ("frames",)),
+    Stage("depth", "reconstruction.depth", DepthMaps, ("poses",)),
+    Stage("world", "reconstruction.world", WorldFrame, ("poses", "depth")),
+    Stage("surface", "reconstruction.surface", Surface, ("poses", "depth", "world")),
+    Stage("instances", "reconstruction.instances", InstanceSet, ("poses", "depth", "world", "surface")),
+    Stage("assets", "reconstruction.assets", AssetSet, ("poses", "depth", "world", "surface", "instances")),
+    Stage("scene_graph", "reconstruction.scene_graph", SceneGraph, ("assets",)),
+    Stage("assembly", "reconstruction.assembly", AssembledScene, ("assets", "scene_graph")),
+)
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
+
+
+@dataclass
+class Run:
+    """One reconstruction in progress: results by stage name, with their fingerprints and costs."""
+
+    video: Path
+    config: PipelineConfig
+    store: StageStore
+    overrides: Overrides = field(default_factory=Overrides)
+    listener: StageListener = NO_PROGRESS
+    results: dict[str, Any] = field(default_factory=dict)
+    keys: dict[str, str] = field(default_factory=dict)
+    usage: dict[str, Usage] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Digest the input once."""
+        self.input_digest = digest_input(self.video)
+
+    def execute(self, until: str = STAGE_NAMES[-1]) -> None:
+        """Run or load every stage up to and including `until`."""
+        for number, stage in enumerate(STAGES, start=1):
+            self._execute_stage(number, stage)
+            if stage.name == until:
+                return
+
+    def _execute_stage(self, number: int, stage: Stage) -> None:
+        config = getattr(self.config, stage.name)
+        upstream = tuple(self.keys[name] for name in stage.needs) or (self.input_digest,)
+        key = fingerprint(stage.name, stage.module, (config, self.overrides.of_stage(stage.name)), upstream)
+        self.keys[stage.name] = key
+        cached = self.store.has(number, stage.name, key)
+        self.listener.begin_stage(stage.name, number, len(STAGES), cached)
+        if not cached:
+            notes: list[str] = []
+            with UsageMeter() as meter:
+                result = self._compute(stage, config, _NoteTaker(self.listener, notes))
+            record = {"stage": stage.name, "key": key, "usage": asdict(meter.usage), "notes": notes, "config": config}
+            self.store.save(result, number, stage.name, key, record)
+            del result
+        manifest = self.store.manifest(number, stage.name, key)
+        # Always continue from what is on disk: a resumed run then computes with the very same values.
+        self.results[stage.name] = self.store.load(stage.produces, number, stage.name, key)
+        self.usage[stage.name] = Usage(**manifest["usage"])
+        self.notes.extend(f"{stage.name}: {note}" for note in manifest["notes"])
+        self.listener.end_stage(stage.name, None if cached else self.usage[stage.name])
+
+    def _compute(self, stage: Stage, config: Any, progress: Progress) -> Any:
+        module = importlib.import_module(stage.module)
+        done = self.results
+        if stage.name == "frames":
+            return module.load_frames(self.video, config, progress=progress)
+        if stage.name == "poses":
+            scratch = self.store.scratch(stage.name)
+            try:
+                return module.estimate_poses(done["frames"], config, work_dir=scratch, progress=progress)
+            finally:
+                self.store.discard(scratch)
+        if stage.name == "depth":
+            return module.estimate_depth(done["poses"], config, progress=progress)
+        if stage.name == "world":
+            return module.find_world(done["poses"], done["depth"], config, progress=progress)
+        if stage.name == "scene_graph":
+            graph = module.infer_scene_graph(done["assets"], config, progress=progress)
+            return self.overrides.apply_to_graph(graph, done["assets"])
+        if stage.name == "assembly":
+            return module.assemble(done["assets"], done["scene_graph"], config, progress=progress)
+        posed, depth = self.in_world()
+        if stage.name == "surface":
+            return module.fuse_surface(posed, depth, config, progress=progress)
+        if stage.name == "instances":
+            found = module.find_instances(posed, depth, done["surface"], config, progress=progress)
+            return self.overrides.apply_to_instances(found, done["surface"])
+        assets = module.build_assets(posed, depth, done["surface"], done["instances"], config, progress=progress)
+        return self.overrides.apply_to_assets(assets)
+
+    def in_world(self) -> tuple[PosedFrames, DepthMaps]:
+        """Return the posed frames and depth maps in world space, in metres."""
+        world: WorldFrame = self.results["world"]
+        return world.apply_to(self.results["poses"]), world.scale_depth(self.results["depth"])
+
+
+class _NoteTaker:
+    """Passes progress on and keeps the notes for the stage's manifest."""
+
+    def __init__(self, listener: Progress, notes: list[str]) -> None:
+        self._listener, self._notes = listener, notes
+        self.start, self.advance = listener.start, listener.advance
+
+    def note(self, message: str) -> None:
+        self._notes.append(message)
+        logger.info(message)
+        self._listener.note(message)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What `reconstruct` returns."""
+
+    record: SceneRecord
+    run: Run
+
+    @property
+    def env_id(self) -> str:
+        """The id to give to `gym.make`."""
+        return f"SimRecon/{self.record.scene_id}"
+
+
+def reconstruct(
+    video: Path,
+    *,
+    scene_id: str | None = None,
+    registry_root: Path | None = None,
+    work_dir: Path | None = None,
+    config: PipelineConfig | None = None,
+    overrides: Overrides | None = None,
+    require_stable: bool = False,
+    listener: StageListener = NO_PROGRESS,
+) -> Reconstruction:
+    """Turn a video (or a folder of images) into a registered scene.
+
+    Args:
+        video: any file that ffmpeg decodes, or a folder of images in name order.
+        scene_id: id in the registry, `[a-z0-9_]+`; None takes the next free `sceneNNNN`.
+        registry_root: where scenes live; None is `$SIMRECON_HOME/registry` or `~/.simrecon/registry`.
+        work_dir: where finished stages are kept for resuming; None is a folder beside the registry, named by the
+            input's digest.
+        config: options of every stage.
+        overrides: the user's corrections.
+        require_stable: refuse to publish a scene in which an object does not stay put.
+        listener: told of stages, progress and notes.
+
+    Raises:
+        UsageError: the video does not exist, or the id is malformed.
+        InputError: the video cannot be reconstructed.
+        SceneBusy: another process is reconstructing the same scene into the same registry.
+        EnvironmentMissing: no space, no permission, something not installed.
+    """
+    from reconstruction.publish import publish_scene
+
+    video = Path(video)
+    if not video.exists():
+        raise UsageError(f"{video}: no such file or folder")
+    registry = SceneRegistry(registry_root, create=True)
+    holder = registry.hold(scene_id) if scene_id is not None else registry.reserve_next_id()
+    with holder as held_id:
+        scene_id = scene_id or held_id
+        digest = digest_input(video)
+        folder = Path(work_dir) if work_dir else registry.root.parent / "work" / digest[:16]
+        run = Run(video, config or PipelineConfig(), StageStore(folder), overrides or Overrides(), listener)
+        run.execute()
+        run = _with_object_scale(run)
+        record = publish_scene(run, registry, scene_id, require_stable=require_stable)
+    return Reconstruction(record, run)
+
+
+def _with_object_scale(run: Run) -> Run:
+    """Apply `--scale object:ID.height=H`: its height in the provisional scale gives the factor; then run again."""
+    from reconstruction.world import parse_scale
+
+    request = parse_scale(run.config.world.scale) if run.config.world.scale else None
+    if request is None or request.kind != "object":
+        return run
+    assets: AssetSet = run.results["assets"]
+    found = [item for item in assets.objects if item.id == request.object_id]
+    if not found:
+        ids = ", ".join(f"{item.id} ({item.label})" for item in assets.objects)
+        raise UsageError(f"--scale {run.config.world.scale}: no object {request.object_id}; there are {ids or 'none'}")
+    measured_m = float(found[0].visual.vertices[:, 2].max() - found[0].visual.vertices[:, 2].min())
+    world = replace(run.config.world, object_measured_height_m=measured_m)
+    again = replace(run, config=replace(run.config, world=world), results={}, keys={}, usage={}, notes=[])
+    again.execute()
+    return again

@@ -1,0 +1,221 @@
+"""The last step: write the scene bundle (CONTRACT section 2), look at it once, and publish it in the registry."""
+
+import dataclasses
+import platform
+import shutil
+import subprocess
+import tempfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from reconstruction.assembly import base_slabs
+from reconstruction.assets.gltf import write_glb, write_obj
+from reconstruction.preview import render_preview
+from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
+from registry import SceneRecord, SceneRegistry, seal_bundle
+from registry.errors import EnvironmentMissing, SimReconError
+
+if TYPE_CHECKING:
+    from reconstruction.pipeline import Run
+
+SCHEMA = "simrecon.scene/1"
+_RECORDED_PACKAGES = ("simrecon", "numpy", "pycolmap", "numba", "sapien", "mani-skill", "coacd", "trimesh", "torch")
+
+
+def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require_stable: bool) -> SceneRecord:
+    """Write the bundle of a finished run beside the registry's scenes and publish it atomically.
+
+    Raises:
+        SimReconError: `require_stable` and an object does not stay put.
+        EnvironmentMissing: the registry cannot be written.
+    """
+    report = run.results["assembly"].physics_report
+    unstable = [str(p.id) for p in run.results["assembly"].placed if p.dynamic and not p.stable]
+    if require_stable and unstable:
+        raise SimReconError(
+            f"{scene_id}: not published, because objects {', '.join(unstable)} do not stay put for 10 s "
+            f"(stable rate {report.get('stable_rate', 0):.2f}). Drop or fix them with --overrides, or leave out --require-stable."
+        )
+    try:
+        registry.root.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=f".staging-{scene_id}-", dir=registry.root))
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"cannot write to the registry {registry.root}: {error.strerror or error}. Choose another with --registry."
+        ) from error
+    try:
+        seal_bundle(staging, write_bundle(run, scene_id, staging))
+        return registry.publish(staging, scene_id)
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"{scene_id}: cannot write its bundle to {registry.root}: {error.strerror or error}. "
+            f"The registry is unchanged and finished stages are kept; free some space and run the same command again."
+        ) from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
+    """Write all files of the bundle but scene.json, and return what goes into that."""
+    assets: AssetSet = run.results["assets"]
+    posed, _ = run.in_world()
+    assembled = run.results["assembly"]
+    placed = {item.id: item for item in assembled.placed}
+    attached = {edge.child for edge in assembled.graph.edges if edge.relation == "attached_to"}
+    scene = {
+        "schema": SCHEMA,
+        "id": scene_id,
+        "source": {**dataclasses.asdict(posed.source), "file": Path(posed.source.file).name},
+        "scale": _scale(run.results["world"]),
+        "world": _world(run.results["world"]),
+        "cameras": _cameras(posed),
+        "base": [_base(item, folder) for item in assets.base],
+        "objects": [_object(item, placed[item.id], item.id in attached, folder) for item in assets.objects],
+        "graph": {"edges": [dataclasses.asdict(edge) for edge in assembled.graph.edges]},
+        "report": _report(run),
+    }
+    picture = render_preview(assets, assembled, posed)
+    cv2.imwrite(str(folder / "preview.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    return scene
+
+
+def _scale(world: WorldFrame) -> dict:
+    return {"method": world.scale.method, "uncertainty": world.scale.uncertainty, "detail": world.scale.detail}
+
+
+def _world(world: WorldFrame) -> dict:
+    return {
+        "gravity_method": world.gravity_method,
+        "gravity_sigma_deg": world.gravity_sigma_deg,
+        "floor_observed": world.floor_observed,
+        "yaw_snapped": world.yaw_snapped,
+    }
+
+
+def _cameras(posed: PosedFrames) -> dict:
+    camera = posed.camera
+    indices = np.concatenate([posed.indices, posed.held_out_indices])
+    times = np.concatenate([posed.times_s, posed.held_out_times_s])
+    poses = np.concatenate([posed.world_from_camera, posed.held_out_world_from_camera.reshape(-1, 4, 4)])
+    held_out = np.arange(len(indices)) >= len(posed.indices)
+    frames = [
+        {
+            "index": int(indices[i]),
+            "time_s": float(times[i]),
+            "world_from_camera": poses[i].tolist(),
+            "held_out": bool(held_out[i]),
+        }
+        for i in np.argsort(indices, kind="stable")
+    ]
+    return {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "frames": frames,
+    }
+
+
+def _base(item: BaseAsset, folder: Path) -> dict:
+    (folder / "base").mkdir(exist_ok=True)
+    mesh = f"base/{item.id:03d}_{item.label}.glb"
+    write_glb(item.visual, folder / mesh)
+    collision = []
+    for number, part in enumerate(base_slabs(item)):
+        collision.append(f"base/{item.id:03d}_collision_{number:03d}.obj")
+        write_obj(part, folder / collision[-1])
+    return {
+        "id": item.id,
+        "label": item.label,
+        "mesh": mesh,
+        "plane": [float(x) for x in item.plane],
+        "observed": item.observed,
+        "collision": collision,
+    }
+
+
+def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Path) -> dict:
+    home = Path("objects") / f"{item.id:03d}"
+    (folder / home).mkdir(parents=True)
+    write_glb(item.visual, folder / home / "visual.glb")
+    collision = []
+    for number, part in enumerate(placed.collision or item.collision):
+        collision.append(str(home / f"collision_{number:03d}.obj"))
+        write_obj(part, folder / collision[-1])
+    extents = item.visual.vertices.max(axis=0) - item.visual.vertices.min(axis=0)
+    physics = item.physics
+    return {
+        "id": item.id,
+        "label": item.label,
+        "label_confidence": float(item.label_confidence),
+        "world_from_object": placed.world_from_object.tolist(),
+        "scale": [float(x) for x in extents],
+        "visual": str(home / "visual.glb"),
+        "collision": collision,
+        "material": physics.material,
+        "density_kg_m3": float(physics.density_kg_m3),
+        "mass_kg": float(physics.mass_kg),
+        "center_of_mass": [float(x) for x in physics.center_of_mass],
+        "inertia": [[float(x) for x in row] for row in physics.inertia],
+        "friction": float(physics.friction),
+        "restitution": float(physics.restitution),
+        "dynamic": bool(placed.dynamic),
+        "relation_fixed": attached,
+        "provenance": dataclasses.asdict(item.provenance),
+        "views": [int(x) for x in item.views],
+        "assembly": {
+            "moved_m": float(placed.moved_m),
+            "turned_deg": float(placed.turned_deg),
+            "repair": placed.repair,
+            "stable": bool(placed.stable),
+        },
+    }
+
+
+def _report(run: "Run") -> dict:
+    timings = {name: round(usage.wall_s, 3) for name, usage in run.usage.items()}
+    posed: PosedFrames = run.results["poses"]
+    return {
+        "physics": run.results["assembly"].physics_report,
+        "timings_s": timings,
+        "peak_memory_mb": round(max(usage.peak_memory_mb for usage in run.usage.values()), 1),
+        "volatile": {
+            "cpu_s": {name: round(usage.cpu_s, 3) for name, usage in run.usage.items()},
+            "stage_peak_memory_mb": {name: round(usage.peak_memory_mb, 1) for name, usage in run.usage.items()},
+            "machine": f"{platform.machine()} {platform.system()}",
+            "versions": _versions(),
+            "commit": _commit(),
+        },
+        "backends": {"poses": "pycolmap", "depth": "plane-sweep", "assets": "embedded", "relations": "geometry"},
+        "config": dataclasses.asdict(run.config),
+        "overrides": run.overrides.entries,
+        "notes": run.notes,
+        "registration": {
+            "keyframes": posed.chosen_frames,
+            "registered": len(posed.images),
+            "reprojection_error_px": float(posed.reprojection_error_px),
+        },
+    }
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _RECORDED_PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _commit() -> str:
+    """Return the commit of a source checkout, or an empty string for an installed wheel."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return ""
+    done = subprocess.run(["git", "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    return done.stdout.strip() if done.returncode == 0 else ""
