@@ -1,0 +1,166 @@
+"""The user's corrections (`--overrides FILE`), read once, checked at once, and applied by the stage that they concern.
+
+The file is a YAML list; each entry names an object by `id` (see `simrecon show`), optionally with an anchor
+`near: [x, y, z]` in world metres that must lie within 0.3 m of the object, so that a file made for another run is
+refused instead of applied to the wrong thing. See docs/overrides.md.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from registry.errors import UsageError
+
+if TYPE_CHECKING:
+    from reconstruction.types import AssetSet, InstanceSet, ObjectAsset, SceneGraph, Surface
+
+# What an entry may do, by the stage that does it.
+ACTIONS: dict[str, tuple[str, ...]] = {
+    "instances": ("relabel", "drop", "merge", "split", "make_base"),
+    "assets": ("mass_kg", "material", "friction", "mesh"),
+    "scene_graph": ("parent",),
+}
+_ADDRESS = ("id", "near", "relation")
+ANCHOR_RADIUS_M = 0.3
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """Checked entries of an overrides file."""
+
+    entries: list[dict] = field(default_factory=list)
+    folder: Path = Path()
+
+    @classmethod
+    def load(cls, path: Path) -> "Overrides":
+        """Read and check an overrides file.
+
+        Raises:
+            UsageError: the file is missing or malformed; the message names the entry and what is allowed.
+        """
+        import yaml
+
+        try:
+            entries = yaml.safe_load(Path(path).read_text())
+        except OSError as error:
+            raise UsageError(f"--overrides {path}: {error.strerror or error}") from error
+        except yaml.YAMLError as error:
+            raise UsageError(f"--overrides {path}: not valid YAML: {error}") from error
+        if entries is None:
+            entries = []
+        if not isinstance(entries, list):
+            raise UsageError(f"--overrides {path}: expected a list of entries such as `- {{id: 3, relabel: mug}}`")
+        for number, entry in enumerate(entries, start=1):
+            _check(entry, f"--overrides {path}: entry {number}")
+        return cls(entries, Path(path).resolve().parent)
+
+    def of_stage(self, stage: str) -> list[dict]:
+        """Return the entries that change this stage's result; part of its fingerprint."""
+        actions = ACTIONS.get(stage, ())
+        return [entry for entry in self.entries if any(action in entry for action in actions)]
+
+    def apply_to_instances(self, found: "InstanceSet", surface: "Surface") -> "InstanceSet":
+        """Relabel, drop, merge, split, make base."""
+        entries = self.of_stage("instances")
+        if not entries:
+            return found
+        from reconstruction.instances import apply_overrides
+
+        return apply_overrides(found, surface, entries)
+
+    def apply_to_assets(self, assets: "AssetSet") -> "AssetSet":
+        """Set mass, material or friction, or replace a mesh."""
+        objects = {item.id: item for item in assets.objects}
+        for entry in self.of_stage("assets"):
+            item = _addressed(entry, objects)
+            objects[item.id] = _with_physics(self._with_mesh(item, entry), entry)
+        return replace(assets, objects=tuple(objects[item.id] for item in assets.objects))
+
+    def apply_to_graph(self, graph: "SceneGraph", assets: "AssetSet") -> "SceneGraph":
+        """Give objects other parents; refuses a parent that does not exist or that makes a cycle."""
+        objects = {item.id: item for item in assets.objects}
+        known = set(objects) | {item.id for item in assets.base}
+        edges = {edge.child: edge for edge in graph.edges}
+        for entry in self.of_stage("scene_graph"):
+            item = _addressed(entry, objects)
+            parent = entry["parent"]
+            if parent not in known:
+                raise UsageError(f"overrides: object {item.id} cannot have parent {parent}; ids are {sorted(known)}")
+            relation = entry.get("relation", edges[item.id].relation)
+            edges[item.id] = replace(edges[item.id], parent=parent, relation=relation, confidence=1.0, evidence="user")
+            step, seen = parent, {item.id}
+            while step in edges:
+                if step in seen:
+                    raise UsageError(f"overrides: parent {parent} of object {item.id} would make a cycle")
+                seen.add(step)
+                step = edges[step].parent
+        return replace(graph, edges=tuple(edges[edge.child] for edge in graph.edges))
+
+    def _with_mesh(self, item: "ObjectAsset", entry: dict) -> "ObjectAsset":
+        if "mesh" not in entry:
+            return item
+        from reconstruction.assets.replace import replace_mesh
+
+        return replace_mesh(item, self.folder / entry["mesh"])
+
+
+def _check(entry: Any, where: str) -> None:
+    """Refuse what no stage would understand."""
+    allowed = [action for actions in ACTIONS.values() for action in actions]
+    if not isinstance(entry, dict):
+        raise UsageError(f"{where}: expected a mapping such as {{id: 3, relabel: mug}}, got {entry!r}")
+    unknown = sorted(set(entry) - set(allowed) - set(_ADDRESS))
+    if unknown:
+        raise UsageError(f"{where}: unknown {', '.join(map(repr, unknown))}; an entry may have {', '.join(allowed)}")
+    if not set(entry) & set(allowed):
+        raise UsageError(f"{where}: says nothing to do; use one of {', '.join(allowed)}")
+    if "merge" not in entry and not isinstance(entry.get("id"), int):
+        raise UsageError(f"{where}: needs `id: N`, the object's number in `simrecon show`")
+    for name in ("mass_kg", "friction"):
+        value = entry.get(name)
+        if value is not None and not (isinstance(value, int | float) and 0 < value < 1e5):
+            raise UsageError(f"{where}: {name} must be a positive number, got {value!r}")
+    if entry.get("relation", "supported_by") not in ("supported_by", "attached_to"):
+        raise UsageError(f"{where}: relation must be supported_by or attached_to")
+
+
+def _addressed(entry: dict, objects: dict[int, "ObjectAsset"]) -> "ObjectAsset":
+    item = objects.get(entry["id"])
+    if item is None:
+        raise UsageError(f"overrides: no object {entry['id']}; objects are {sorted(objects)}")
+    if "near" in entry:
+        center = item.world_from_object[:3, 3]
+        if np.linalg.norm(center - np.asarray(entry["near"], float)) > ANCHOR_RADIUS_M + float(np.ptp(item.visual.vertices)):
+            where = ", ".join(f"{x:.2f}" for x in center)
+            raise UsageError(f"overrides: object {item.id} ({item.label}) is at [{where}], not near {entry['near']}")
+    return item
+
+
+def _with_physics(item: "ObjectAsset", entry: dict) -> "ObjectAsset":
+    physics = item.physics
+    if "material" in entry:
+        from reconstruction.assets.materials import MATERIALS
+
+        if entry["material"] not in MATERIALS:
+            raise UsageError(f"overrides: no material {entry['material']!r}; there are {', '.join(sorted(MATERIALS))}")
+        chosen = MATERIALS[entry["material"]]
+        factor = chosen.density_kg_m3 / physics.density_kg_m3
+        physics = replace(
+            physics,
+            material=entry["material"],
+            density_kg_m3=chosen.density_kg_m3,
+            friction=chosen.friction,
+            restitution=chosen.restitution,
+            mass_kg=physics.mass_kg * factor,
+            inertia=physics.inertia * factor,
+        )
+    if "mass_kg" in entry:
+        factor = entry["mass_kg"] / physics.mass_kg
+        physics = replace(physics, mass_kg=float(entry["mass_kg"]), inertia=physics.inertia * factor)
+    if "friction" in entry:
+        physics = replace(physics, friction=float(entry["friction"]))
+    if physics is item.physics:
+        return item
+    return replace(item, physics=physics, provenance=replace(item.provenance, physics="user"))

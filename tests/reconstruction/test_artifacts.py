@@ -1,0 +1,56 @@
+"""Artifacts survive a round trip bit for bit."""
+
+import numpy as np
+import pytest
+
+from reconstruction import artifacts
+from reconstruction.types import AssembledScene, DepthMaps, Camera, Edge, PlacedObject, SceneGraph, Surface, SpaceGrid
+
+
+def _assembled() -> AssembledScene:
+    rng = np.random.default_rng(3)
+    placed = tuple(
+        PlacedObject(
+            id=i, world_from_object=rng.normal(size=(4, 4)), dynamic=bool(i % 2), moved_m=0.1 * i, turned_deg=0.0,
+            repair="", stable=True,
+        )
+        for i in range(3)
+    )  # fmt: skip
+    graph = SceneGraph(edges=(Edge(1, "supported_by", 0, 0.5, "contact"),))
+    return AssembledScene(placed=placed, graph=graph, physics_report={"stable_rate": 1.0, "objects": {"1": [1, 2.5]}})
+
+
+def test_nested_dataclasses_round_trip(tmp_path):
+    value = _assembled()
+    artifacts.save(value, tmp_path / "a")
+    again = artifacts.load(AssembledScene, tmp_path / "a")
+    assert again.graph == value.graph
+    assert again.physics_report == value.physics_report
+    for left, right in zip(value.placed, again.placed, strict=True):
+        assert np.array_equal(left.world_from_object, right.world_from_object)
+        assert left.dynamic is right.dynamic
+        assert left.moved_m == right.moved_m
+
+
+def test_arrays_keep_dtype_shape_and_bits(tmp_path):
+    rng = np.random.default_rng(0)
+    value = DepthMaps(
+        camera=Camera(320, 240, 300.5, 301.5, 160, 120),
+        depth=rng.random((20, 240, 320), dtype=np.float32),
+        confidence=rng.integers(0, 3, (20, 240, 320), dtype=np.uint8),
+    )
+    artifacts.save(value, tmp_path / "d")
+    again = artifacts.load(DepthMaps, tmp_path / "d")
+    assert again.camera == value.camera
+    assert again.depth.dtype == np.float32
+    assert np.array_equal(again.depth, value.depth)
+    assert np.array_equal(again.confidence, value.confidence)
+    assert isinstance(again.depth, np.memmap), "a large array must not be read whole"
+
+
+def test_non_finite_plain_numbers_are_refused(tmp_path):
+    grid = SpaceGrid(np.zeros(3), float("nan"), np.zeros((1, 1, 1), np.uint8))
+    empty = np.zeros((0, 3), np.float32)
+    surface = Surface(empty, np.zeros((0, 3), np.int32), empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), 0.01, grid)
+    with pytest.raises(ValueError, match="JSON"):
+        artifacts.save(surface, tmp_path / "s")
