@@ -1,0 +1,378 @@
+"""A scene bundle on disk: sealing one that we made, opening one that anybody made.
+
+A bundle is a folder: `scene.json`, `manifest.json` (SHA-256 and size of every other file, and the revision)
+and the mesh files. Opening trusts nothing: schema, ranges, sizes, hashes and paths are checked; nothing is
+pickled.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import stat
+import weakref
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from registry.errors import BundleError
+from registry.locks import lease_folder
+from registry.meshfiles import check_mesh_file
+from registry.schema import check_relative_path, referenced_files, validate_scene
+
+MANIFEST_FORMAT = "simrecon.manifest/1"
+MAX_FILE_BYTES = 256 << 20
+MAX_TOTAL_BYTES = 4 << 30
+MAX_SCENE_JSON_BYTES = 64 << 20
+MAX_FILES = 20_000
+MAX_DEPTH = 8
+_VOLATILE_REPORT_KEYS = ("timings_s", "peak_memory_mb", "volatile")
+
+
+@dataclass(frozen=True)
+class BundleCameras:
+    """The cameras of the video, OpenCV axes."""
+
+    model: str  # "PINHOLE" | "OPENCV"
+    width: int
+    height: int
+    params: np.ndarray  # float64: fx, fy, cx, cy (then k1, k2, p1, p2)
+    indices: np.ndarray  # int32 (n,) decoded video frame numbers
+    times_s: np.ndarray  # float64 (n,)
+    world_from_camera: np.ndarray  # float64 (n, 4, 4)
+
+
+@dataclass(frozen=True)
+class BundleBase:
+    """A floor, wall or ceiling. Its meshes are in world space."""
+
+    id: int
+    label: str
+    mesh: str  # path in the bundle
+    collision: tuple[str, ...]  # paths in the bundle; may be empty
+    plane: np.ndarray  # float64 (4,) n . x + d = 0, n into the room
+    observed: bool
+
+
+@dataclass(frozen=True)
+class BundleObject:
+    """One placed object. Its meshes are in object space (+z up, metres)."""
+
+    id: int
+    label: str
+    label_confidence: float
+    world_from_object: np.ndarray  # float64 (4, 4) rigid
+    scale: np.ndarray  # float64 (3,) extents of its box, metres
+    visual: str  # path in the bundle
+    collision: tuple[str, ...]  # paths in the bundle
+    material: str
+    density_kg_m3: float
+    mass_kg: float
+    center_of_mass: np.ndarray  # float64 (3,) object space
+    inertia: (
+        np.ndarray | None
+    )  # float64 (3, 3) about the centre of mass, object axes; None where the bundle has none
+    friction: float
+    restitution: float
+    dynamic: bool
+    relation_fixed: bool  # attached to its parent rather than resting on it
+    provenance: dict
+    views: tuple  # video frame numbers, best first
+
+
+@dataclass(frozen=True)
+class BundleEdge:
+    """(child, relation, parent) of the scene graph."""
+
+    child: int
+    relation: str  # "supported_by" | "attached_to"
+    parent: int
+    confidence: float
+    evidence: Any
+
+
+class SceneBundle:
+    """One revision of one scene, read only. Make it with `SceneBundle.open`.
+
+    While it lives it holds a shared lock on its folder, so that publishing a newer revision does not remove
+    the files under its feet.
+    """
+
+    def __init__(self, root: Path, scene: dict, revision: str, files: dict[str, tuple[str, int]]) -> None:
+        self.root = root
+        self.scene = scene
+        self.revision = revision
+        self.files = files  # {path: (sha256, bytes)} of everything but manifest.json
+
+    @classmethod
+    def open(cls, folder: Path, check_hashes: bool = True) -> "SceneBundle":
+        """Open a bundle that anybody may have made.
+
+        Args:
+            folder: The bundle's folder.
+            check_hashes: Also read every file and compare its SHA-256. Without it the schema, the list of
+                files, their sizes and the hash of scene.json are still checked.
+
+        Raises:
+            BundleError: it is malformed, unsafe or damaged.
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise BundleError(f"bundle {folder}: no such folder")
+        lease = None
+        try:
+            lease = lease_folder(folder)
+            bundle = cls(folder, *_read(folder, check_hashes))
+        except BaseException as error:
+            if lease is not None:
+                os.close(lease)
+            if isinstance(error, OSError):
+                raise BundleError(f"bundle {folder}: cannot be read ({error})") from error
+            raise
+        if lease is not None:
+            weakref.finalize(bundle, os.close, lease)
+        return bundle
+
+    def resolve(self, path: str) -> Path:
+        """Return where a file of the bundle lies; never outside the folder.
+
+        Raises:
+            BundleError: the path is unsafe, is not in the manifest, or leads through a symbolic link.
+        """
+        check_relative_path(path, f"bundle {self.root}")
+        if path not in self.files:
+            raise BundleError(f"bundle {self.root}: {path!r} is not in its manifest")
+        place = self.root
+        for part in path.split("/"):
+            place = place / part
+            if place.is_symlink():
+                raise BundleError(f"bundle {self.root}: {path!r} leads through a symbolic link")
+        return place
+
+    @cached_property
+    def cameras(self) -> BundleCameras:
+        """The cameras of the video."""
+        c, frames = self.scene["cameras"], self.scene["cameras"]["frames"]
+        return BundleCameras(
+            model=c["model"],
+            width=c["width"],
+            height=c["height"],
+            params=np.array(c["params"], np.float64),
+            indices=np.array([f["index"] for f in frames], np.int32),
+            times_s=np.array([f["time_s"] for f in frames], np.float64),
+            world_from_camera=np.array([f["world_from_camera"] for f in frames], np.float64).reshape(
+                -1, 4, 4
+            ),
+        )
+
+    @cached_property
+    def base(self) -> tuple[BundleBase, ...]:
+        """Floor, walls, ceiling."""
+        return tuple(
+            BundleBase(
+                id=b["id"],
+                label=b["label"],
+                mesh=b["mesh"],
+                collision=tuple(b.get("collision", ())),
+                plane=np.array(b["plane"], np.float64),
+                observed=b["observed"],
+            )
+            for b in self.scene["base"]
+        )
+
+    @cached_property
+    def objects(self) -> tuple[BundleObject, ...]:
+        """The placed objects."""
+        arrays = ("world_from_object", "scale", "center_of_mass")
+        plain = ("id", "label", "label_confidence", "visual", "material", "density_kg_m3", "mass_kg")
+        plain += ("friction", "restitution", "dynamic", "provenance")
+        return tuple(
+            BundleObject(
+                **{key: np.array(o[key], np.float64) for key in arrays},
+                **{key: o[key] for key in plain},
+                collision=tuple(o["collision"]),
+                inertia=np.array(o["inertia"], np.float64) if "inertia" in o else None,
+                relation_fixed=o.get("relation_fixed", False),
+                views=tuple(o["views"]),
+            )
+            for o in self.scene["objects"]
+        )
+
+    @cached_property
+    def edges(self) -> tuple[BundleEdge, ...]:
+        """The scene graph."""
+        keys = ("child", "relation", "parent", "confidence", "evidence")
+        return tuple(BundleEdge(**{key: e[key] for key in keys}) for e in self.scene["graph"]["edges"])
+
+
+def seal_bundle(folder: Path, scene: dict) -> str:
+    """Write scene.json and manifest.json beside the mesh files that lie in `folder`; return the revision.
+
+    Raises:
+        BundleError: the scene is not valid, names a file that is not there, or the folder breaks a limit.
+    """
+    folder = Path(folder)
+    try:
+        text = json.dumps(scene, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+    except (TypeError, ValueError) as error:
+        raise BundleError(f"scene.json: only finite JSON values can be written ({error})") from error
+    scene = _parse(text.encode(), "scene.json")
+    validate_scene(scene)
+    (folder / "scene.json").write_text(text + "\n", encoding="utf-8")
+    with contextlib.suppress(FileNotFoundError):
+        (folder / "manifest.json").unlink()
+    sizes = _list_files(folder)
+    _check_references(scene, sizes)
+    for name in sizes:
+        check_mesh_file(folder / name, name)
+    files = {name: (hash_file(folder / name), size) for name, size in sizes.items()}
+    revision = content_revision(scene, files)
+    listed = {name: {"sha256": digest, "bytes": size} for name, (digest, size) in files.items()}
+    manifest = {"format": MANIFEST_FORMAT, "revision": revision, "files": listed}
+    (folder / "manifest.json").write_text(
+        json.dumps(manifest, indent=1, sort_keys=True) + "\n", encoding="utf-8"
+    )
+    return revision
+
+
+def content_revision(scene: dict, files: dict[str, tuple[str, int]]) -> str:
+    """Return the content address: the same reconstruction gives the same one, whatever it is called and took.
+
+    Left out are the id (a name, not content) and what differs between two equal runs (timings, memory,
+    `report.volatile`).
+    """
+    report = {key: value for key, value in scene["report"].items() if key not in _VOLATILE_REPORT_KEYS}
+    kept = {**{key: value for key, value in scene.items() if key != "id"}, "report": report}
+    hashes = {name: digest for name, (digest, _) in files.items() if name != "scene.json"}
+    text = json.dumps(
+        {"files": hashes, "scene": kept}, sort_keys=True, separators=(",", ":"), allow_nan=False
+    )
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _read(folder: Path, check_hashes: bool) -> tuple[dict, str, dict[str, tuple[str, int]]]:
+    sizes = _list_files(folder)
+    for required in ("scene.json", "manifest.json"):
+        if required not in sizes:
+            raise BundleError(f"bundle {folder}: {required} is missing")
+        if sizes[required] > MAX_SCENE_JSON_BYTES:
+            raise BundleError(f"bundle {folder}: {required} has {sizes[required]} bytes, more than 64 MiB")
+    claimed_revision, files = _manifest(folder, sizes)
+    data = (folder / "scene.json").read_bytes()
+    if hashlib.sha256(data).hexdigest() != files["scene.json"][0]:
+        raise BundleError(f"bundle {folder}: scene.json does not match its SHA-256 in the manifest")
+    try:
+        scene = _parse(data, "scene.json")
+        validate_scene(scene)
+        _check_references(scene, sizes)
+        if content_revision(scene, files) != claimed_revision:
+            raise BundleError(f"manifest.json: revision {claimed_revision} is not that of the content")
+        for name, (digest, _) in files.items() if check_hashes else ():
+            if name != "scene.json" and hash_file(folder / name) != digest:
+                raise BundleError(f"{name}: does not match its SHA-256 in the manifest")
+            check_mesh_file(folder / name, name)
+    except BundleError as error:
+        raise BundleError(f"bundle {folder}: {error}") from error
+    return scene, claimed_revision, files
+
+
+def _manifest(folder: Path, sizes: dict[str, int]) -> tuple[str, dict[str, tuple[str, int]]]:
+    manifest = _parse((folder / "manifest.json").read_bytes(), f"bundle {folder}: manifest.json")
+    listed = manifest.get("files") if isinstance(manifest, dict) else None
+    if not isinstance(listed, dict) or manifest.get("format") != MANIFEST_FORMAT:
+        raise BundleError(f"bundle {folder}: manifest.json is not a {MANIFEST_FORMAT} file")
+    files = {}
+    for name, entry in listed.items():
+        digest = entry.get("sha256") if isinstance(entry, dict) else None
+        size = entry.get("bytes") if isinstance(entry, dict) else None
+        if not isinstance(digest, str) or not isinstance(size, int):
+            raise BundleError(f"bundle {folder}: manifest.json: files[{name!r}]: expected sha256 and bytes")
+        if name not in sizes:
+            raise BundleError(f"bundle {folder}: {name!r} is in the manifest but not in the folder")
+        if sizes[name] != size:
+            raise BundleError(f"bundle {folder}: {name} has {sizes[name]} bytes, the manifest says {size}")
+        files[name] = (digest, size)
+    extra = sorted(sizes.keys() - files.keys() - {"manifest.json"})
+    if extra:
+        raise BundleError(f"bundle {folder}: {extra[0]!r} is not in the manifest")
+    return str(manifest.get("revision")), files
+
+
+def _check_references(scene: dict, sizes: dict[str, int]) -> None:
+    for name, place in referenced_files(scene).items():
+        if name not in sizes:
+            raise BundleError(f"{place}: {name} is not in the bundle")
+
+
+def _list_files(folder: Path) -> dict[str, int]:
+    """Return {relative path: bytes} of all files; refuse what breaks a limit or is not a plain file."""
+    sizes: dict[str, int] = {}
+    entries_seen = 0
+    pending = [("", 0)]
+    while pending:
+        prefix, depth = pending.pop()
+        if depth > MAX_DEPTH:
+            raise BundleError(f"bundle {folder}: folders are nested more than {MAX_DEPTH} deep")
+        with os.scandir(folder / prefix) as entries:
+            for entry in entries:
+                name = prefix + entry.name
+                check_relative_path(name, f"bundle {folder}")
+                entries_seen += 1
+                if entries_seen > MAX_FILES:
+                    raise BundleError(f"bundle {folder}: more than {MAX_FILES} files and folders")
+                info = entry.stat(follow_symlinks=False)
+                if stat.S_ISDIR(info.st_mode):
+                    pending.append((name + "/", depth + 1))
+                    continue
+                if not stat.S_ISREG(info.st_mode):
+                    kind = "a symbolic link" if stat.S_ISLNK(info.st_mode) else "not a plain file"
+                    raise BundleError(f"bundle {folder}: {name} is {kind}")
+                if info.st_size > MAX_FILE_BYTES:
+                    raise BundleError(f"bundle {folder}: {name} has {info.st_size} bytes, more than 256 MiB")
+                sizes[name] = info.st_size
+    if sum(sizes.values()) > MAX_TOTAL_BYTES:
+        raise BundleError(f"bundle {folder}: {sum(sizes.values())} bytes in all, more than 4 GiB")
+    return dict(sorted(sizes.items()))
+
+
+def _parse(data: bytes, where: str) -> Any:
+    """Parse strict JSON: UTF-8, no NaN or infinity, no key twice, bounded nesting."""
+
+    def constant(name: str) -> None:
+        raise BundleError(f"{where}: {name} is not strict JSON")
+
+    def number(text: str) -> float:
+        value = float(text)
+        if value in (float("inf"), float("-inf")):
+            raise BundleError(f"{where}: {text} is not a finite number")
+        return value
+
+    def pairs(items: list[tuple[str, Any]]) -> dict:
+        found = dict(items)
+        if len(found) != len(items):
+            raise BundleError(
+                f"{where}: a key appears twice in one object ({sorted(k for k, _ in items)[:8]})"
+            )
+        return found
+
+    try:
+        text = data.decode("utf-8")
+        return json.loads(text, parse_constant=constant, parse_float=number, object_pairs_hook=pairs)
+    except BundleError:
+        raise
+    except RecursionError as error:
+        raise BundleError(f"{where}: nested too deeply") from error
+    except ValueError as error:
+        raise BundleError(f"{where}: not JSON ({error})") from error

@@ -1,0 +1,356 @@
+"""What a scene.json must look like (docs/bundle_format.md, CONTRACT section 2), checked by hand.
+
+Every message names the place: `objects[3].mass_kg: expected a positive number, got -1`. Unknown extra keys
+are allowed, so that an older reader opens what a newer writer of the same major version wrote.
+"""
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+
+from registry.errors import BundleError, UsageError
+
+SCHEMA = "simrecon.scene/1"
+_SCHEMA_PATTERN = re.compile(r"simrecon\.scene/(\d+)(\.\d+)?")
+_SCENE_ID = re.compile(r"[a-z0-9_]{1,64}")
+_RELATIONS = ("supported_by", "attached_to")
+_BASE_LABELS = ("floor", "wall", "ceiling")
+_RIGID_TOLERANCE = 1e-4
+_MAX_METRES = 1e4
+_MAX_PATH_CHARACTERS = 240
+
+
+def check_scene_id(scene_id: str) -> str:
+    """Return the id, or raise UsageError with one that would do."""
+    if isinstance(scene_id, str) and _SCENE_ID.fullmatch(scene_id):
+        return scene_id
+    suggestion = re.sub(r"[^a-z0-9]+", "_", str(scene_id).lower()).strip("_")[:64] or "scene0001"
+    raise UsageError(
+        f"scene id {scene_id!r}: use 1 to 64 small letters, digits and underscores, such as {suggestion!r}"
+    )
+
+
+def check_relative_path(path: Any, where: str) -> str:
+    """Return a path inside the bundle, or raise: no way out of the folder on any operating system."""
+    if not isinstance(path, str) or not path or len(path) > _MAX_PATH_CHARACTERS:
+        raise BundleError(
+            f"{where}: expected a relative path of 1 to {_MAX_PATH_CHARACTERS} characters, got {_show(path)}"
+        )
+    unsafe = "\\" in path or ":" in path or any(ord(c) < 32 or ord(c) == 127 for c in path)
+    if unsafe or path.startswith(("/", "~")) or any(part in ("", ".", "..") for part in path.split("/")):
+        raise BundleError(f"{where}: {_show(path)} is not a plain relative path inside the bundle")
+    return path
+
+
+def validate_scene(scene: Any) -> None:
+    """Check a parsed scene.json.
+
+    Raises:
+        BundleError: names the first place that is wrong, what was expected and what is there.
+    """
+    _mapping(scene, "scene.json")
+    _schema_version(scene)
+    if not isinstance(scene.get("id"), str) or not _SCENE_ID.fullmatch(scene["id"]):
+        _fail("id", "a scene id of small letters, digits and underscores", scene.get("id"))
+    _source(_mapping(_get(scene, "source", ""), "source"))
+    _scale(_mapping(_get(scene, "scale", ""), "scale"))
+    _cameras(_mapping(_get(scene, "cameras", ""), "cameras"))
+    base_ids = _base(_sequence(_get(scene, "base", ""), "base"))
+    object_ids = _objects(_sequence(_get(scene, "objects", ""), "objects"), base_ids)
+    graph = _mapping(_get(scene, "graph", ""), "graph")
+    _edges(_sequence(_get(graph, "edges", "graph"), "graph.edges"), base_ids, object_ids)
+    _report(_mapping(_get(scene, "report", ""), "report"))
+
+
+def referenced_files(scene: dict) -> dict[str, str]:
+    """Return {path: JSON place} of every file that a valid scene names."""
+    found = {}
+    for i, item in enumerate(scene["base"]):
+        found[item["mesh"]] = f"base[{i}].mesh"
+        found.update({path: f"base[{i}].collision[{k}]" for k, path in enumerate(item.get("collision", []))})
+    for i, item in enumerate(scene["objects"]):
+        found[item["visual"]] = f"objects[{i}].visual"
+        found.update({path: f"objects[{i}].collision[{k}]" for k, path in enumerate(item["collision"])})
+    return found
+
+
+def _schema_version(scene: dict) -> None:
+    schema = scene.get("schema")
+    match = _SCHEMA_PATTERN.fullmatch(schema) if isinstance(schema, str) else None
+    if match is None:
+        _fail("schema", f'"{SCHEMA}"', schema)
+    if match.group(1) != "1":
+        raise BundleError(
+            f"schema: this bundle is {schema}, this simrecon reads {SCHEMA}; "
+            "upgrade with `pip install -U simrecon`"
+        )
+
+
+def _source(source: dict) -> None:
+    _text(source, "file", "source")
+    if not isinstance(source.get("sha256"), str) or not re.fullmatch(r"[0-9a-f]{64}", source["sha256"]):
+        _fail("source.sha256", "64 hexadecimal digits", source.get("sha256"))
+    for key in ("width", "height", "frame_count"):
+        _integer(source, key, "source", low=1)
+    for key in ("fps", "duration_s"):
+        _number(source, key, "source", low=0)
+
+
+def _scale(scale: dict) -> None:
+    method = _text(scale, "method", "scale")
+    if method == "unknown" and scale.get("uncertainty", 0) is None:
+        return
+    _number(scale, "uncertainty", "scale", low=0)
+
+
+def _cameras(cameras: dict) -> None:
+    model = cameras.get("model")
+    if model not in ("PINHOLE", "OPENCV"):
+        _fail("cameras.model", '"PINHOLE" or "OPENCV"', model)
+    for key in ("width", "height"):
+        _integer(cameras, key, "cameras", low=1)
+    count = (4,) if model == "PINHOLE" else (8,)
+    params = _vector(cameras, "params", "cameras", count)
+    if params[0] <= 0 or params[1] <= 0:
+        _fail("cameras.params", "positive focal lengths in the first two places", cameras["params"])
+    seen: set[int] = set()
+    for i, frame in enumerate(_sequence(_get(cameras, "frames", "cameras"), "cameras.frames")):
+        where = f"cameras.frames[{i}]"
+        _mapping(frame, where)
+        _unique(_integer(frame, "index", where, low=0), seen, f"{where}.index")
+        _number(frame, "time_s", where, low=0)
+        _transform(frame, "world_from_camera", where)
+
+
+def _base(items: list) -> set[int]:
+    seen: set[int] = set()
+    for i, item in enumerate(items):
+        where = f"base[{i}]"
+        _mapping(item, where)
+        _unique(_integer(item, "id", where, low=1), seen, f"{where}.id")
+        if item.get("label") not in _BASE_LABELS:
+            _fail(f"{where}.label", " or ".join(f'"{x}"' for x in _BASE_LABELS), item.get("label"))
+        _path(item, "mesh", where, ".glb")
+        plane = _vector(item, "plane", where, (4,))
+        if abs(np.linalg.norm(plane[:3]) - 1) > 1e-3:
+            _fail(f"{where}.plane", "a unit normal in the first three places", item["plane"])
+        _boolean(item, "observed", where)
+        if "collision" in item:
+            _paths(item, "collision", where, ".obj")
+    return seen
+
+
+def _objects(items: list, base_ids: set[int]) -> set[int]:
+    seen = set(base_ids)
+    for i, item in enumerate(items):
+        where = f"objects[{i}]"
+        _mapping(item, where)
+        _unique(_integer(item, "id", where, low=1), seen, f"{where}.id")
+        _text(item, "label", where)
+        _number(item, "label_confidence", where, low=0, high=1)
+        _transform(item, "world_from_object", where)
+        if min(_vector(item, "scale", where, (3,), high=_MAX_METRES)) <= 0:
+            _fail(f"{where}.scale", "three positive extents in metres", item["scale"])
+        _path(item, "visual", where, ".glb")
+        dynamic = _boolean(item, "dynamic", where)
+        if not _paths(item, "collision", where, ".obj") and dynamic:
+            _fail(f"{where}.collision", "at least one convex part, because the object is dynamic", [])
+        _physics(item, where)
+        provenance = _mapping(_get(item, "provenance", where), f"{where}.provenance")
+        for key in ("geometry", "appearance", "physics"):
+            _text(provenance, key, f"{where}.provenance")
+        _number(provenance, "observed_fraction", f"{where}.provenance", low=0, high=1)
+        _sequence(_get(item, "views", where), f"{where}.views")
+    return seen - base_ids
+
+
+def _physics(item: dict, where: str) -> None:
+    _text(item, "material", where)
+    for key in ("density_kg_m3", "mass_kg"):
+        _number(item, key, where, low=0, high=1e7, positive=True)
+    _vector(item, "center_of_mass", where, (3,), high=_MAX_METRES)
+    _number(item, "friction", where, low=0, high=100)
+    _number(item, "restitution", where, low=0, high=1)
+    if "relation_fixed" in item:
+        _boolean(item, "relation_fixed", where)
+    if "inertia" in item:
+        inertia = _matrix(item["inertia"], 3, f"{where}.inertia")
+        symmetric = np.allclose(inertia, inertia.T, rtol=1e-6, atol=1e-12)
+        if not symmetric or np.linalg.eigvalsh(inertia).min() <= 0:
+            _fail(f"{where}.inertia", "a symmetric positive definite 3x3 matrix", item["inertia"])
+
+
+def _edges(items: list, base_ids: set[int], object_ids: set[int]) -> None:
+    parent_of: dict[int, int] = {}
+    for i, item in enumerate(items):
+        where = f"graph.edges[{i}]"
+        _mapping(item, where)
+        child, parent = _integer(item, "child", where), _integer(item, "parent", where)
+        if child not in object_ids:
+            _fail(f"{where}.child", "the id of an object", child)
+        if parent not in object_ids and parent not in base_ids:
+            _fail(f"{where}.parent", "the id of an object or base entity", parent)
+        if child in parent_of:
+            _fail(f"{where}.child", "one parent an object", f"a second parent of {child}")
+        if item.get("relation") not in _RELATIONS:
+            _fail(f"{where}.relation", " or ".join(f'"{x}"' for x in _RELATIONS), item.get("relation"))
+        _number(item, "confidence", where, low=0, high=1)
+        _get(item, "evidence", where)
+        parent_of[child] = parent
+    orphans = sorted(object_ids - parent_of.keys())
+    if orphans:
+        raise BundleError(f"graph.edges: expected one parent for every object, object {orphans[0]} has none")
+    rooted = set(base_ids)
+    for start in sorted(object_ids):
+        trail: list[int] = []
+        node = start
+        while node not in rooted:
+            if node in trail:
+                cycle = " -> ".join(str(x) for x in [*trail[trail.index(node) :], node][:8])
+                raise BundleError(
+                    f"graph.edges: expected a forest rooted in the base, found the cycle {cycle}"
+                )
+            trail.append(node)
+            node = parent_of[node]
+        rooted.update(trail)
+
+
+def _report(report: dict) -> None:
+    for key in ("physics", "timings_s", "backends", "config"):
+        if key in report:
+            _mapping(report[key], f"report.{key}")
+    if report.get("peak_memory_mb") is not None:
+        _number(report, "peak_memory_mb", "report", low=0)
+
+
+# ---- One value each. `where` is the JSON place of the mapping that holds it.
+
+
+def _fail(place: str, expected: str, got: Any) -> None:
+    raise BundleError(f"{place}: expected {expected}, got {_show(got)}")
+
+
+def _show(value: Any) -> str:
+    text = value if isinstance(value, str) and value.startswith("a ") else repr(value)
+    return "nothing" if value is None else text if len(text) <= 80 else text[:77] + "..."
+
+
+def _get(mapping: dict, key: str, where: str) -> Any:
+    if key not in mapping:
+        raise BundleError(f"{_place(where, key)}: missing")
+    return mapping[key]
+
+
+def _place(where: str, key: str) -> str:
+    return f"{where}.{key}" if where else key
+
+
+def _mapping(value: Any, place: str) -> dict:
+    if not isinstance(value, dict):
+        _fail(place, "an object {...}", value)
+    return value
+
+
+def _sequence(value: Any, place: str) -> list:
+    if not isinstance(value, list):
+        _fail(place, "a list [...]", value)
+    return value
+
+
+def _text(mapping: dict, key: str, where: str) -> str:
+    value = _get(mapping, key, where)
+    if not isinstance(value, str) or not value or len(value) > 4096:
+        _fail(_place(where, key), "a text that is not empty", value)
+    return value
+
+
+def _boolean(mapping: dict, key: str, where: str) -> bool:
+    value = _get(mapping, key, where)
+    if not isinstance(value, bool):
+        _fail(_place(where, key), "true or false", value)
+    return value
+
+
+def _integer(mapping: dict, key: str, where: str, low: int = -(2**31)) -> int:
+    value = _get(mapping, key, where)
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value < 2**31:
+        _fail(_place(where, key), "a whole number" + (f" of at least {low}" if low >= 0 else ""), value)
+    return value
+
+
+def _finite(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= 1e300 and math.isfinite(value)
+
+
+def _number(
+    mapping: dict, key: str, where: str, low: float = -1e300, high: float = 1e300, positive: bool = False
+) -> float:
+    value = _get(mapping, key, where)
+    if not _finite(value) or not low <= value <= high or (positive and value <= 0):
+        kind = "a positive number" if positive else "a number"
+        if high < 1e300:
+            kind += f" of at most {high:g}" if positive else f" between {low:g} and {high:g}"
+        elif low > -1e300 and not positive:
+            kind += f" of at least {low:g}"
+        _fail(_place(where, key), kind, value)
+    return value
+
+
+def _vector(mapping: dict, key: str, where: str, counts: tuple[int, ...], high: float = 1e300) -> list[float]:
+    value = _get(mapping, key, where)
+    good = (
+        isinstance(value, list) and len(value) in counts and all(_finite(x) and abs(x) <= high for x in value)
+    )
+    if not good:
+        _fail(_place(where, key), f"{' or '.join(map(str, counts))} finite numbers", value)
+    return value
+
+
+def _matrix(value: Any, size: int, place: str) -> np.ndarray:
+    good = isinstance(value, list) and len(value) == size
+    good = good and all(
+        isinstance(row, list) and len(row) == size and all(map(_finite, row)) for row in value
+    )
+    if not good:
+        _fail(place, f"{size} rows of {size} finite numbers", value)
+    return np.array(value, dtype=np.float64)
+
+
+def _transform(mapping: dict, key: str, where: str) -> None:
+    place = _place(where, key)
+    matrix = _matrix(_get(mapping, key, where), 4, place)
+    rotation = matrix[:3, :3]
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
+        _fail(place, "the last row [0, 0, 0, 1]", mapping[key][3])
+    if np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_TOLERANCE:
+        _fail(place, "a rigid transform (an orthonormal rotation, no scale)", mapping[key])
+    if np.linalg.det(rotation) < 0:
+        _fail(place, "a rotation, not a reflection", mapping[key])
+    if np.abs(matrix[:3, 3]).max() > _MAX_METRES:
+        _fail(place, f"a translation within {_MAX_METRES:g} m", matrix[:3, 3].tolist())
+
+
+def _unique(value: int, seen: set[int], place: str) -> None:
+    if value in seen:
+        raise BundleError(f"{place}: {value} is used twice")
+    seen.add(value)
+
+
+def _path(mapping: dict, key: str, where: str, suffix: str) -> str:
+    path = check_relative_path(_get(mapping, key, where), _place(where, key))
+    if not path.endswith(suffix):
+        _fail(_place(where, key), f"a {suffix} file", path)
+    return path
+
+
+def _paths(mapping: dict, key: str, where: str, suffix: str) -> list[str]:
+    values = _sequence(_get(mapping, key, where), _place(where, key))
+    for k, path in enumerate(values):
+        place = f"{_place(where, key)}[{k}]"
+        if not check_relative_path(path, place).endswith(suffix):
+            _fail(place, f"a {suffix} file", path)
+    return values

@@ -1,0 +1,427 @@
+"""The registry of scenes: bundles in folders, an index beside them.
+
+    <root>/index.sqlite                     one row a scene: which revision is the current one
+    <root>/scenes/<scene id>/<revision>/    a bundle; the folder's name is the hash of its content
+    <root>/locks/                           lock files, never deleted
+
+Publishing copies the staging folder to `scenes/<id>/.publishing-…`, flushes it to the disk, verifies it,
+renames it to its revision and writes the row last: a scene is there whole or not at all, and a kill at any
+moment leaves only a `.publishing-…` folder, which the next publish of anything removes. A scene's publish
+lock is held for as long as such a folder is in use, so one that is found while the lock is free belongs to
+the dead.
+
+A new revision of a scene replaces the row; then the older revisions are removed, except those that some
+reader has open (`SceneBundle` holds a shared lock on its folder): these go at the scene's next publish or
+removal.
+"""
+
+import contextlib
+import difflib
+import errno
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from registry.bundle import SceneBundle, seal_bundle
+from registry.db import Index, SceneRow, utc_text
+from registry.errors import BundleError, EnvironmentMissing, SceneBusy, SceneNotFound, UsageError
+from registry.locks import LockHeld, file_lock, is_leased
+from registry.schema import check_scene_id
+
+_REVISION = re.compile(r"[0-9a-f]{16}")
+_TEMPORARY = (".publishing-", ".removing-")
+_CAUSES = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EROFS: "the file system is read-only",
+    errno.EACCES: "permission denied",
+    errno.EPERM: "operation not permitted",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
+    errno.EEXIST: "a part of the path is a file, not a folder",
+}
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """What the index knows of a scene."""
+
+    scene_id: str
+    revision: str
+    path: Path  # the bundle's folder
+    schema_version: str
+    created_utc: str
+    source_file: str
+    source_sha256: str
+    n_objects: int
+    status: str  # "stable" | "unstable" | "unchecked", from the bundle's own physics report
+    metrics: dict  # JSON values: scale method and uncertainty, counts, numbers of the physics report
+
+
+@dataclass(frozen=True)
+class VerifyReport:
+    """What `SceneRegistry.verify` found."""
+
+    scene_id: str
+    revision: str
+    ok: bool
+    problems: tuple[str, ...]
+    files: int
+    total_bytes: int
+
+
+# `SceneRegistry.list` hides the built-in name inside the class body, so its annotations use these.
+Records = list[SceneRecord]
+Rows = list[SceneRow]
+Names = list[str]
+
+
+def default_registry_root() -> Path:
+    """Return `$SIMRECON_HOME/registry`, or `~/.simrecon/registry` where that variable is unset."""
+    home = os.environ.get("SIMRECON_HOME")
+    return (Path(home).expanduser() if home else Path.home() / ".simrecon") / "registry"
+
+
+class SceneRegistry:
+    """All scenes below one folder. Reading an absent registry works: it is empty."""
+
+    def __init__(self, root: Path | None = None, create: bool = False) -> None:
+        self.root = default_registry_root() if root is None else Path(root).expanduser()
+        self._index = Index(self.root / "index.sqlite")
+        if create:
+            with _disk_errors(f"create the registry {self.root}"):
+                self.scenes_folder.mkdir(parents=True, exist_ok=True)
+                self._create_index()
+
+    @property
+    def scenes_folder(self) -> Path:
+        """Where the bundles are."""
+        return self.root / "scenes"
+
+    def list(self) -> Records:
+        """Return all scenes, ordered by id. Opens no bundle."""
+        return [self._record(row) for row in self._index.rows()]
+
+    def get(self, scene_id: str) -> SceneRecord:
+        """Return one scene.
+
+        Raises:
+            SceneNotFound: with the nearest match and what exists.
+        """
+        row = self._index.row(check_scene_id(scene_id))
+        if row is None:
+            raise SceneNotFound(self._not_found(scene_id))
+        return self._record(row)
+
+    def load(self, scene_id: str, check_hashes: bool = False) -> SceneBundle:
+        """Open the current revision of a scene."""
+        while True:
+            record = self.get(scene_id)
+            try:
+                return SceneBundle.open(record.path, check_hashes)
+            except BundleError as error:
+                # A newer revision may have taken the place between the two lines above: then look again.
+                if self.get(scene_id).revision == record.revision:
+                    raise BundleError(
+                        f"scene {scene_id}: {error}. Reconstruct it again, or `simrecon remove {scene_id}`"
+                    ) from error
+
+    def verify(self, scene_id: str) -> VerifyReport:
+        """Check a scene's schema, the list, size and hash of every file, and that the index agrees."""
+        record = self.get(scene_id)
+        try:
+            bundle = SceneBundle.open(record.path, check_hashes=True)
+        except BundleError as error:
+            return VerifyReport(scene_id, record.revision, False, (str(error),), 0, 0)
+        problems = []
+        if bundle.revision != record.revision:
+            problems.append(f"the index says revision {record.revision}, the bundle is {bundle.revision}")
+        if bundle.scene["id"] != scene_id:
+            problems.append(f"the bundle calls itself {bundle.scene['id']!r}")
+        total = sum(size for _, size in bundle.files.values())
+        return VerifyReport(
+            scene_id, record.revision, not problems, tuple(problems), len(bundle.files), total
+        )
+
+    def next_free_id(self) -> str:
+        """Return the next free `sceneNNNN`. Use `reserve_next_id` where other processes may ask, too."""
+        return _scene_name(self._highest_number() + 1)
+
+    @contextlib.contextmanager
+    def hold(self, scene_id: str) -> Iterator[None]:
+        """Hold a scene while it is being reconstructed.
+
+        Raises:
+            SceneBusy: another process holds it.
+            EnvironmentMissing: the registry cannot be written.
+        """
+        path = self._lock_path(scene_id, "hold")
+        with contextlib.ExitStack() as stack:
+            try:
+                with _disk_errors(f"lock scene {scene_id}"):
+                    stack.enter_context(file_lock(path, blocking=False))
+            except LockHeld as error:
+                raise SceneBusy(
+                    f"scene {scene_id}: another process is reconstructing it ({error.holder}, {path}); wait "
+                    "for it to end, or choose another id with --scene"
+                ) from None
+            yield
+
+    @contextlib.contextmanager
+    def reserve_next_id(self) -> Iterator[str]:
+        """Choose the next free id and hold it while the block runs; two processes never get the same one."""
+        number = self._highest_number() + 1
+        while True:
+            scene_id = _scene_name(number)
+            with contextlib.ExitStack() as stack:
+                try:
+                    stack.enter_context(self.hold(scene_id))
+                except SceneBusy:
+                    number += 1
+                    continue
+                # Whoever held it a moment ago may just have published it.
+                if self._index.row(scene_id) is not None:
+                    number += 1
+                    continue
+                yield scene_id
+                return
+
+    def publish(self, staging: Path, scene_id: str) -> SceneRecord:
+        """Publish a sealed bundle as the current revision of `scene_id`. The staging folder is left as it is.
+
+        A bundle that was sealed under another id is given this one. Publishing what is already there changes
+        nothing.
+
+        Raises:
+            BundleError: the staging folder is not a valid bundle.
+            EnvironmentMissing: the registry cannot be written; nothing is left behind.
+        """
+        check_scene_id(scene_id)
+        SceneBundle.open(staging, check_hashes=False)  # before anything is created
+        folder = self.scenes_folder / scene_id
+        with _disk_errors(f"publish scene {scene_id} to {self.root}"):
+            self._create_index()
+            with file_lock(self._lock_path(scene_id, "publish")):
+                self._sweep(folder)
+                try:
+                    folder.mkdir(parents=True, exist_ok=True)
+                    row = self._place(Path(staging), folder, scene_id)
+                finally:
+                    with contextlib.suppress(OSError):
+                        folder.rmdir()  # only succeeds where nothing was published
+                self._remove_superseded(folder, row.revision)
+            self._sweep_others(folder)
+        return self._record(row)
+
+    def remove(self, scene_id: str) -> None:
+        """Remove a scene: first its row, then its files."""
+        record = self.get(scene_id)
+        folder = record.path.parent
+        with (
+            _disk_errors(f"remove scene {scene_id} from {self.root}"),
+            file_lock(self._lock_path(scene_id, "publish")),
+        ):
+            self._index.delete(scene_id)
+            for revision in _revisions(folder):
+                _remove_folder(revision)
+            self._sweep(folder)
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+    def rebuild_index(self) -> Records:
+        """Recover a lost or damaged index from the folders; returns the scenes found.
+
+        Where a scene has several revisions that verify, the one written last is taken. Folders that do not
+        verify are left alone and out of the index.
+        """
+        with _disk_errors(f"rebuild the index of {self.root}"):
+            self.scenes_folder.mkdir(parents=True, exist_ok=True)
+            self._index.replace_all(self._rows_from_folders())
+        return self.list()
+
+    # ---- Reading.
+
+    def _record(self, row: SceneRow) -> SceneRecord:
+        path = self.scenes_folder / row.scene_id / row.revision
+        return SceneRecord(path=path, **vars(row))
+
+    def _not_found(self, scene_id: str) -> str:
+        known = [row.scene_id for row in self._index.rows()]
+        if not known:
+            hint = "the registry is empty; make a scene with `simrecon reconstruct VIDEO`"
+            if not self._index.exists() and self._folder_ids():
+                hint = "its index is lost; recover it with `registry.SceneRegistry(root).rebuild_index()`"
+            return f"scene {scene_id!r} is not in {self.root}: {hint}"
+        near = difflib.get_close_matches(scene_id, known, n=1)
+        shown = ", ".join(known[:10]) + (f" and {len(known) - 10} more" if len(known) > 10 else "")
+        meant = f" Did you mean {near[0]!r}?" if near else ""
+        return f"scene {scene_id!r} is not in {self.root}.{meant} There are: {shown}"
+
+    def _folder_ids(self) -> Names:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            return [f.name for f in sorted(self.scenes_folder.iterdir()) if f.is_dir() and any(_revisions(f))]
+        return []
+
+    def _highest_number(self) -> int:
+        names = [row.scene_id for row in self._index.rows()] + self._folder_ids()
+        numbers = [int(m.group(1)) for n in names if (m := re.fullmatch(r"scene(\d{4,9})", n))]
+        return max(numbers, default=0)
+
+    # ---- Writing.
+
+    def _lock_path(self, scene_id: str, purpose: str) -> Path:
+        return self.root / "locks" / f"{check_scene_id(scene_id)}.{purpose}.lock"
+
+    def _create_index(self) -> None:
+        """Create the index; a registry that lost it gets it back from the folders, not an empty one."""
+        if not self._index.exists() and self._folder_ids():
+            self.rebuild_index()
+        self._index.create()
+
+    def _place(self, staging: Path, folder: Path, scene_id: str) -> SceneRow:
+        temporary = folder / f"{_TEMPORARY[0]}{os.getpid()}-{secrets.token_hex(4)}"
+        placed = None
+        try:
+            shutil.copytree(staging, temporary, symlinks=True)
+            bundle = SceneBundle.open(temporary, check_hashes=True)
+            if bundle.scene["id"] != scene_id:
+                seal_bundle(temporary, {**bundle.scene, "id": scene_id})
+                bundle = SceneBundle.open(temporary, check_hashes=True)
+            final = folder / bundle.revision
+            if final.exists() and not _is_intact(final):
+                _remove_folder(final)
+            if not final.exists():
+                _flush_tree(temporary)
+                os.replace(temporary, final)
+                placed = final
+                _flush(folder)
+            row = self._index.row(scene_id)
+            if row is None or row.revision != bundle.revision:
+                row = _row_of(SceneBundle.open(final, check_hashes=False), scene_id, utc_text())
+                self._index.put(row)
+            return row
+        except BaseException:
+            if placed is not None:
+                shutil.rmtree(placed, ignore_errors=True)
+            raise
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+    def _remove_superseded(self, folder: Path, current: str) -> None:
+        for revision in _revisions(folder):
+            if revision.name != current and not is_leased(revision):
+                _remove_folder(revision)
+
+    def _sweep(self, folder: Path) -> None:
+        """Remove what dead processes left in a scene's folder; the caller holds its publish lock."""
+        if folder.is_dir():
+            for item in folder.iterdir():
+                if item.name.startswith(_TEMPORARY):
+                    shutil.rmtree(item, ignore_errors=True)
+
+    def _sweep_others(self, but: Path) -> None:
+        for folder in self.scenes_folder.iterdir():
+            if folder == but or not any(i.name.startswith(_TEMPORARY) for i in folder.iterdir()):
+                continue
+            # A folder in use is somebody else's; one that is no scene is none of ours.
+            with (
+                contextlib.suppress(LockHeld, UsageError),
+                file_lock(self._lock_path(folder.name, "publish"), blocking=False),
+            ):
+                self._sweep(folder)
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+
+    def _rows_from_folders(self) -> Rows:
+        rows = []
+        for scene_id in self._folder_ids():
+            found = []
+            for revision in _revisions(self.scenes_folder / scene_id):
+                with contextlib.suppress(BundleError):
+                    bundle = SceneBundle.open(revision, check_hashes=True)
+                    written = (revision / "manifest.json").stat().st_mtime
+                    if bundle.revision == revision.name and bundle.scene["id"] == scene_id:
+                        found.append((written, revision.name, _row_of(bundle, scene_id, utc_text(written))))
+            if found:
+                rows.append(max(found, key=lambda item: item[:2])[2])
+        return rows
+
+
+@contextlib.contextmanager
+def _disk_errors(doing: str) -> Iterator[None]:
+    """Turn what the disk refuses into an EnvironmentMissing that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        cause = _CAUSES.get(error.errno or 0, error.strerror or str(error))
+        where = f" ({error.filename})" if error.filename else ""
+        raise EnvironmentMissing(
+            f"registry: cannot {doing}: {cause}{where}. Free some space or fix the permissions, or choose "
+            "another folder with --registry or $SIMRECON_HOME; nothing was published"
+        ) from error
+
+
+def _scene_name(number: int) -> str:
+    return f"scene{number:04d}"
+
+
+def _revisions(folder: Path) -> Iterator[Path]:
+    with contextlib.suppress(FileNotFoundError):
+        for item in sorted(folder.iterdir()):
+            if _REVISION.fullmatch(item.name) and item.is_dir():
+                yield item
+
+
+def _is_intact(folder: Path) -> bool:
+    try:
+        return SceneBundle.open(folder, check_hashes=True).revision == folder.name
+    except BundleError:
+        return False
+
+
+def _remove_folder(folder: Path) -> None:
+    """Remove a revision: out of sight in one step, then file by file."""
+    doomed = folder.with_name(f"{_TEMPORARY[1]}{folder.name}-{secrets.token_hex(4)}")
+    os.replace(folder, doomed)
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _flush_tree(folder: Path) -> None:
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            _flush(Path(parent, name))
+        _flush(Path(parent))
+
+
+def _row_of(bundle: SceneBundle, scene_id: str, created_utc: str) -> SceneRow:
+    scene = bundle.scene
+    physics = scene["report"].get("physics", {})
+    rate = physics.get("stable_rate")
+    known = isinstance(rate, int | float) and not isinstance(rate, bool)
+    metrics = {key: value for key, value in physics.items() if isinstance(value, int | float | str | bool)}
+    metrics["scale_method"] = scene["scale"]["method"]
+    metrics["scale_uncertainty"] = scene["scale"].get("uncertainty")
+    metrics["n_dynamic"] = sum(item["dynamic"] for item in scene["objects"])
+    metrics["n_base"] = len(scene["base"])
+    return SceneRow(
+        scene_id=scene_id,
+        revision=bundle.revision,
+        schema_version=scene["schema"],
+        created_utc=created_utc,
+        source_file=scene["source"]["file"],
+        source_sha256=scene["source"]["sha256"],
+        n_objects=len(scene["objects"]),
+        status=("stable" if rate >= 1 else "unstable") if known else "unchecked",
+        metrics=metrics,
+    )
