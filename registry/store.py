@@ -285,7 +285,9 @@ class SceneRegistry:
         temporary = folder / f"{_TEMPORARY[0]}{os.getpid()}-{secrets.token_hex(4)}"
         placed = None
         try:
-            shutil.copytree(staging, temporary, symlinks=True)
+            for name in [*SceneBundle.open(staging, check_hashes=False).files, "manifest.json"]:
+                (temporary / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(staging / name, temporary / name)
             bundle = SceneBundle.open(temporary, check_hashes=True)
             if bundle.scene["id"] != scene_id:
                 seal_bundle(temporary, {**bundle.scene, "id": scene_id})
