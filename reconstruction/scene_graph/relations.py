@@ -1,0 +1,290 @@
+"""Which thing rests on or hangs from which: the relation backend and its embedded, geometric default.
+
+For each cell of a child's underside, the carrier is the highest surface that faces up at or just beneath it. The parent
+is the thing that carries most of the underside, weighted by closeness, with the instance stage's hint as a prior. What
+nothing carries hangs on a wall or the ceiling if it lies flat against one. Reconstructed surfaces are off by a
+centimetre or so, hence the tolerances, and hence the vote on which of two overlapping things is the upper one.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from reconstruction.scene_graph.surfaces import SampledBase, SampledObject, sample_assets
+from reconstruction.types import AssetSet, Edge
+
+
+class RelationBackend(Protocol):
+    """Proposes a parent for each object of a view (geometry here, a vision-language model elsewhere)."""
+
+    name: str
+    version: int
+
+    def infer(self, ids: Iterable[int]) -> list[Edge]:
+        """Return one edge per object id in `ids`; parents are among `ids` and the base. No cycles."""
+
+
+@dataclass(frozen=True)
+class RelationConfig:
+    """Tolerances of the geometric relation backend."""
+
+    contact_gap_m: float = 0.035
+    """An underside this far above a surface still counts as resting on it."""
+    contact_sink_m: float = 0.025
+    """An underside this far below a surface still counts as resting on it."""
+    deep_sink_m: float = 0.06
+    """Second chance for things reconstructed deep inside their support."""
+    min_contact: float = 0.10
+    """Least share of the underside (weighted by closeness) that makes a support."""
+    wall_gap_m: float = 0.05
+    """Largest distance to a wall or ceiling that counts as touching it."""
+    wall_thickness_m: float = 0.15
+    """Things thinner than this (or than a third of their size), measured off the wall, can hang on it."""
+    bridge_gap_m: float = 0.30
+    """A gap this large below an object is put down to missing reconstruction."""
+    near_object_m: float = 0.04
+    """Something that nothing carries is attached to an object at most this far away."""
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    relation: str
+    parent: int
+    score: float
+    evidence: str
+
+
+class GeometryRelations:
+    """The embedded relation backend. Samples all surfaces once; asking is cheap."""
+
+    name = "geometry"
+    version = 1
+
+    def __init__(self, assets: AssetSet, config: RelationConfig) -> None:
+        """Prepare the assets for questions."""
+        self.config = config
+        self._base, self._objects = sample_assets(assets)
+        self._floors = [b for b in self._base.values() if b.label == "floor"]
+        self._trees: dict[int, cKDTree] = {}
+        self._gaps: dict[tuple[int, int, bool], np.ndarray] = {}
+
+    def infer(self, ids: Iterable[int]) -> list[Edge]:
+        """See `RelationBackend.infer`."""
+        present = sorted(i for i in set(ids) if i in self._objects)
+        ranked = {i: self.candidates(i, present) for i in present}
+        return _without_cycles(ranked)
+
+    def candidates(self, child_id: int, present: Iterable[int]) -> list[_Candidate]:
+        """Return possible (relation, parent)s of an object, best first; never empty."""
+        child = self._objects[child_id]
+        others = [self._objects[i] for i in sorted(present) if i != child_id]
+        supports = self._supports(child, others, deep=False) or self._supports(child, others, deep=True)
+        hanging = self._hanging(child)
+        floating = self._floating(child, others)
+        best_support = supports[0].score if supports else 0.0
+        wanted = child.attached_hint and best_support < 0.5
+        if hanging and (best_support < self.config.min_contact or wanted):
+            order = hanging + supports + floating
+        else:
+            order = supports + hanging + floating
+        seen: set[int] = set()
+        return [c for c in order if not (c.parent in seen or seen.add(c.parent))]
+
+    def _supports(self, child: SampledObject, others: list[SampledObject], deep: bool) -> list[_Candidate]:
+        """Rank what may carry the child, by the share of its underside that each carries."""
+        low, high = child.low - 0.02, child.high + 0.02
+        reach = self.config.contact_gap_m + child.underside[:, 2].max() - child.low[2]
+        near = [
+            o
+            for o in others
+            if np.all(o.high[:2] > low[:2])
+            and np.all(o.low[:2] < high[:2])
+            and o.high[2] > child.low[2] - reach
+        ]
+        carriers = [o for o in near if self._is_above(child, o)]
+        gaps = [self._gap(child, o, deep) for o in carriers]
+        names = [o.name for o in carriers]
+        ids = [o.id for o in carriers]
+        for floor in self._floors:
+            gaps.append(self._plane_gap(child, floor, deep))
+            names.append(floor.label)
+            ids.append(floor.id)
+        if not gaps:
+            return []
+        table = np.stack(gaps)  # (candidates, cells), NaN where nothing is near
+        # The highest surface wins a cell: a plate between a bowl and a table carries the bowl.
+        filled = np.where(np.isnan(table), np.inf, table)
+        winner = np.where(np.isfinite(filled.min(axis=0)), filled.argmin(axis=0), -1)
+        out = []
+        for row, (parent, name) in enumerate(zip(ids, names)):
+            cells = winner == row
+            if not cells.any():
+                continue
+            gap = table[row, cells]
+            share = float(np.sum(_closeness(gap, self.config, deep)) / table.shape[1])
+            prior = 1.5 if child.support_hint == parent else 1.0
+            minimum = self.config.min_contact / (2 if prior > 1 else 1)
+            if share < minimum:
+                continue
+            evidence = f"{cells.mean():.0%} of its underside lies {_gap_words(float(np.median(gap)))} {name}"
+            score = min(share * prior, 1.0) * (0.6 if deep else 1.0)
+            out.append(
+                _Candidate("supported_by", parent, score, evidence + (", as its view suggests" * (prior > 1)))
+            )
+        return sorted(out, key=lambda c: (-c.score, c.parent))
+
+    def _gap(self, child: SampledObject, parent: SampledObject, deep: bool) -> np.ndarray:
+        """Return per cell of the child's underside its height above the parent's highest surface there; NaN: none."""
+        key = (child.id, parent.id, deep)
+        if key not in self._gaps:
+            self._gaps[key] = self._measure_gap(child, parent, deep)
+        return self._gaps[key]
+
+    def _measure_gap(self, child: SampledObject, parent: SampledObject, deep: bool) -> np.ndarray:
+        cells = child.underside
+        out = np.full(len(cells), np.nan)
+        if len(parent.up) == 0:
+            return out
+        if parent.id not in self._trees:
+            self._trees[parent.id] = cKDTree(parent.up[:, :2])
+        radius = max(1.2 * parent.spacing_m, 0.008)
+        sink = self._sink(child, deep)
+        for i, found in enumerate(self._trees[parent.id].query_ball_point(cells[:, :2], radius)):
+            gap = cells[i, 2] - parent.up[found, 2]
+            fits = (gap >= -sink) & (gap <= self.config.contact_gap_m)
+            if fits.any():
+                out[i] = gap[fits].min()
+        return out
+
+    def _plane_gap(self, child: SampledObject, floor: SampledBase, deep: bool) -> np.ndarray:
+        gap = floor.distance(np.asarray(child.underside))
+        fits = (gap >= -max(self._sink(child, deep), 0.05)) & (gap <= self.config.contact_gap_m)
+        return np.where(fits, gap, np.nan)
+
+    def _sink(self, child: SampledObject, deep: bool) -> float:
+        height = child.high[2] - child.low[2]
+        if deep:
+            return max(min(self.config.deep_sink_m, 0.5 * height), 1.5 * self.config.contact_sink_m)
+        return self.config.contact_sink_m
+
+    def _is_above(self, child: SampledObject, parent: SampledObject) -> bool:
+        """Vote whether `child` is the upper one of two things that touch. Antisymmetric in the two."""
+
+        def clip(x: float, bound: float) -> float:
+            return float(np.clip(x, -bound, bound))
+
+        def contact(a: SampledObject, b: SampledObject) -> float:
+            gap = self._gap(a, b, False)
+            return float(np.nansum(_closeness(gap, self.config, False)) / len(gap))
+
+        vote = clip((child.center[2] - parent.center[2]) / 0.05, 2)
+        vote += clip((child.low[2] - parent.low[2]) / 0.015, 2)
+        vote += clip(0.7 * np.log(parent.footprint_m2 / child.footprint_m2), 2)
+        vote += 4 * (contact(child, parent) - contact(parent, child))
+        vote += 3.0 * (child.support_hint == parent.id) - 3.0 * (parent.support_hint == child.id)
+        return vote > 0 or (vote == 0 and child.id > parent.id)
+
+    def _hanging(self, child: SampledObject) -> list[_Candidate]:
+        """Rank walls and ceilings that the child lies against."""
+        out = []
+        for base in self._base.values():
+            if base.label == "floor":
+                continue
+            distance = base.distance(child.points)
+            near, far = np.percentile(distance, [3, 97])
+            thick, size = far - near, float(np.max(child.high - child.low))
+            bound = self.config.wall_gap_m * (2 if child.attached_hint else 1)
+            beside = np.all(child.center > base.low - 0.3) and np.all(child.center < base.high + 0.3)
+            thin = thick < max(self.config.wall_thickness_m, size / 3)
+            # A thing may lie behind the fitted plane by a few centimetres, but its bulk is in the room.
+            if abs(near) > bound or far < -0.01 or not beside or not (thin or child.attached_hint):
+                continue
+            score = 0.9 - 0.4 * abs(near) / bound
+            evidence = f"nothing below it; {near * 100:.1f} cm off {base.label} {base.id} and {thick * 100:.0f} cm thick"
+            out.append(_Candidate("attached_to", base.id, score, evidence))
+        return sorted(out, key=lambda c: (-c.score, c.parent))
+
+    def _floating(self, child: SampledObject, others: list[SampledObject]) -> list[_Candidate]:
+        """Rank what remains for a thing that nothing carries: the next surface below, a neighbor, the floor."""
+        below = []
+        for other in others:
+            over = np.all(other.high[:2] > child.low[:2]) and np.all(other.low[:2] < child.high[:2])
+            if not over or not self._is_above(child, other) or len(other.up) == 0:
+                continue
+            under = other.up[
+                np.all((other.up[:, :2] > child.low[:2]) & (other.up[:, :2] < child.high[:2]), axis=1)
+                & (other.up[:, 2] < child.low[2] + self.config.contact_sink_m)
+            ]
+            if len(under):
+                below.append((child.low[2] - float(np.percentile(under[:, 2], 95)), other.id, other.name))
+        for floor in self._floors:
+            gap = float(floor.distance(np.array([[child.center[0], child.center[1], child.low[2]]]))[0])
+            below.append((gap, floor.id, floor.label))
+        below.sort()
+        bridged, distant = [], []
+        for gap, parent, name in below:
+            near = gap < self.config.bridge_gap_m
+            evidence = f"nothing touches it; {name} is the next surface, {gap * 100:.0f} cm below"
+            (bridged if near else distant).append(
+                _Candidate("supported_by", parent, 0.3 if near else 0.1, evidence)
+            )
+        beside = []
+        for other in others:
+            if np.any(other.low > child.high + 0.1) or np.any(other.high < child.low - 0.1):
+                continue
+            gap = float(np.percentile(cKDTree(other.points).query(child.points[::8])[0], 1))
+            if gap < self.config.near_object_m and other.footprint_m2 > child.footprint_m2:
+                evidence = f"nothing below it; {gap * 100:.1f} cm beside {other.name}"
+                beside.append(_Candidate("attached_to", other.id, 0.25, evidence))
+        return bridged + sorted(beside, key=lambda c: (-c.score, c.parent)) + distant
+
+
+def _closeness(gap: np.ndarray, config: RelationConfig, deep: bool) -> np.ndarray:
+    """Weigh gaps: 1 at contact, falling off on either side; NaN counts nothing."""
+    below = config.deep_sink_m if deep else 0.8 * config.contact_sink_m
+    width = np.where(gap > 0, 0.6 * config.contact_gap_m, below)
+    return np.nan_to_num(np.exp(-((gap / width) ** 2)), nan=0.0)
+
+
+def _gap_words(gap_m: float) -> str:
+    if abs(gap_m) < 0.001:
+        return "on"
+    return f"{abs(gap_m) * 1000:.0f} mm {'above' if gap_m > 0 else 'inside'}"
+
+
+def _without_cycles(ranked: dict[int, list[_Candidate]]) -> list[Edge]:
+    """Give each child its best parent; a cycle is broken at its weakest edge, which takes its next candidate."""
+    choice = dict.fromkeys(ranked, 0)
+    while True:
+        cycle = _find_cycle({i: ranked[i][choice[i]].parent for i in ranked})
+        if not cycle:
+            break
+        open_ended = [i for i in cycle if choice[i] + 1 < len(ranked[i])]
+        # The floor is among every object's candidates, so the last candidate cannot keep a cycle alive.
+        weakest = min(open_ended, key=lambda i: (ranked[i][choice[i]].score, i))
+        choice[weakest] += 1
+    out = []
+    for i in sorted(ranked):
+        chosen = ranked[i][choice[i]]
+        rest = max((c.score for n, c in enumerate(ranked[i]) if n != choice[i]), default=0.0)
+        confidence = chosen.score / (chosen.score + 0.5 * rest) * min(1.0, 0.4 + chosen.score)
+        out.append(
+            Edge(i, chosen.relation, chosen.parent, round(float(min(confidence, 0.99)), 3), chosen.evidence)
+        )
+    return out
+
+
+def _find_cycle(parent: dict[int, int]) -> list[int]:
+    """Return the ids of one cycle, or nothing."""
+    for start in sorted(parent):
+        path: list[int] = []
+        node = start
+        while node in parent and node not in path:
+            path.append(node)
+            node = parent[node]
+        if node in path:
+            return path[path.index(node) :]
+    return []

@@ -1,0 +1,416 @@
+"""Bodies in, a bare PhysX scene and the report card of CONTRACT section 4 out. No rendering, no ManiSkill.
+
+Used by assembly, by `simrecon verify --physics` and by tests, so that all of them measure the same thing. SAPIEN is
+imported inside functions: listing a registry must not pay for it. Nothing here needs a Vulkan driver.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from registry.errors import BundleError, EnvironmentMissing, SimReconError
+from registry.geometry import matrix_from_quat, quat_from_matrix, rigid
+
+TIMESTEP_S = 1 / 240
+VERIFY_DURATION_S = 10.0
+# PhysX cooks at most 255 vertices per convex; a flat point set cannot be cooked at all and is thickened to this.
+_MAX_PART_VERTICES = 255
+_MIN_PART_THICKNESS_M = 1e-3
+_FLOAT_WINDOW_S, _FLOAT_DROP_M = 0.5, 0.005
+_FAR_AWAY_M = 1e3  # where a body that left the world is said to be: reports hold finite numbers only
+
+
+@dataclass(frozen=True)
+class BodySpec:
+    """One rigid body. Lengths in metres, masses in kilograms."""
+
+    id: int
+    name: str
+    parts: tuple[np.ndarray, ...]  # convex pieces, each (v, 3) points in object space
+    mass_kg: float
+    center_of_mass: np.ndarray  # (3,) object space
+    inertia: np.ndarray | None  # (3, 3) about the centre of mass, object axes; None: from the shapes
+    friction: float
+    restitution: float
+    world_from_object: np.ndarray  # (4, 4) rigid
+    dynamic: bool
+    fixed_to: int | None = None  # body that it is fixed to; meant for a dynamic body on a dynamic parent
+    base: bool = False  # floor, wall, ceiling: immovable, and never measured
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One contact point between two bodies; separation < 0 is penetration."""
+
+    first: int
+    second: int
+    separation_m: float
+    normal: np.ndarray  # (3,) world, from `second` towards `first`
+    position: np.ndarray  # (3,) world
+    impulse: np.ndarray  # (3,) N s on `first`
+
+
+class Physics:
+    """A PhysX CPU scene whose bodies can be moved, frozen and stepped. Base bodies are static for ever."""
+
+    def __init__(self, timestep_s: float, sleep_threshold: float) -> None:
+        """Make an empty scene; `sleep_threshold` 0 means that no body ever falls asleep."""
+        sapien, physx = _sapien()
+        self.timestep_s = timestep_s
+        self._sleep_threshold = sleep_threshold
+        previous = physx.get_scene_config()
+        config = physx.PhysxSceneConfig()
+        # Results must not depend on what else lies in the scene, nor on a configuration that others left behind.
+        config.enable_enhanced_determinism = True
+        physx.set_scene_config(config)
+        try:
+            self.scene = sapien.Scene([physx.PhysxCpuSystem()])
+        finally:
+            physx.set_scene_config(previous)
+        self.scene.set_timestep(timestep_s)
+        self.specs: dict[int, BodySpec] = {}
+        self._entities: dict[int, Any] = {}
+        self._bodies: dict[int, Any] = {}
+
+    def add(self, spec: BodySpec, *, kinematic: bool | None = None) -> None:
+        """Add a body at its pose; `kinematic` overrides whether an object is held still."""
+        sapien, physx = _sapien()
+        if spec.id in self._bodies:
+            raise SimReconError(f"physics: two bodies have id {spec.id} ('{spec.name}')")
+        previous = physx.get_body_config()
+        config = physx.PhysxBodyConfig()
+        config.sleep_threshold = self._sleep_threshold
+        config.solver_position_iterations = 15  # as ManiSkill's default scene has it
+        config.solver_velocity_iterations = 1
+        physx.set_body_config(config)
+        try:
+            body = physx.PhysxRigidStaticComponent() if spec.base else physx.PhysxRigidDynamicComponent()
+        finally:
+            physx.set_body_config(previous)
+        material = physx.PhysxMaterial(spec.friction, spec.friction, spec.restitution)
+        for part in spec.parts:
+            body.attach(_convex_shape(physx, part, material, spec))
+        if not spec.base:
+            _set_inertial(sapien, body, spec)
+            # SAPIEN's default angular damping is 0.05; the contract measures without any.
+            body.set_linear_damping(0.0)
+            body.set_angular_damping(0.0)
+            body.kinematic = (not spec.dynamic) if kinematic is None else kinematic
+        entity = sapien.Entity()
+        entity.name = str(spec.id)  # how contacts find their way back to ids
+        entity.add_component(body)
+        entity.pose = _pose(sapien, spec.world_from_object)
+        self.scene.add_entity(entity)
+        self.specs[spec.id], self._entities[spec.id], self._bodies[spec.id] = spec, entity, body
+
+    def remove(self, body_id: int) -> None:
+        """Take a body out of the scene."""
+        entity = self._entities.pop(body_id)
+        self._bodies.pop(body_id)
+        self.specs.pop(body_id)
+        self.scene.remove_entity(entity)
+
+    def fix(self, child: int, parent: int) -> None:
+        """Lock a dynamic child to its parent in their present relative pose."""
+        sapien, physx = _sapien()
+        drive = physx.PhysxDriveComponent(self._bodies[child])
+        drive.set_parent(self._bodies[parent])
+        drive.set_pose_in_parent(self._entities[parent].pose.inv() * self._entities[child].pose)
+        drive.set_pose_in_child(sapien.Pose())
+        drive.set_limit_x(0, 0, 0, 0)
+        drive.set_limit_y(0, 0, 0, 0)
+        drive.set_limit_z(0, 0, 0, 0)
+        drive.set_limit_twist(0, 0, 0, 0)
+        drive.set_limit_cone(0, 0, 0, 0)
+        self._entities[child].add_component(drive)
+
+    def pose(self, body_id: int) -> np.ndarray:
+        """Return `world_from_object` (4, 4) of a body."""
+        pose = self._entities[body_id].pose
+        return rigid(matrix_from_quat(np.asarray(pose.q)), np.asarray(pose.p, np.float64))
+
+    def set_pose(self, body_id: int, world_from_object: np.ndarray) -> None:
+        """Teleport a body and stop it."""
+        sapien, _ = _sapien()
+        self._entities[body_id].pose = _pose(sapien, world_from_object)
+        self.stop(body_id)
+
+    def stop(self, body_id: int) -> None:
+        """Take all velocity from a body."""
+        body = self._bodies[body_id]
+        if not self.specs[body_id].base and not body.kinematic:
+            body.set_linear_velocity(np.zeros(3))
+            body.set_angular_velocity(np.zeros(3))
+
+    def speed(self, body_id: int) -> tuple[float, float]:
+        """Return the linear (m/s) and angular (rad/s) speed of a body."""
+        body = self._bodies[body_id]
+        linear = float(np.linalg.norm(body.get_linear_velocity()))
+        return linear, float(np.linalg.norm(body.get_angular_velocity()))
+
+    def set_kinematic(self, body_id: int, kinematic: bool) -> None:
+        """Freeze an object where it is, or let it go."""
+        body = self._bodies[body_id]
+        if body.kinematic != kinematic:
+            body.kinematic = kinematic
+        self.stop(body_id)
+
+    def set_damping(self, body_id: int, linear: float, angular: float) -> None:
+        """Set the damping rates (1/s) of an object; 0 in everything that is measured."""
+        self._bodies[body_id].set_linear_damping(linear)
+        self._bodies[body_id].set_angular_damping(angular)
+
+    def set_gravity(self, body_id: int, on: bool) -> None:
+        """Switch gravity for one object."""
+        self._bodies[body_id].set_disable_gravity(not on)
+
+    def step(self, count: int = 1) -> None:
+        """Advance by `count` time steps."""
+        for _ in range(count):
+            self.scene.step()
+
+    def contacts(self, max_separation_m: float = 0.0) -> list[Contact]:
+        """Return the contact points of the last step that are at most `max_separation_m` apart.
+
+        PhysX finds contacts before it moves the bodies, so they belong to the poses before the last step.
+        """
+        out = []
+        for contact in self.scene.get_contacts():
+            first, second = (int(body.entity.name) for body in contact.bodies)
+            for point in contact.points:
+                if point.separation <= max_separation_m:
+                    out.append(
+                        Contact(
+                            first,
+                            second,
+                            float(point.separation),
+                            np.asarray(point.normal, np.float64),
+                            np.asarray(point.position, np.float64),
+                            np.asarray(point.impulse, np.float64),
+                        )
+                    )
+        return out
+
+
+def build_physics(
+    specs: Iterable[BodySpec], timestep_s: float = TIMESTEP_S, *, sleep_threshold: float = 0.0
+) -> Physics:
+    """Build a scene of all bodies at their poses; parents of fixed bodies may come in any order."""
+    specs = list(specs)
+    physics = Physics(timestep_s, sleep_threshold)
+    for spec in specs:
+        physics.add(spec)
+    for spec in specs:
+        if spec.fixed_to is not None and spec.dynamic:
+            if spec.fixed_to not in physics.specs:
+                raise SimReconError(
+                    f"physics: body {spec.id} is fixed to {spec.fixed_to}, which does not exist"
+                )
+            physics.fix(spec.id, spec.fixed_to)
+    return physics
+
+
+def spawn_contacts(specs: Sequence[BodySpec]) -> list[Contact]:
+    """Return every penetrating contact at the given poses, fixed objects against everything included.
+
+    PhysX reports no contact between two immovable bodies, so all objects are movable for this one step.
+    """
+    physics = build_physics([replace(spec, dynamic=not spec.base, fixed_to=None) for spec in specs])
+    physics.step()
+    return physics.contacts(0.0)
+
+
+def physics_report(
+    specs: Sequence[BodySpec],
+    *,
+    duration_s: float = VERIFY_DURATION_S,
+    timestep_s: float = TIMESTEP_S,
+) -> dict[str, Any]:
+    """Measure the report card of CONTRACT section 4: all dynamic objects together, undamped, never asleep.
+
+    Rates are shares of the dynamic objects (1.0 where there is none; `dynamic_objects` says so). Values are JSON.
+    """
+    specs = list(specs)
+    names = {spec.id: spec.name for spec in specs}
+    deepest = min(spawn_contacts(specs), key=lambda c: c.separation_m, default=None)
+    physics = build_physics(specs, timestep_s)
+    moving = [spec for spec in specs if spec.dynamic and not spec.base]
+    physics.step(round(_FLOAT_WINDOW_S / timestep_s))
+    early = {spec.id: _finite(physics.pose(spec.id)) for spec in moving}
+    physics.step(round(duration_s / timestep_s) - round(_FLOAT_WINDOW_S / timestep_s))
+    objects = []
+    for spec in moving:
+        start, end = np.asarray(spec.world_from_object), _finite(physics.pose(spec.id))
+        moved, turned = pose_change(start, end)
+        drop = float(start[2, 3] - end[2, 3])
+        objects.append(
+            {
+                "id": spec.id,
+                "name": spec.name,
+                "moved_m": round(moved, 6),
+                "turned_deg": round(turned, 4),
+                "drop_m": round(drop, 6),
+                "floating": bool(start[2, 3] - early[spec.id][2, 3] > _FLOAT_DROP_M),
+                "stable": bool(moved < 0.02 and turned < 5.0),
+                "stable_10cm_0.1rad": bool(moved < 0.1 and np.deg2rad(turned) < 0.1),
+                "stable_5cm_drop_5deg": bool(drop < 0.05 and turned < 5.0),
+            }
+        )
+
+    def rate(key: str, empty: float) -> float:
+        return float(np.mean([o[key] for o in objects])) if objects else empty
+
+    penetration = 0.0 if deepest is None else max(0.0, -deepest.separation_m * 1e3)
+    return {
+        "duration_s": duration_s,
+        "timestep_s": timestep_s,
+        "dynamic_objects": len(objects),
+        "fixed_objects": sum(not s.dynamic and not s.base for s in specs),
+        "stable_rate": rate("stable", 1.0),
+        "stable_rate_10cm_0.1rad": rate("stable_10cm_0.1rad", 1.0),
+        "stable_rate_5cm_drop_5deg": rate("stable_5cm_drop_5deg", 1.0),
+        "floating_rate": rate("floating", 0.0),
+        "spawn_penetration_mm": round(penetration, 4),
+        "spawn_penetration_between": [] if deepest is None else [names[deepest.first], names[deepest.second]],
+        "objects": objects,
+    }
+
+
+def pose_change(start: np.ndarray, end: np.ndarray) -> tuple[float, float]:
+    """Return how far (m) and by how many degrees a pose changed."""
+    moved = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
+    # atan2 of the quaternion keeps small angles exact, where arccos of the trace does not.
+    quat = quat_from_matrix(start[:3, :3].T @ end[:3, :3])
+    return moved, float(np.degrees(2 * np.arctan2(np.linalg.norm(quat[1:]), abs(quat[0]))))
+
+
+def specs_from_bundle(bundle: Any) -> list[BodySpec]:
+    """Read the bodies of a scene bundle (`bundle.scene` as CONTRACT section 2, `bundle.resolve(path)`)."""
+    scene = bundle.scene
+    where = f"bundle '{scene.get('id', '?')}'"
+    fixed_to = {e["child"]: e["parent"] for e in scene["graph"]["edges"] if e["relation"] == "attached_to"}
+    specs = []
+    for base in scene["base"]:
+        if not base.get("collision"):
+            raise BundleError(
+                f"{where}: base {base['id']} ({base['label']}) has no collision slab, so nothing can stand on it; "
+                "run `simrecon reconstruct` again to write one"
+            )
+        parts = tuple(read_obj_points(bundle.resolve(path)) for path in base["collision"])
+        name = f"{base['label']}_{base['id']}"
+        specs.append(
+            BodySpec(base["id"], name, parts, 0.0, np.zeros(3), None, 0.5, 0.0, np.eye(4), False, base=True)
+        )
+    for item in scene["objects"]:
+        inertia = item.get("inertia")
+        specs.append(
+            BodySpec(
+                id=item["id"],
+                name=f"{item['label']}_{item['id']}",
+                parts=tuple(read_obj_points(bundle.resolve(path)) for path in item["collision"]),
+                mass_kg=float(item["mass_kg"]),
+                center_of_mass=np.asarray(item["center_of_mass"], np.float64),
+                inertia=None if inertia is None else np.asarray(inertia, np.float64),
+                friction=float(item["friction"]),
+                restitution=float(item["restitution"]),
+                world_from_object=np.asarray(item["world_from_object"], np.float64),
+                dynamic=bool(item["dynamic"]),
+                fixed_to=fixed_to.get(item["id"]),
+            )
+        )
+    return specs
+
+
+def read_obj_points(path: Any) -> np.ndarray:
+    """Read the vertices (v, 3) of a Wavefront .obj file; a convex piece needs nothing else."""
+    points = []
+    with open(path, encoding="utf-8") as file:
+        for line in file:
+            if line.startswith("v "):
+                points.append([float(x) for x in line.split()[1:4]])
+    out = np.asarray(points, np.float64)
+    if out.ndim != 2 or out.shape[1:] != (3,) or len(out) < 4 or not np.isfinite(out).all():
+        raise BundleError(f"{path}: not a convex piece (needs at least 4 finite vertices)")
+    return out
+
+
+def _sapien() -> tuple[Any, Any]:
+    """Import SAPIEN when it is first needed."""
+    try:
+        import sapien
+        from sapien import physx
+    except ImportError as error:
+        raise EnvironmentMissing(
+            f"physics needs SAPIEN, which cannot be imported ({error}); run `pip install sapien`, "
+            "then `simrecon doctor`"
+        ) from error
+    return sapien, physx
+
+
+def _pose(sapien: Any, world_from_object: np.ndarray) -> Any:
+    m = np.asarray(world_from_object, np.float64)
+    return sapien.Pose(m[:3, 3].astype(np.float32), quat_from_matrix(m[:3, :3]).astype(np.float32))
+
+
+def _finite(pose: np.ndarray) -> np.ndarray:
+    """Replace a pose that diverged or left the world by a finite one far away."""
+    if np.isfinite(pose).all() and np.abs(pose[:3, 3]).max() < _FAR_AWAY_M:
+        return pose
+    return rigid(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, -_FAR_AWAY_M]))
+
+
+def _convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) -> Any:
+    """Cook one convex piece; pieces that are flat get a minimal thickness first."""
+    points = np.asarray(part, np.float64)
+    center = points.mean(0)
+    _, _, axes = np.linalg.svd(points - center, full_matrices=False)
+    thin = axes[-1]
+    along = (points - center) @ thin
+    if np.ptp(along) < _MIN_PART_THICKNESS_M:
+        flat = points - along[:, None] * thin
+        half = 0.5 * _MIN_PART_THICKNESS_M * thin
+        points = np.concatenate([flat - half, flat + half])
+    if len(points) > _MAX_PART_VERTICES:
+        points = _most_extreme(points, _MAX_PART_VERTICES)
+    try:
+        return physx.PhysxCollisionShapeConvexMesh(
+            vertices=points.astype(np.float32), scale=np.ones(3, np.float32), material=material
+        )
+    except RuntimeError as error:
+        raise SimReconError(
+            f"physics: PhysX cannot use a convex piece of '{spec.name}' (id {spec.id}, {len(points)} points, "
+            f"extents {np.round(np.ptp(points, axis=0), 4).tolist()} m): {error}"
+        ) from error
+
+
+def _most_extreme(points: np.ndarray, count: int) -> np.ndarray:
+    """Keep the points that are extreme along evenly spread directions; the hull hardly changes."""
+    i = np.arange(count * 4) + 0.5
+    polar, turn = np.arccos(1 - 2 * i / len(i)), np.pi * (1 + 5**0.5) * i
+    directions = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)])
+    keep = np.unique(np.argmax(points @ directions, axis=0))
+    return points[keep[:count]]
+
+
+def _set_inertial(sapien: Any, body: Any, spec: BodySpec) -> None:
+    if not spec.mass_kg > 0:
+        raise SimReconError(
+            f"physics: '{spec.name}' (id {spec.id}) has mass {spec.mass_kg} kg, expected more than 0"
+        )
+    if spec.inertia is None:
+        scale = spec.mass_kg / float(body.mass)
+        inertia = np.asarray(body.inertia, np.float64) * scale
+        pose = body.cmass_local_pose
+        pose = sapien.Pose(np.asarray(spec.center_of_mass, np.float32), pose.q)
+    else:
+        inertia, axes = np.linalg.eigh(0.5 * (spec.inertia + spec.inertia.T))
+        if np.linalg.det(axes) < 0:
+            axes[:, 0] *= -1
+        pose = _pose(sapien, rigid(axes, spec.center_of_mass))
+    # A tensor that no real body can have (from a noisy mesh) makes PhysX explode: keep it within a thin rod's.
+    inertia = np.maximum(inertia, max(1e-3 * float(np.max(inertia)), 1e-9))
+    body.mass = spec.mass_kg
+    body.cmass_local_pose = pose
+    body.inertia = inertia.astype(np.float32)
