@@ -1,0 +1,49 @@
+"""Gymnasium environments of reconstructed scenes.
+
+Importing this package registers every scene of the default registry as `SimRecon/<scene id>`, reading only the
+registry's index:
+
+    import gymnasium as gym, simrecon_envs
+    env = gym.make("SimRecon/scene0001")                # batched torch tensors, as every ManiSkill environment
+    env = simrecon_envs.make_cpu("scene0001")           # unbatched NumPy, for stable-baselines3 and the like
+
+Nothing heavy (torch, sapien, mani_skill) is loaded before the first `make`.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from simrecon_envs.errors import SceneAssetsMissing
+from simrecon_envs.registration import env_id, make, make_cpu, register_default_scenes, register_scenes
+
+if TYPE_CHECKING:
+    from simrecon_envs.rollout import record_rollout, render_scene_picture
+    from simrecon_envs.scene_env import SceneEnv
+
+__all__ = [
+    "SceneAssetsMissing",
+    "SceneEnv",
+    "env_id",
+    "make",
+    "make_cpu",
+    "record_rollout",
+    "register_scenes",
+    "render_scene_picture",
+]
+
+_LAZY = {
+    "SceneEnv": "simrecon_envs.scene_env",
+    "record_rollout": "simrecon_envs.rollout",
+    "render_scene_picture": "simrecon_envs.rollout",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs the simulator on first use."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_LAZY[name]), name)
+
+
+register_default_scenes()

@@ -1,0 +1,153 @@
+"""Which robots can be used here, and what shape they have at rest."""
+
+import contextlib
+import difflib
+import functools
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from registry import EnvironmentMissing, UsageError
+
+_SAMPLE_SPACING_M = 0.02
+
+
+@dataclass(frozen=True)
+class RobotTraits:
+    """What placement needs to know of a robot; lengths in metres."""
+
+    mobile: bool
+    """Stands on the floor and drives; others are mounted, at the height of what the target stands on."""
+    reach_m: tuple[float, float, float]
+    """Least, best and greatest horizontal distance from the root to something to grasp."""
+    work_height_m: tuple[float, float]
+    """Least and greatest height of something to grasp above the root."""
+    gripper_opening_m: float
+    payload_kg: float
+    footprint_radius_m: float
+
+
+_ARM = RobotTraits(False, (0.35, 0.50, 0.68), (-0.25, 0.60), 0.08, 3.0, 0.13)
+_SMALL_ARM = RobotTraits(False, (0.15, 0.22, 0.32), (-0.10, 0.20), 0.06, 0.3, 0.08)
+TRAITS = {
+    "panda": _ARM,
+    "panda_wristcam": _ARM,
+    "fetch": RobotTraits(True, (0.60, 0.75, 0.95), (0.30, 1.20), 0.10, 3.0, 0.30),
+    "so100": _SMALL_ARM,
+    "koch-v1.1": _SMALL_ARM,
+}
+"""Robots that were tried here. Others are treated as an arm like the panda."""
+
+
+@dataclass(frozen=True)
+class RobotShape:
+    """Collision geometry at the rest pose, in the robot's root space."""
+
+    points: np.ndarray  # float64 (n, 3) on its surface
+    rest_qpos: np.ndarray  # float64 (d,)
+    has_gripper: bool  # it can tell whether it grasps an object
+
+
+def usable_robots() -> list[str]:
+    """Return the ManiSkill robots whose files are on this machine."""
+    return sorted(uid for uid, agent in _agents().items() if _file_of(agent) is not None)
+
+
+def check_robot(uid: str) -> None:
+    """Make sure that a robot can be built; ManiSkill itself would ask on the terminal and exit.
+
+    Raises:
+        UsageError: there is no such robot.
+        EnvironmentMissing: its files are not here.
+    """
+    agents = _agents()
+    listed = ", ".join(usable_robots())
+    if uid not in agents:
+        near = difflib.get_close_matches(str(uid), agents, n=1)
+        meant = f" Did you mean {near[0]!r}?" if near else ""
+        raise UsageError(f"robot {uid!r} is not known to ManiSkill.{meant} Usable here: {listed}")
+    if _file_of(agents[uid]) is None:
+        raise EnvironmentMissing(
+            f"robot {uid!r}: its files are not on this machine; get them with "
+            f"`python -m mani_skill.utils.download_asset {uid}`. Usable here: {listed}"
+        )
+
+
+def traits_of(uid: str) -> RobotTraits:
+    """Return what is known of a robot."""
+    return TRAITS.get(uid, _ARM)
+
+
+@functools.lru_cache(maxsize=8)
+def robot_shape(uid: str) -> RobotShape:
+    """Build a robot alone in an empty scene, without rendering, and sample its collision shapes at rest."""
+    import sapien
+    import torch
+    from mani_skill.envs.scene import ManiSkillScene
+    from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
+
+    backend = parse_sim_and_render_backend("physx_cpu", "none")
+    scene = ManiSkillScene(
+        [sapien.Scene([sapien.physx.PhysxCpuSystem()])], device=torch.device("cpu"), backend=backend
+    )
+    agent = _agents()[uid](scene, 20, initial_pose=sapien.Pose())
+    qpos = rest_qpos(agent)
+    agent.robot.set_qpos(torch.as_tensor(qpos, dtype=torch.float32)[None])
+    clouds = []
+    for link in agent.robot.get_links():
+        body = link._objs[0]
+        for shape in body.collision_shapes:
+            pose = body.entity.pose * shape.local_pose
+            clouds.append(_surface_points(shape) @ pose.to_transformation_matrix()[:3, :3].T + pose.p)
+    points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
+    # One point a cell is enough, and much less to test.
+    _, kept = np.unique(np.floor(points / _SAMPLE_SPACING_M), axis=0, return_index=True)
+    return RobotShape(points[np.sort(kept)], qpos, hasattr(agent, "is_grasping") and hasattr(agent, "tcp"))
+
+
+def rest_qpos(agent: object) -> np.ndarray:
+    """Return the joint positions (d,) of a robot's rest keyframe, or of its first one, or zeros."""
+    frames = agent.keyframes
+    frame = frames.get("rest") or next(iter(frames.values()), None)
+    if frame is None or frame.qpos is None:
+        return np.zeros(agent.robot.max_dof)
+    return np.asarray(frame.qpos, dtype=np.float64)
+
+
+def _surface_points(shape: object) -> np.ndarray:
+    """Return points (n, 3) on a PhysX shape, in its own space, no farther apart than the sample spacing."""
+    import trimesh
+    from sapien import physx
+
+    if isinstance(shape, physx.PhysxCollisionShapeBox):
+        mesh = trimesh.creation.box(2 * np.asarray(shape.half_size))
+    elif isinstance(shape, physx.PhysxCollisionShapeSphere):
+        mesh = trimesh.creation.icosphere(radius=shape.radius, subdivisions=2)
+    elif isinstance(shape, physx.PhysxCollisionShapeCapsule | physx.PhysxCollisionShapeCylinder):
+        # SAPIEN's cylinders lie along x; a capsule is a cylinder for this purpose, a little longer.
+        caps = 2 * shape.radius if isinstance(shape, physx.PhysxCollisionShapeCapsule) else 0.0
+        mesh = trimesh.creation.cylinder(shape.radius, 2 * shape.half_length + caps)
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+    elif isinstance(shape, physx.PhysxCollisionShapePlane):
+        return np.zeros((0, 3))
+    else:
+        mesh = trimesh.Trimesh(np.asarray(shape.vertices) * np.asarray(shape.scale), shape.triangles, process=False)
+    vertices, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SAMPLE_SPACING_M, max_iter=12)
+    return np.asarray(vertices)
+
+
+def _agents() -> dict[str, type]:
+    import mani_skill.agents.robots  # noqa: F401 - importing it registers the robots
+    from mani_skill.agents.registration import REGISTERED_AGENTS
+
+    return {uid: spec.agent_cls for uid, spec in REGISTERED_AGENTS.items()}
+
+
+def _file_of(agent: type) -> str | None:
+    from mani_skill import format_path
+
+    path = agent.urdf_path or agent.mjcf_path
+    with contextlib.suppress(KeyError, IndexError, ValueError):
+        path = format_path(str(path)) if path else None
+    return path if path and os.path.exists(path) else None

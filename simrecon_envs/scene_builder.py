@@ -1,0 +1,324 @@
+"""A scene bundle in a ManiSkill scene: actors are built once per reconfigure, posed once per reset.
+
+| in the bundle                                             | actor                                              |
+|-----------------------------------------------------------|----------------------------------------------------|
+| floor, wall, ceiling                                      | static, convex slabs (a box behind the plane where the bundle has none) |
+| object, `dynamic: false`                                  | static                                             |
+| object attached to something that is (in the end) static  | static                                             |
+| object attached to a dynamic one                          | welded: shapes, mass and inertia join the parent's actor |
+| other objects                                             | dynamic, with the bundle's mass, centre of mass, inertia, friction, restitution |
+
+Welding is the stiffest fixed joint there is: no drive that could stretch, on the CPU and on the GPU alike.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.building.actor_builder import ActorBuilder
+from mani_skill.utils.structs.actor import Actor
+from mani_skill.utils.structs.pose import Pose
+from sapien import physx
+
+from registry import SceneBundle
+from registry.geometry import (
+    WORLD_FROM_GLTF,
+    invert_rigid,
+    matrix_from_quat,
+    quat_from_matrix,
+
+    transform_points,
+)
+
+# The same shapes and masses as in the report card that the bundle carries.
+from registry.simulation import BodySpec, _convex_shape, _set_inertial
+from simrecon_envs.occupancy import ConvexSolid, base_slab, glb_vertices, read_obj_vertices, slab_corners
+
+BASE_FRICTION = 0.5
+BASE_RESTITUTION = 0.0
+_GROUND_BELOW_FLOOR_M = 0.002
+_GROUND_MARGIN_M = 6.0
+# Fetch's wheels and base do not collide with what it drives on (bits as in mani_skill.agents.robots.fetch).
+_WHEEL_BIT, _BASE_BIT = 30, 31
+
+
+@dataclass(frozen=True)
+class Body:
+    """One actor to be: an object and what is welded to it. `specs` and `visuals` are in the root object's space."""
+
+    root: int
+    name: str
+    specs: tuple[BodySpec, ...]  # the root first
+    visuals: tuple[tuple[str, np.ndarray], ...]  # (file, root_from_object (4, 4))
+    world_from_root: np.ndarray  # float64 (4, 4)
+    dynamic: bool
+
+
+@dataclass(frozen=True)
+class PlacedObject:
+    """Where to find an object of the bundle in the simulator."""
+
+    id: int
+    label: str
+    actor: Actor
+    actor_from_object: np.ndarray  # float64 (4, 4); not the identity for what is welded to another object
+    dynamic: bool
+
+
+class SceneBuilder:
+    """Builds a bundle's actors (`build`) and poses them (`initialize`)."""
+
+    def __init__(self, bundle: SceneBundle) -> None:
+        """Read what will be built; nothing is created in a simulator yet."""
+        self.bundle = bundle
+        self.bodies = bodies_of(bundle)
+        self.movable_ids = {body.root for body in self.bodies if body.dynamic}
+        self.objects: dict[int, PlacedObject] = {}
+
+    @property
+    def movable_actors(self) -> list[PlacedObject]:
+        """Return the dynamic actors, in the order of the bundle."""
+        return [self.objects[body.root] for body in self.bodies if body.dynamic]
+
+    def build(self, scene: object, pedestal: tuple[np.ndarray, float, float] | None = None) -> None:
+        """Create all actors in a ManiSkill scene.
+
+        Args:
+            scene: The `ManiSkillScene`.
+            pedestal: (position (3,) of its top, height, radius) of a stand for the robot, or None.
+        """
+        self.objects = {}
+        self._build_base(scene)
+        for body in self.bodies:
+            actor = _BodyBuilder(scene, body).build(name=body.name)
+            for spec in body.specs:
+                root_from_object = invert_rigid(body.world_from_root) @ spec.world_from_object
+                label = next(o.label for o in self.bundle.objects if o.id == spec.id)
+                self.objects[spec.id] = PlacedObject(spec.id, label, actor, root_from_object, body.dynamic)
+        if pedestal is not None:
+            _build_pedestal(scene, *pedestal)
+
+    def initialize(
+        self, env_idx: torch.Tensor, device: torch.device, noise: tuple[float, float], rng: object
+    ) -> None:
+        """Put the dynamic actors of the environments `env_idx` (b,) where the bundle has them.
+
+        Args:
+            env_idx: Which parallel environments are reset.
+            device: Where the simulator's tensors live.
+            noise: Standard deviations of a random shift (m, horizontal) and turn (rad, about +z).
+            rng: ManiSkill's batched generator; `rng[env_idx].normal(size=...)`.
+        """
+        for body in self.bodies:
+            if not body.dynamic:
+                continue
+            count = len(env_idx)
+            position = np.repeat(body.world_from_root[None, :3, 3], count, axis=0)
+            rotation = np.repeat(body.world_from_root[None, :3, :3], count, axis=0)
+            if noise[0] > 0 or noise[1] > 0:
+                draws = np.asarray(rng[env_idx.cpu().numpy()].normal(size=3)).reshape(count, 3)
+                position[:, :2] += noise[0] * np.clip(draws[:, :2], -2, 2)
+                half = 0.5 * noise[1] * np.clip(draws[:, 2], -2, 2)
+                zero = np.zeros(count)
+                rotation = matrix_from_quat(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)) @ rotation
+            self.objects[body.root].actor.set_pose(
+                Pose.create_from_pq(
+                    torch.as_tensor(position, dtype=torch.float32, device=device),
+                    torch.as_tensor(quat_from_matrix(rotation), dtype=torch.float32, device=device),
+                )
+            )
+
+    def _build_base(self, scene: object) -> None:
+        ground = scene.create_actor_builder()
+        material = physx.PhysxMaterial(BASE_FRICTION, BASE_FRICTION, BASE_RESTITUTION)
+        # Below everything, so that nothing falls for ever where the reconstructed floor ends.
+        ground.add_plane_collision(
+            sapien.Pose([0, 0, -_GROUND_BELOW_FLOOR_M], [0.7071068, 0, -0.7071068, 0]), material
+        )
+        ground.initial_pose = sapien.Pose()
+        drivable = [ground.build_static(name="ground")]
+        for base in self.bundle.base:
+            clouds = base_clouds(self.bundle, base)
+            spec = BodySpec(
+                id=base.id,
+                name=f"{base.label}_{base.id}",
+                parts=tuple(clouds),
+                mass_kg=0.0,
+                center_of_mass=np.zeros(3),
+                inertia=None,
+                friction=BASE_FRICTION,
+                restitution=BASE_RESTITUTION,
+                world_from_object=np.eye(4),
+                dynamic=False,
+                base=True,
+            )
+            visual = ((str(self.bundle.resolve(base.mesh)), np.eye(4)),)
+            body = Body(base.id, spec.name, (spec,), visual, np.eye(4), False)
+            actor = _BodyBuilder(scene, body).build(name=spec.name)
+            if base.label == "floor":
+                drivable.append(actor)
+        for actor in drivable:
+            for bit in (_WHEEL_BIT, _BASE_BIT):
+                actor.set_collision_group_bit(group=2, bit_idx=bit, bit=1)
+
+
+class _BodyBuilder(ActorBuilder):
+    """An actor builder whose PhysX component is made of a `Body`'s convex parts.
+
+    ManiSkill's own drops a part that PhysX cannot cook without a word; this one raises.
+    """
+
+    def __init__(self, scene: object, body: Body) -> None:
+        super().__init__()
+        self.set_scene(scene)
+        self._body = body
+        self.set_physx_body_type("dynamic" if body.dynamic else "static")
+        self.initial_pose = _pose(body.world_from_root)
+        if scene.can_render():
+            for file, root_from_object in body.visuals:
+                self.add_visual_from_file(file, pose=_pose(root_from_object @ WORLD_FROM_GLTF))
+
+    def build_physx_component(self, link_parent: object = None) -> physx.PhysxBaseComponent:
+        """Create the rigid body with its shapes."""
+        body = self._body
+        component = physx.PhysxRigidDynamicComponent() if body.dynamic else physx.PhysxRigidStaticComponent()
+        for spec in body.specs:
+            root_from_object = invert_rigid(body.world_from_root) @ spec.world_from_object
+            material = physx.PhysxMaterial(spec.friction, spec.friction, spec.restitution)
+            for part in spec.parts:
+                shape = _convex_shape(physx, transform_points(root_from_object, part), material, spec)
+                shape.set_collision_groups(self.collision_groups)
+                component.attach(shape)
+        if body.dynamic:
+            _set_inertial(sapien, component, merged_mass(body))
+            component.set_linear_damping(0.0)
+            component.set_angular_damping(0.0)
+        component.name = self.name
+        return component
+
+
+def bodies_of(bundle: SceneBundle) -> list[Body]:
+    """Group the bundle's objects into actors: what is attached to a dynamic object belongs to its actor."""
+    items = {item.id: item for item in bundle.objects}
+    edge_of = {edge.child: edge for edge in bundle.edges}
+
+    def moves(key: int) -> bool:
+        """Tell whether an object can move; one that is attached moves if what it is attached to does."""
+        if key not in items or not items[key].dynamic:
+            return False
+        edge = edge_of.get(key)
+        return edge is None or edge.relation != "attached_to" or moves(edge.parent)
+
+    def root_of(key: int) -> int:
+        edge = edge_of.get(key)
+        welded = edge is not None and edge.relation == "attached_to" and moves(key)
+        return root_of(edge.parent) if welded else key
+
+    members: dict[int, list[int]] = {}
+    for key in items:
+        # What is attached to a dynamic object follows it even where the bundle calls it not dynamic.
+        edge = edge_of.get(key)
+        follows = edge is not None and edge.relation == "attached_to" and moves(edge.parent)
+        root = root_of(edge.parent) if follows else root_of(key)
+        members.setdefault(root, []).append(key)
+    bodies = []
+    for root in items:
+        if root not in members:
+            continue
+        keys = [root, *(key for key in members[root] if key != root)]
+        world_from_root = items[root].world_from_object
+        specs = tuple(_spec(bundle, items[key]) for key in keys)
+        visuals = tuple(
+            (str(bundle.resolve(items[key].visual)), invert_rigid(world_from_root) @ items[key].world_from_object)
+            for key in keys
+        )
+        bodies.append(
+            Body(root, f"{items[root].label}_{root}", specs, visuals, np.asarray(world_from_root), moves(root))
+        )
+    return bodies
+
+
+def merged_mass(body: Body) -> BodySpec:
+    """Return a spec in the root's space whose mass, centre of mass and inertia are those of all specs together."""
+    if len(body.specs) == 1:
+        return replace(body.specs[0], world_from_object=np.eye(4))
+    total = sum(spec.mass_kg for spec in body.specs)
+    placed = [(spec, invert_rigid(body.world_from_root) @ spec.world_from_object) for spec in body.specs]
+    centers = [transform_points(pose, spec.center_of_mass[None])[0] for spec, pose in placed]
+    center = sum(spec.mass_kg * c for (spec, _), c in zip(placed, centers)) / total
+    inertia = np.zeros((3, 3))
+    for (spec, pose), c in zip(placed, centers):
+        own = spec.inertia if spec.inertia is not None else _box_inertia(spec)
+        arm = c - center
+        inertia += pose[:3, :3] @ own @ pose[:3, :3].T
+        inertia += spec.mass_kg * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return replace(
+        body.specs[0], mass_kg=total, center_of_mass=center, inertia=inertia, world_from_object=np.eye(4)
+    )
+
+
+def base_clouds(bundle: SceneBundle, base: object) -> list[np.ndarray]:
+    """Return the convex parts (v, 3) of a base entity in world space."""
+    if base.collision:
+        return [read_obj_vertices(bundle.resolve(path)) for path in base.collision]
+    return [slab_corners(base_slab(base.plane, glb_vertices(bundle.resolve(base.mesh))))]
+
+
+def scene_extent(solids: list[ConvexSolid]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the box (lower (3,), upper (3,)) of everything."""
+    if not solids:
+        return np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0])
+    return np.min([s.lower for s in solids], axis=0), np.max([s.upper for s in solids], axis=0)
+
+
+def _spec(bundle: SceneBundle, item: object) -> BodySpec:
+    return BodySpec(
+        id=item.id,
+        name=f"{item.label}_{item.id}",
+        parts=tuple(read_obj_vertices(bundle.resolve(path)) for path in item.collision),
+        mass_kg=item.mass_kg,
+        center_of_mass=item.center_of_mass,
+        inertia=item.inertia,
+        friction=item.friction,
+        restitution=item.restitution,
+        world_from_object=item.world_from_object,
+        dynamic=item.dynamic,
+    )
+
+
+def _box_inertia(spec: BodySpec) -> np.ndarray:
+    size = np.ptp(np.concatenate(spec.parts), axis=0)
+    return spec.mass_kg / 12 * np.diag(size @ size - size**2)
+
+
+def _build_pedestal(scene: object, top: np.ndarray, height: float, radius: float) -> None:
+    builder = scene.create_actor_builder()
+    half = [radius, radius, height / 2]
+    builder.add_box_collision(half_size=half)
+    if scene.can_render():
+        builder.add_box_visual(half_size=half, material=_matte([0.22, 0.23, 0.25, 1.0]))
+    builder.initial_pose = sapien.Pose([top[0], top[1], top[2] - height / 2])
+    builder.build_static(name="pedestal")
+
+
+def build_ground_visual(scene: object, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Add a plain plate around and below the scene, for pictures only."""
+    half = (upper - lower)[:2] / 2 + _GROUND_MARGIN_M
+    center = (upper + lower)[:2] / 2
+    builder = scene.create_actor_builder()
+    builder.add_box_visual(half_size=[half[0], half[1], 0.01], material=_matte([0.55, 0.55, 0.55, 1.0]))
+    # A collision-free actor; well below the reconstructed floor, which may lie a little under z = 0.
+    builder.initial_pose = sapien.Pose([center[0], center[1], -0.06])
+    builder.build_kinematic(name="ground_plate")
+
+
+def _matte(color: list[float]) -> "sapien.render.RenderMaterial":
+    return sapien.render.RenderMaterial(base_color=color, roughness=1.0, specular=0.0, metallic=0.0)
+
+
+def _pose(matrix: np.ndarray) -> sapien.Pose:
+    return sapien.Pose(matrix[:3, 3].astype(np.float32), quat_from_matrix(matrix[:3, :3]).astype(np.float32))
+
+
+__all__ = ["Body", "PlacedObject", "SceneBuilder", "bodies_of", "build_ground_visual", "merged_mass"]
