@@ -15,6 +15,7 @@ from registry.geometry import matrix_from_quat, quat_from_matrix, rigid
 
 TIMESTEP_S = 1 / 240
 VERIFY_DURATION_S = 10.0
+BASE_FRICTION, BASE_RESTITUTION = 0.5, 0.0  # of floors and walls; PhysX averages them with the object's own
 # PhysX cooks at most 255 vertices per convex; a flat point set cannot be cooked at all and is thickened to this.
 _MAX_PART_VERTICES = 255
 _MIN_PART_THICKNESS_M = 1e-3
@@ -301,7 +302,19 @@ def specs_from_bundle(bundle: Any) -> list[BodySpec]:
         parts = tuple(read_obj_points(bundle.resolve(path)) for path in base["collision"])
         name = f"{base['label']}_{base['id']}"
         specs.append(
-            BodySpec(base["id"], name, parts, 0.0, np.zeros(3), None, 0.5, 0.0, np.eye(4), False, base=True)
+            BodySpec(
+                base["id"],
+                name,
+                parts,
+                0.0,
+                np.zeros(3),
+                None,
+                BASE_FRICTION,
+                BASE_RESTITUTION,
+                np.eye(4),
+                False,
+                base=True,
+            )
         )
     for item in scene["objects"]:
         inertia = item.get("inertia")

@@ -115,8 +115,15 @@ class GeometryRelations:
         if not gaps:
             return []
         table = np.stack(gaps)  # (candidates, cells), NaN where nothing is near
-        # The highest surface wins a cell: a plate between a bowl and a table carries the bowl.
+        # The highest surface wins a cell: a plate between a bowl and a table carries the bowl. What itself rests on
+        # another candidate hides that one, even where noise has pushed the lower surface through the upper one.
         filled = np.where(np.isnan(table), np.inf, table)
+        for upper, carrier in enumerate(carriers):
+            hidden = [
+                row for row, other in enumerate(carriers) if row != upper and self._rests_on(carrier, other)
+            ]
+            for row in [*hidden, *range(len(carriers), len(ids))]:
+                filled[row, ~np.isnan(table[upper])] = np.inf
         winner = np.where(np.isfinite(filled.min(axis=0)), filled.argmin(axis=0), -1)
         out = []
         for row, (parent, name) in enumerate(zip(ids, names)):
@@ -135,6 +142,14 @@ class GeometryRelations:
                 _Candidate("supported_by", parent, score, evidence + (", as its view suggests" * (prior > 1)))
             )
         return sorted(out, key=lambda c: (-c.score, c.parent))
+
+    def _rests_on(self, upper: SampledObject, lower: SampledObject) -> bool:
+        """Tell whether one carrier plainly lies on another."""
+        apart = np.any(upper.low[:2] > lower.high[:2]) or np.any(upper.high[:2] < lower.low[:2])
+        if apart or not self._is_above(upper, lower):
+            return False
+        gap = self._gap(upper, lower, False)
+        return float(np.sum(_closeness(gap, self.config, False))) / len(gap) > 0.3
 
     def _gap(self, child: SampledObject, parent: SampledObject, deep: bool) -> np.ndarray:
         """Return per cell of the child's underside its height above the parent's highest surface there; NaN: none."""

@@ -1,0 +1,146 @@
+"""Stage 9: assets and graph -> a scene at rest in SAPIEN, with its physics report card.
+
+Base static; breadth first from it each object is placed clear of everything, let go, and held where it settles; then
+all of them are let go together, settled and measured as CONTRACT section 4 says. Whatever does not stand is repaired in
+bounded ways, and what was done is written into `PlacedObject.repair`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruction.assembly.base import base_slabs
+from reconstruction.assembly.config import ASSEMBLY_PRESETS, AssemblyConfig
+from reconstruction.assembly.place import Placement, Placer, base_specs
+from reconstruction.assembly.workbench import object_spec
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.scene_graph.merge import breadth_first
+from reconstruction.types import AssembledScene, AssetSet, PlacedObject, SceneGraph
+from registry.errors import SimReconError
+from registry.simulation import TIMESTEP_S, BodySpec, build_physics, physics_report, pose_change
+
+VERSION = 1
+
+
+def assemble(
+    assets: AssetSet, graph: SceneGraph, config: AssemblyConfig, *, progress: Progress = NO_PROGRESS
+) -> AssembledScene:
+    """Build the scene in physics, parents first, and leave it at rest."""
+    by_id = {o.id: o for o in assets.objects}
+    edges = breadth_first(graph.edges, [b.id for b in assets.base])
+    missing = sorted(set(by_id) - {e.child for e in edges})
+    if missing:
+        raise SimReconError(
+            f"assembly: the scene graph does not connect objects {missing} to the base; "
+            "every object needs exactly one parent and there must be no cycle"
+        )
+    progress.start(len(edges) + config.joint_rounds, "placing objects")
+    placer = Placer(assets, config)
+    for edge in _lowest_first(edges, by_id):
+        placement = placer.place(by_id[edge.child], edge)
+        for note in placement.notes if not placement.stands else ():
+            progress.note(f"assembly: {by_id[edge.child].label} {edge.child}: {note}")
+        progress.advance()
+    report = _settle_together(placer, base_specs(assets), config, progress)
+    stable = {entry["id"]: entry["stable"] for entry in report["objects"]}
+    order = [o.id for o in assets.objects]
+    placed = tuple(_finish(placer.placed[i], stable.get(i, True)) for i in order)
+    edges = [placer.placed[e.child].edge for e in graph.edges]
+    return AssembledScene(placed, SceneGraph(tuple(edges)), report)
+
+
+def scene_specs(placements: list[Placement], base: list[BodySpec]) -> list[BodySpec]:
+    """Describe the placed scene to the physics, as the bundle will."""
+    specs = list(base)
+    for p in placements:
+        fixed_to = p.edge.parent if p.edge.relation == "attached_to" and p.dynamic else None
+        specs.append(object_spec(p.asset, p.parts, p.pose, dynamic=p.dynamic, fixed_to=fixed_to))
+    return specs
+
+
+def _lowest_first(edges: list, by_id: dict) -> list:
+    """Order edges by depth in the graph, then by height, so that stacks and crowds fill from below."""
+    depth: dict[int, int] = {}
+    for edge in edges:
+        depth[edge.child] = depth.get(edge.parent, 0) + 1
+    return sorted(
+        edges, key=lambda e: (depth[e.child], float(by_id[e.child].world_from_object[2, 3]), e.child)
+    )
+
+
+def _settle_together(
+    placer: Placer, base: list[BodySpec], config: AssemblyConfig, progress: Progress
+) -> dict:
+    """Let everything go at once, take the poses at rest, measure; repair what moves, and again."""
+    best: tuple[tuple, dict[int, Placement], dict] | None = None
+    for round_number in range(config.joint_rounds):
+        _joint_settle(placer, base, config.joint_settle_s)
+        report = physics_report(scene_specs(list(placer.placed.values()), base))
+        progress.advance()
+        key = (-report["stable_rate"], report["floating_rate"], report["spawn_penetration_mm"] > 1.0)
+        if best is None or key < best[0]:
+            best = key, dict(placer.placed), report
+        if key == (-1.0, 0.0, False) or round_number == config.joint_rounds - 1:
+            break
+        _repair_movers(placer, report)
+    assert best is not None
+    placer.placed = best[1]
+    report = best[2]
+    unstable = [entry["id"] for entry in report["objects"] if not entry["stable"]]
+    if unstable and config.freeze_unstable:
+        for i in unstable:
+            note = "made immovable: it does not stay where it was seen"
+            placer.placed[i] = placer.placed[i].noted(note, dynamic=False)
+        report = physics_report(scene_specs(list(placer.placed.values()), base))
+    for i in unstable:
+        progress.note(
+            f"assembly: {placer.placed[i].asset.label} {i} does not stay put for {report['duration_s']:g} s"
+        )
+    return report
+
+
+def _joint_settle(placer: Placer, base: list[BodySpec], limit_s: float) -> None:
+    """Let all objects go from where they are, damped, then free, and take over where they come to rest."""
+    physics = build_physics(scene_specs(list(placer.placed.values()), base))
+    moving = [i for i, p in placer.placed.items() if p.dynamic]
+    chunk = round(0.1 / TIMESTEP_S)
+    for damping, seconds in ((5.0, limit_s), (0.0, 0.5)):
+        for i in moving:
+            physics.set_damping(i, damping, damping)
+        for _ in range(max(1, round(seconds / 0.1))):
+            before = {i: physics.pose(i) for i in moving}
+            physics.step(chunk)
+            changes = [pose_change(before[i], physics.pose(i)) for i in moving]
+            if all(moved < 1e-5 and turned < 0.01 for moved, turned in changes):
+                break
+    for i in moving:
+        pose = physics.pose(i)
+        moved, turned = pose_change(placer.placed[i].pose, pose)
+        # What flies off in this phase is left where it was placed: the report will say that it does not stand.
+        if np.isfinite(pose).all() and moved < 0.05 and turned < 15:
+            placer.commit(replace(placer.placed[i], pose=pose))
+
+
+def _repair_movers(placer: Placer, report: dict) -> None:
+    """Give what moved a flatter foot, lowest first; what stands on a mover is given a chance without repair."""
+    moved = {entry["id"] for entry in report["objects"] if not entry["stable"] or entry["floating"]}
+    for i in [i for i, p in placer.placed.items() if i in moved and p.edge.parent not in moved]:
+        placer.again(i)
+
+
+def _finish(placement: Placement, stable: bool) -> PlacedObject:
+    moved, turned = pose_change(placement.asset.world_from_object, placement.pose)
+    changed = placement.parts is not placement.asset.collision
+    return PlacedObject(
+        id=placement.asset.id,
+        world_from_object=placement.pose,
+        dynamic=placement.dynamic,
+        moved_m=moved,
+        turned_deg=turned,
+        repair="; ".join(placement.notes),
+        stable=stable and placement.stands,
+        collision=placement.parts if changed else (),
+    )
+
+
+__all__ = ["ASSEMBLY_PRESETS", "VERSION", "AssemblyConfig", "assemble", "base_slabs"]
