@@ -69,9 +69,10 @@ class PlacedObject:
 class SceneBuilder:
     """Builds a bundle's actors (`build`) and poses them (`initialize`)."""
 
-    def __init__(self, bundle: SceneBundle) -> None:
-        """Read what will be built; nothing is created in a simulator yet."""
+    def __init__(self, bundle: SceneBundle, extent: tuple[np.ndarray, np.ndarray]) -> None:
+        """Read what will be built; nothing is created in a simulator yet. `extent` is the scene's box."""
         self.bundle = bundle
+        self.extent = extent
         self.bodies = bodies_of(bundle)
         self.movable_ids = {body.root for body in self.bodies if body.dynamic}
         self.objects: dict[int, PlacedObject] = {}
@@ -136,6 +137,12 @@ class SceneBuilder:
         ground.add_plane_collision(
             sapien.Pose([0, 0, -_GROUND_BELOW_FLOOR_M], [0.7071068, 0, -0.7071068, 0]), material
         )
+        if scene.can_render():
+            # A plain plate around the scene; well below a reconstructed floor that may lie a little under z = 0.
+            lower, upper = self.extent
+            half = [*((upper - lower)[:2] / 2 + _GROUND_MARGIN_M), 0.01]
+            center = [*((upper + lower)[:2] / 2), -0.06]
+            ground.add_box_visual(sapien.Pose(center), half_size=half, material=_matte([0.55, 0.55, 0.55, 1.0]))
         ground.initial_pose = sapien.Pose()
         drivable = [ground.build_static(name="ground")]
         for base in self.bundle.base:
@@ -203,25 +210,24 @@ def bodies_of(bundle: SceneBundle) -> list[Body]:
     items = {item.id: item for item in bundle.objects}
     edge_of = {edge.child: edge for edge in bundle.edges}
 
+    def attached_parent(key: int) -> int | None:
+        edge = edge_of.get(key)
+        return edge.parent if edge is not None and edge.relation == "attached_to" else None
+
     def moves(key: int) -> bool:
         """Tell whether an object can move; one that is attached moves if what it is attached to does."""
-        if key not in items or not items[key].dynamic:
+        if key not in items:
             return False
-        edge = edge_of.get(key)
-        return edge is None or edge.relation != "attached_to" or moves(edge.parent)
+        parent = attached_parent(key)
+        return items[key].dynamic if parent is None else moves(parent)
 
     def root_of(key: int) -> int:
-        edge = edge_of.get(key)
-        welded = edge is not None and edge.relation == "attached_to" and moves(key)
-        return root_of(edge.parent) if welded else key
+        parent = attached_parent(key)
+        return root_of(parent) if parent is not None and moves(parent) else key
 
     members: dict[int, list[int]] = {}
     for key in items:
-        # What is attached to a dynamic object follows it even where the bundle calls it not dynamic.
-        edge = edge_of.get(key)
-        follows = edge is not None and edge.relation == "attached_to" and moves(edge.parent)
-        root = root_of(edge.parent) if follows else root_of(key)
-        members.setdefault(root, []).append(key)
+        members.setdefault(root_of(key), []).append(key)
     bodies = []
     for root in items:
         if root not in members:
@@ -302,17 +308,6 @@ def _build_pedestal(scene: object, top: np.ndarray, height: float, radius: float
     builder.build_static(name="pedestal")
 
 
-def build_ground_visual(scene: object, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Add a plain plate around and below the scene, for pictures only."""
-    half = (upper - lower)[:2] / 2 + _GROUND_MARGIN_M
-    center = (upper + lower)[:2] / 2
-    builder = scene.create_actor_builder()
-    builder.add_box_visual(half_size=[half[0], half[1], 0.01], material=_matte([0.55, 0.55, 0.55, 1.0]))
-    # A collision-free actor; well below the reconstructed floor, which may lie a little under z = 0.
-    builder.initial_pose = sapien.Pose([center[0], center[1], -0.06])
-    builder.build_kinematic(name="ground_plate")
-
-
 def _matte(color: list[float]) -> "sapien.render.RenderMaterial":
     return sapien.render.RenderMaterial(base_color=color, roughness=1.0, specular=0.0, metallic=0.0)
 
@@ -321,4 +316,4 @@ def _pose(matrix: np.ndarray) -> sapien.Pose:
     return sapien.Pose(matrix[:3, 3].astype(np.float32), quat_from_matrix(matrix[:3, :3]).astype(np.float32))
 
 
-__all__ = ["Body", "PlacedObject", "SceneBuilder", "bodies_of", "build_ground_visual", "merged_mass"]
+__all__ = ["Body", "PlacedObject", "SceneBuilder", "bodies_of", "merged_mass", "scene_extent"]

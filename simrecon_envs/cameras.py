@@ -1,0 +1,127 @@
+"""Where the cameras of an environment look from: occupancy + placement -> poses in SAPIEN's axes.
+
+SAPIEN's camera looks along +x, with +y left and +z up; OpenCV's along +z, with +x right and +y down.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from registry import SceneBundle
+from registry.geometry import SAPIEN_CAMERA_FROM_OPENCV, quat_from_matrix
+from simrecon_envs.occupancy import ConvexSolid, OccupancyGrid
+from simrecon_envs.placement import Placement
+
+_WORKSPACE_FOV_RAD = 1.05
+_MAX_CAPTURE_CANDIDATES = 40
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera's pose and vertical field of view; pictures are square unless said otherwise."""
+
+    eye: np.ndarray  # float64 (3,) world
+    quat_wxyz: np.ndarray  # float64 (4,) world_from_sapien_camera
+    fov_rad: float
+
+    def seen_share(self, points: np.ndarray, grid: OccupancyGrid) -> float:
+        """Return which share of world points (n, 3) a square picture shows: in it, in front, not hidden."""
+        from registry.geometry import matrix_from_quat
+
+        local = (points - self.eye) @ matrix_from_quat(self.quat_wxyz)
+        limit = np.tan(self.fov_rad / 2) * 0.95
+        inside = (local[:, 0] > 0.1) & (np.abs(local[:, 1:]) <= limit * local[:, :1].clip(1e-6)).all(axis=1)
+        return float((inside & grid.visible(self.eye, points)).mean())
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, fov_rad: float) -> Viewpoint:
+    """Return an upright viewpoint at `eye` (3,) that looks at `target` (3,)."""
+    forward = np.asarray(target, np.float64) - eye
+    forward /= np.linalg.norm(forward)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    # Straight up or down has no horizontal direction of its own.
+    left = left / np.linalg.norm(left) if np.linalg.norm(left) > 1e-6 else np.array([0.0, 1.0, 0.0])
+    world_from_camera = np.stack([forward, left, np.cross(forward, left)], axis=1)
+    return Viewpoint(np.asarray(eye, np.float64), quat_from_matrix(world_from_camera), fov_rad)
+
+
+def from_capture(world_from_camera: np.ndarray, params: np.ndarray, width: int, height: int) -> Viewpoint:
+    """Return the viewpoint of a frame of the video: same pose, square picture that covers the larger side."""
+    world_from_sapien = np.asarray(world_from_camera)[:3, :3] @ SAPIEN_CAMERA_FROM_OPENCV[:3, :3].T
+    fov = 2 * np.arctan(max(width / 2 / params[0], height / 2 / params[1]))
+    return Viewpoint(np.asarray(world_from_camera)[:3, 3], quat_from_matrix(world_from_sapien), float(min(fov, 1.6)))
+
+
+def workspace_view(solids: list[ConvexSolid], placement: Placement, middle: np.ndarray) -> Viewpoint:
+    """Return the view of the observation camera: onto the target, from beside or opposite the robot, unhidden."""
+    focus = placement.target.center if placement.target is not None else middle
+    grid = _grid_around(solids, focus, 2.0)
+    offsets = np.array([[0, 0, 0], [0.08, 0, 0], [-0.08, 0, 0], [0, 0.08, 0], [0, -0.08, 0], [0, 0, 0.15]])
+    points = focus + offsets
+    ranked = []
+    for turn_deg in (150, -150, 120, -120, 180, 90, -90, 60, -60, 30, -30):
+        for distance, lift in ((0.80, 0.55), (0.65, 0.60), (1.0, 0.50), (0.45, 0.75), (0.35, 0.50)):
+            angle = placement.yaw_rad + np.pi + np.deg2rad(turn_deg)
+            eye = focus + [distance * np.cos(angle), distance * np.sin(angle), lift]
+            view = look_at(eye, focus + [0, 0, 0.05], _WORKSPACE_FOV_RAD)
+            hidden = 1 - view.seen_share(points, grid) + 2.0 * float(grid.occupied(eye))
+            ranked.append((round(hidden, 4), len(ranked), view))
+    return min(ranked, key=lambda entry: entry[:2])[2]
+
+
+def room_view(
+    bundle: SceneBundle, solids: list[ConvexSolid], placement: Placement | None, robot_points: np.ndarray
+) -> Viewpoint:
+    """Return a view that shows the robot, its target and much of the scene: a frame's camera, or one beside it."""
+    boxes: dict[int, list[np.ndarray]] = {item.id: [] for item in bundle.objects}
+    for solid in solids:
+        if solid.owner in boxes:
+            boxes[solid.owner].append((solid.lower + solid.upper) / 2)
+    centers = np.array([np.mean(parts, axis=0) for parts in boxes.values() if parts]).reshape(-1, 3)
+    groups = [(centers, 1.0)]
+    if placement is not None and len(robot_points):
+        step = max(len(robot_points) // 40, 1)
+        groups.append((placement.to_world(robot_points)[::step], 1.5))
+        if placement.target is not None:
+            groups.append((placement.target.center[None], 1.0))
+    groups = [(points, weight) for points, weight in groups if len(points)]
+    focus = np.mean([points.mean(axis=0) for points, _ in groups], axis=0) if groups else np.zeros(3)
+    grid = _grid_around(solids, focus, 5.0, cell_m=0.05)
+    best, best_score = None, -np.inf
+    for view, bonus in _room_candidates(bundle, focus):
+        if grid.occupied(view.eye):
+            continue
+        score = bonus + sum(weight * view.seen_share(points, grid) for points, weight in groups)
+        if groups and placement is not None:
+            # The workspace should fill a good part of the picture.
+            distance = np.linalg.norm(groups[-1][0].mean(axis=0) - view.eye)
+            score -= 0.5 * abs(np.log(max(distance, 0.1) / 1.8))
+        if score > best_score + 1e-9:
+            best, best_score = view, score
+    return best if best is not None else look_at(focus + [2.0, -2.0, 1.8], focus, 1.0)
+
+
+def _room_candidates(bundle: SceneBundle, focus: np.ndarray) -> list[tuple[Viewpoint, float]]:
+    cameras = bundle.cameras
+    count = len(cameras.indices)
+    views = []
+    for row in np.unique(np.linspace(0, count - 1, min(count, _MAX_CAPTURE_CANDIDATES)).astype(int)) if count else []:
+        captured = from_capture(
+            cameras.world_from_camera[row], cameras.params, cameras.width, cameras.height
+        )
+        # Where the person stood is in the room and sees it; turning towards the focus keeps that.
+        views.append((captured, 0.3))
+        views.append((look_at(captured.eye, focus, 1.0), 0.3))
+    for radius in (1.4, 1.8, 2.3):
+        for step in range(16):
+            for lift in (0.7, 1.1):
+                angle = 2 * np.pi * step / 16
+                eye = focus + [radius * np.cos(angle), radius * np.sin(angle), lift]
+                views.append((look_at(eye, focus, 1.0), 0.0))
+    return views
+
+
+def _grid_around(
+    solids: list[ConvexSolid], center: np.ndarray, radius: float, cell_m: float = 0.03
+) -> OccupancyGrid:
+    return OccupancyGrid(solids, center - radius, center + radius, cell_m=cell_m, margin_m=-cell_m / 2)

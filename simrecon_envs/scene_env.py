@@ -1,0 +1,342 @@
+"""`SceneEnv`: a ManiSkill environment of one reconstructed scene. `gym.make("SimRecon/scene0001")` makes it."""
+
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.structs.pose import Pose
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
+
+from registry import BundleError, SceneBundle, SceneNotFound, SceneRegistry, UsageError, default_registry_root
+from simrecon_envs.backends import choose_render_backend
+from simrecon_envs.cameras import Viewpoint, room_view, workspace_view
+from simrecon_envs.errors import SceneAssetsMissing
+from simrecon_envs.occupancy import scene_solids
+from simrecon_envs.pick_task import MAX_DENSE_REWARD, PickTaskConfig, dense_pick_reward, evaluate_pick
+from simrecon_envs.placement import (
+    Placement,
+    PlacementConfig,
+    candidate_targets,
+    choose_targets,
+    place_robot,
+)
+from simrecon_envs.robots import RobotShape, check_robot, rest_qpos, robot_shape, traits_of
+from simrecon_envs.scene_builder import SceneBuilder, scene_extent
+
+logger = logging.getLogger(__name__)
+
+TASKS = ("pick", "none")
+
+
+class SceneEnv(BaseEnv):
+    """One reconstructed scene, a robot in it, and a task.
+
+    Observations are batched torch tensors (b = number of parallel environments, 1 on the CPU);
+    `simrecon_envs.make_cpu` removes the batch and gives NumPy. World space: metres, +z up, floor at z = 0;
+    quaternions wxyz; a pose is position then quaternion.
+
+    | key (obs_mode "state_dict")  | shape        | dtype   | space | unit | only where           |
+    |------------------------------|--------------|---------|-------|------|----------------------|
+    | agent/qpos                   | (b, d)       | float32 | joint | rad, m | there is a robot   |
+    | agent/qvel                   | (b, d)       | float32 | joint | rad/s, m/s | there is a robot |
+    | extra/tcp_pose               | (b, 7)       | float32 | world | m, - | the robot has a hand |
+    | extra/is_grasped             | (b,)         | bool    | -     | -    | task "pick"          |
+    | extra/target_pose            | (b, 7)       | float32 | world | m, - | task "pick", state   |
+    | extra/tcp_to_target          | (b, 3)       | float32 | world | m    | task "pick", state   |
+    | extra/target_lift            | (b, 1)       | float32 | world | m    | task "pick", state   |
+    | extra/object_poses           | (b, 7 n)     | float32 | world | m, - | n > 0 movable objects, state |
+
+    `target_pose` is that of the target's box centre (with the object's orientation); `object_poses` are the
+    bundle's `world_from_object`, in the order of `movable_ids`. "state" is all of this in one (b, k) float32 vector.
+    "rgb", "rgbd" and the other visual modes of ManiSkill leave out the rows marked "state" and add
+
+    | sensor_data/CAMERA/rgb       | (b, h, w, 3) | uint8   | image | -    | cameras: base_camera and the robot's own |
+    | sensor_data/CAMERA/depth     | (b, h, w, 1) | int16   | image | mm   | z-depth, 0 = nothing |
+    | sensor_param/CAMERA/…        | intrinsic_cv (b, 3, 3) px, extrinsic_cv (b, 3, 4) camera_from_world, cam2world_gl (b, 4, 4) |
+
+    Attributes: `task`, `task_note` (why the task is not what was asked for, or hard), `instruction`, `target_id`,
+    `movable_ids`, `placement`, `bundle`, `revision_note`.
+    """
+
+    SUPPORTED_ROBOTS = None  # every robot of ManiSkill whose files are here; see `robots.usable_robots`
+    SUPPORTED_OBS_MODES = ("state", "state_dict", "none", "sensor_data", "any_textures", "pointcloud")
+    SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
+
+    def __init__(
+        self,
+        scene_id: str,
+        revision: str | None = None,
+        registry: str | None = None,
+        *,
+        strict_revision: bool = False,
+        task: str = "pick",
+        target: str | int = "auto",
+        pose_noise: float | tuple[float, float] = 0.0,
+        robot_uids: str = "panda",
+        task_config: PickTaskConfig | dict | None = None,
+        obs_mode: str | None = None,
+        render_mode: str | None = None,
+        render_backend: str = "auto",
+        **kwargs: Any,
+    ) -> None:
+        """Load the scene and build it.
+
+        Args:
+            scene_id: Scene of the registry.
+            revision: Which revision of it was registered. Where the scene has a newer one by now, the newer one is
+                used, with a warning and a text in `revision_note`: the old files are gone with it.
+            registry: The registry's folder; the default registry where None.
+            strict_revision: Raise instead of using another revision.
+            task: "pick" (pick up the target) or "none" (no success, reward 0).
+            target: "auto" (what is easiest to pick up), an object's id, or a label.
+            pose_noise: Standard deviation of a random shift of each movable object at reset (m), or of shift and
+                turn (m, rad). A little noise can make objects overlap where they stand close together.
+            robot_uids: A robot of ManiSkill, or "none".
+            task_config: Thresholds of the task.
+            obs_mode: As in ManiSkill; "state" where None.
+            render_mode: None, "rgb_array", "sensors", "all" or "human".
+            render_backend: "auto" renders only if a mode asks for pictures; "gpu", "cpu" and "none" as in ManiSkill.
+            **kwargs: As for ManiSkill's `BaseEnv` (num_envs, control_mode, reward_mode, sim_backend, sensor_configs …).
+
+        Raises:
+            SceneNotFound: the registry has no such scene; the message lists what there is.
+            SceneAssetsMissing: its files are gone or damaged.
+            UsageError: no such robot, task or target; the message lists what there is.
+            EnvironmentMissing: pictures were asked for, and nothing can render here.
+        """
+        if task not in TASKS:
+            raise UsageError(f"scene {scene_id}: task {task!r} is not one of {', '.join(TASKS)}")
+        if not isinstance(robot_uids, str):
+            raise UsageError(f"scene {scene_id}: robot_uids: expected the name of one robot, got {robot_uids!r}")
+        if robot_uids != "none":
+            check_robot(robot_uids)
+        self.bundle, self.revision_note = _load(scene_id, revision, registry, strict_revision)
+        self.scene_id = scene_id
+        self.task_config = PickTaskConfig(**task_config) if isinstance(task_config, dict) else task_config
+        self.task_config = self.task_config or PickTaskConfig()
+        self.pose_noise = (pose_noise, 0.0) if np.isscalar(pose_noise) else tuple(pose_noise)
+        self._solids = scene_solids(self.bundle)
+        self.builder = SceneBuilder(self.bundle, scene_extent(self._solids))
+        self.movable_ids = tuple(body.root for body in self.builder.bodies if body.dynamic)
+        self._shape = robot_shape(robot_uids) if robot_uids != "none" else RobotShape(np.zeros((0, 3)), None, False)
+        self._plan(task, target, robot_uids)
+        self.target_initial_height: torch.Tensor | None = None
+        super().__init__(
+            obs_mode=obs_mode,
+            render_mode=render_mode,
+            robot_uids=robot_uids,
+            render_backend=choose_render_backend(render_backend, obs_mode, render_mode),
+            **kwargs,
+        )
+
+    # ---- What the task and the placement are; decided before anything is built.
+
+    def _plan(self, task: str, target: str | int, robot_uid: str) -> None:
+        config = PlacementConfig()
+        traits = traits_of(robot_uid)
+        candidates = candidate_targets(self.bundle, self._solids, set(self.movable_ids), traits, config)
+        self.task, self.task_note = task, ""
+        if task == "pick" and robot_uid == "none":
+            self.task, self.task_note = "none", "there is no robot"
+        elif task == "pick" and not self._shape.has_gripper:
+            self.task, self.task_note = "none", f"robot {robot_uid!r} cannot tell whether it grasps something"
+        elif task == "pick" and not candidates and target == "auto":
+            self.task, self.task_note = "none", "nothing in this scene can move"
+        chosen = choose_targets(candidates, target, self.bundle) if self.task == "pick" else candidates[:1]
+        self.placement: Placement | None = None
+        if robot_uid != "none":
+            base = self.bundle.base
+            self.placement = place_robot(
+                self._solids,
+                {b.id for b in base if b.label == "floor"},
+                {b.id for b in base if b.label == "wall"},
+                chosen,
+                self._shape,
+                traits,
+                config,
+            )
+        self.target = self.placement.target if self.placement is not None and self.task == "pick" else None
+        self.target_id = self.target.id if self.target is not None else None
+        if self.target is not None:
+            problems = [text for text in (self.target.problem, self.placement.note) if text]
+            self.task_note = "; ".join(problems)
+            item = next(o for o in self.bundle.objects if o.id == self.target_id)
+            # The box centre in object space, so that the target's position is the middle of what is to be gripped.
+            offset = self.target.center - item.world_from_object[:3, 3]
+            self._target_center = torch.as_tensor(
+                item.world_from_object[:3, :3].T @ offset, dtype=torch.float32
+            )
+        if self.task_note:
+            logger.info("scene %s: task %r: %s", self.scene_id, self.task, self.task_note)
+
+    @property
+    def instruction(self) -> str:
+        """Return the task in words."""
+        if self.target is None:
+            return ""
+        same = [o for o in self.bundle.objects if o.label == self.target.label]
+        name = self.target.label if self.target.label != "unknown" else "object"
+        which = f" {self.target.id}" if len(same) > 1 or self.target.label == "unknown" else ""
+        return f"Pick up the {name}{which}."
+
+    # ---- Building; once per reconfigure.
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        # The timestep of the bundle's physics report: objects rest as quietly here as they did there.
+        return SimConfig(
+            sim_freq=240,
+            control_freq=20,
+            spacing=float(max(20.0, *(2 * (self.builder.extent[1] - self.builder.extent[0])[:2]))),
+            scene_config=SceneConfig(contact_offset=0.01, enable_enhanced_determinism=True),
+        )
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        middle = (self.builder.extent[0] + self.builder.extent[1]) / 2
+        placement = self.placement or Placement(middle, 0.0, 0.0, None, "")
+        return [_camera("base_camera", workspace_view(self._solids, placement, middle), 128)]
+
+    @property
+    def _default_human_render_camera_configs(self) -> list[CameraConfig]:
+        view = room_view(self.bundle, self._solids, self.placement, self._shape.points)
+        return [_camera("render_camera", view, 512)]
+
+    def _load_agent(self, options: dict) -> None:
+        super()._load_agent(options, self._root_pose() if self.placement is not None else None)
+
+    def _load_scene(self, options: dict) -> None:
+        pedestal = None
+        if self.placement is not None and self.placement.pedestal_m > 0.01:
+            # A hair below the robot, so that the two do not touch.
+            top = self.placement.position - [0, 0, 0.002]
+            radius = 0.8 * traits_of(self.robot_uids).footprint_radius_m
+            pedestal = (top, self.placement.pedestal_m - 0.004, radius)
+        self.builder.build(self.scene, pedestal)
+
+    def _load_lighting(self, options: dict) -> None:
+        # The textures come from a video and carry the room's light already: mostly ambient, a little shape.
+        self.scene.set_ambient_light([0.75, 0.75, 0.75])
+        self.scene.add_directional_light([0.4, 0.3, -1.0], [0.9, 0.9, 0.88], shadow=self.enable_shadow)
+        self.scene.add_directional_light([-0.5, -0.6, -0.6], [0.35, 0.35, 0.38])
+
+    def _root_pose(self) -> sapien.Pose:
+        return sapien.Pose(self.placement.position, self.placement.quat_wxyz)
+
+    # ---- Episodes.
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
+        if self.agent is not None:
+            qpos = torch.as_tensor(rest_qpos(self.agent), dtype=torch.float32, device=self.device)
+            self.agent.reset(qpos.repeat(len(env_idx), 1))
+            self.agent.robot.set_pose(Pose.create(self._root_pose(), device=self.device))
+        if self.target is not None:
+            if self.target_initial_height is None or len(self.target_initial_height) != self.num_envs:
+                self.target_initial_height = torch.zeros(self.num_envs, device=self.device)
+            # Shifts are horizontal and turns are about +z, so noise leaves the height as it is.
+            self.target_initial_height[env_idx] = float(self.target.center[2])
+
+    def get_state_dict(self) -> dict:
+        """Return the simulation's state; without a robot there is no controller to ask."""
+        return super().get_state_dict() if self.agent is not None else self.scene.get_sim_state()
+
+    # ---- Task.
+
+    @property
+    def target_actor(self) -> Any:
+        """Return the actor of the target (of what it is welded to, if it is)."""
+        return self.builder.objects[self.target_id].actor
+
+    @property
+    def target_pose(self) -> Pose:
+        """Return the pose of the target's box centre, batched."""
+        return self.target_actor.pose * Pose.create_from_pq(p=self._target_center.to(self.device)[None])
+
+    @property
+    def target_position(self) -> torch.Tensor:
+        """Return where the target's box centre is (num_envs, 3), world, metres."""
+        return self.target_pose.p
+
+    def evaluate(self) -> dict:
+        """Return whether the target is picked up, and what that depends on."""
+        return evaluate_pick(self, self.task_config) if self.target is not None else {}
+
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return the reward (num_envs,) in [0, 5]; 0 without a task."""
+        if self.target is None:
+            return torch.zeros(self.num_envs, device=self.device)
+        return dense_pick_reward(info, self.task_config)
+
+    def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return the reward (num_envs,) in [0, 1]."""
+        return self.compute_dense_reward(obs, action, info) / MAX_DENSE_REWARD
+
+    def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return 1 where the target is picked up, else 0 (num_envs,)."""
+        if self.target is None:
+            return torch.zeros(self.num_envs, device=self.device)
+        return info["success"].float()
+
+    # ---- Observations.
+
+    def _get_obs_agent(self) -> dict:
+        return super()._get_obs_agent() if self.agent is not None else {}
+
+    def _get_obs_extra(self, info: dict) -> dict:
+        obs = {}
+        if hasattr(self.agent, "tcp"):
+            obs["tcp_pose"] = self.agent.tcp.pose.raw_pose
+        if self.target is not None:
+            obs["is_grasped"] = info["is_grasped"]
+        if not self.obs_mode_struct.use_state:
+            return obs
+        if self.target is not None:
+            pose = self.target_pose
+            obs["target_pose"] = pose.raw_pose
+            obs["tcp_to_target"] = pose.p - self.agent.tcp.pose.p
+            obs["target_lift"] = (pose.p[:, 2] - self.target_initial_height)[:, None]
+        if self.movable_ids:
+            poses = [placed.actor.pose.raw_pose for placed in self.builder.movable_actors]
+            obs["object_poses"] = torch.cat(poses, dim=1)
+        return obs
+
+
+def _camera(uid: str, view: Viewpoint, size_px: int) -> CameraConfig:
+    pose = sapien.Pose(view.eye, view.quat_wxyz)
+    return CameraConfig(uid=uid, pose=pose, width=size_px, height=size_px, fov=view.fov_rad, near=0.01, far=100)
+
+
+def _load(scene_id: str, revision: str | None, registry: str | None, strict: bool) -> tuple[SceneBundle, str]:
+    """Open the scene's current revision; return it and a note where it is not the one that was asked for."""
+    root = Path(registry) if registry is not None else default_registry_root()
+    catalog = SceneRegistry(root)
+    try:
+        bundle = catalog.load(scene_id)
+    except SceneNotFound as error:
+        raise SceneNotFound(
+            f"{error}. Call simrecon_envs.register_scenes() to see what the registry has now"
+        ) from error
+    except BundleError as error:
+        option = "" if registry is None else f" --registry {root}"
+        raise SceneAssetsMissing(
+            f"scene {scene_id}: its files in {root} are gone or damaged: {error}. "
+            f"`simrecon verify {scene_id}{option}` says more; `simrecon reconstruct VIDEO --scene {scene_id}{option}` "
+            "makes it again"
+        ) from error
+    if revision is None or bundle.revision == revision:
+        return bundle, ""
+    note = f"scene {scene_id}: revision {revision} was replaced by {bundle.revision}, which is used"
+    if strict:
+        raise SceneAssetsMissing(
+            f"scene {scene_id}: revision {revision} was replaced by {bundle.revision}; call "
+            "simrecon_envs.register_scenes() to register the new one, or leave out strict_revision"
+        )
+    warnings.warn(note, stacklevel=3)
+    return bundle, note

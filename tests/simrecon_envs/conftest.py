@@ -1,0 +1,247 @@
+"""A small hand-made scene in a registry of its own, and whether this machine can render."""
+
+import functools
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from registry import SceneRegistry, seal_bundle
+from registry.geometry import GLTF_FROM_WORLD
+
+ROOM_M = (4.0, 3.0, 2.4)
+TABLE_TOP_M = 0.60
+BOX, CYLINDER, PICTURE, TABLE, BOOK, KNOB = 10, 11, 12, 13, 14, 15
+
+
+def _glb(mesh: trimesh.Trimesh, path: Path, color: tuple[int, int, int]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mesh = mesh.copy().apply_transform(GLTF_FROM_WORLD)
+    mesh.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.PBRMaterial(
+            baseColorFactor=[*color, 255], metallicFactor=0.0, roughnessFactor=1.0
+        )
+    )
+    path.write_bytes(trimesh.Scene(mesh).export(file_type="glb"))
+
+
+def _obj(mesh: trimesh.Trimesh, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices]
+    rows += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces]
+    path.write_text("\n".join(rows) + "\n")
+
+
+def box(size: tuple, bottom: float = 0.0, at: tuple = (0.0, 0.0)) -> trimesh.Trimesh:
+    """Return a box of a size (3,) whose bottom centre is at (x, y, bottom)."""
+    mesh = trimesh.creation.box(size)
+    return mesh.apply_translation([at[0], at[1], bottom + size[2] / 2])
+
+
+def _translation(x: float, y: float, z: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = (x, y, z)
+    return pose
+
+
+class BundleWriter:
+    """Writes a bundle piece by piece; `seal` finishes it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.base, self.objects, self.edges = [], [], []
+
+    def add_base(self, key: int, label: str, mesh: trimesh.Trimesh, plane: list, *, collision: bool = True) -> None:
+        """Add a floor or wall: a slab in world space whose front lies on the plane."""
+        _glb(mesh, self.folder / f"base/{key:03d}.glb", (200, 196, 188) if label == "wall" else (150, 120, 90))
+        entry = {"id": key, "label": label, "mesh": f"base/{key:03d}.glb", "plane": plane, "observed": True}
+        if collision:
+            _obj(mesh, self.folder / f"base/{key:03d}_collision.obj")
+            entry["collision"] = [f"base/{key:03d}_collision.obj"]
+        self.base.append(entry)
+
+    def add_object(
+        self,
+        key: int,
+        label: str,
+        parts: list[trimesh.Trimesh],
+        world_from_object: np.ndarray,
+        parent: int,
+        *,
+        color: tuple = (180, 60, 50),
+        mass: float = 0.2,
+        dynamic: bool = True,
+        relation: str = "supported_by",
+        friction: float = 0.7,
+    ) -> None:
+        """Add an object of convex parts in object space."""
+        stem = f"objects/{key:03d}"
+        whole = trimesh.util.concatenate(parts)
+        _glb(whole, self.folder / f"{stem}/visual.glb", color)
+        names = []
+        for number, part in enumerate(parts):
+            names.append(f"{stem}/collision_{number:03d}.obj")
+            _obj(part, self.folder / names[-1])
+        volume = sum(part.volume for part in parts)
+        center = sum(part.volume * part.center_mass for part in parts) / volume
+        inertia = np.zeros((3, 3))
+        for part in parts:
+            arm = part.center_mass - center
+            inertia += part.moment_inertia + part.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        self.objects.append(
+            {
+                "id": key,
+                "label": label,
+                "label_confidence": 0.9,
+                "world_from_object": np.asarray(world_from_object).tolist(),
+                "scale": whole.extents.tolist(),
+                "visual": f"{stem}/visual.glb",
+                "collision": names,
+                "material": "wood",
+                "density_kg_m3": mass / volume,
+                "mass_kg": mass,
+                "center_of_mass": center.tolist(),
+                "inertia": (0.5 * (inertia + inertia.T) * mass / volume).tolist(),
+                "friction": friction,
+                "restitution": 0.05,
+                "dynamic": dynamic,
+                "relation_fixed": relation == "attached_to",
+                "provenance": {
+                    "geometry": "made",
+                    "appearance": "made",
+                    "physics": "made",
+                    "observed_fraction": 1.0,
+                },
+                "views": [0],
+            }
+        )
+        self.edges.append(
+            {"child": key, "relation": relation, "parent": parent, "confidence": 1.0, "evidence": "made"}
+        )
+
+    def seal(self, scene_id: str) -> None:
+        """Write scene.json and the manifest."""
+        # A camera in a corner of the room that looks at its middle, OpenCV axes.
+        eye, target = np.array([1.6, -1.2, 1.6]), np.array([-0.3, 0.3, 0.6])
+        forward = (target - eye) / np.linalg.norm(target - eye)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        pose[:3, 3] = eye
+        seal_bundle(
+            self.folder,
+            {
+                "schema": "simrecon.scene/1",
+                "id": scene_id,
+                "source": {
+                    "file": "made.mp4",
+                    "sha256": "0" * 64,
+                    "width": 640,
+                    "height": 480,
+                    "fps": 30.0,
+                    "frame_count": 1,
+                    "duration_s": 0.1,
+                },
+                "scale": {"method": "marker", "uncertainty": 0.01},
+                "cameras": {
+                    "model": "PINHOLE",
+                    "width": 640,
+                    "height": 480,
+                    "params": [520.0, 520.0, 320.0, 240.0],
+                    "frames": [{"index": 0, "time_s": 0.0, "world_from_camera": pose.tolist()}],
+                },
+                "base": self.base,
+                "objects": self.objects,
+                "graph": {"edges": self.edges},
+                "report": {"physics": {}, "timings_s": {}, "peak_memory_mb": 1.0, "backends": {}, "config": {}},
+            },
+        )
+
+
+def add_room(writer: BundleWriter) -> None:
+    """Add a floor (1), two walls (2 with collision parts, 3 without)."""
+    x, y, z = ROOM_M
+    writer.add_base(1, "floor", box((x, y, 0.1), -0.1), [0, 0, 1, 0])
+    writer.add_base(2, "wall", box((x, 0.1, z), at=(0, y / 2 + 0.05)), [0, -1, 0, y / 2])
+    writer.add_base(3, "wall", box((0.1, y, z), at=(-x / 2 - 0.05, 0)), [1, 0, 0, x / 2], collision=False)
+
+
+def add_furniture(writer: BundleWriter) -> None:
+    """Add a table against the wall, a box, a cylinder and a book with a knob on it, and a picture on the wall."""
+    legs = [box((0.05, 0.05, 0.57), at=(sx * 0.5, sy * 0.3)) for sx in (-1, 1) for sy in (-1, 1)]
+    table = [box((1.1, 0.7, 0.03), 0.57), *legs]
+    at_table = (-0.3, 1.05)
+    writer.add_object(
+        TABLE, "table", table, _translation(*at_table, 0.0), 1, mass=12, dynamic=False, color=(140, 100, 60)
+    )
+    top = TABLE_TOP_M
+    writer.add_object(BOX, "box", [box((0.05, 0.045, 0.09))], _translation(-0.35, 0.85, top), TABLE)
+    cylinder = trimesh.creation.cylinder(0.022, 0.10, sections=24).apply_translation([0, 0, 0.05])
+    writer.add_object(
+        CYLINDER, "cup", [cylinder], _translation(0.0, 0.9, top), TABLE, mass=0.15, color=(50, 90, 170)
+    )
+    writer.add_object(
+        BOOK, "book", [box((0.22, 0.15, 0.03))], _translation(-0.65, 1.05, top), TABLE, mass=0.4, color=(60, 140, 70)
+    )
+    writer.add_object(
+        KNOB,
+        "knob",
+        [box((0.03, 0.03, 0.03))],
+        _translation(-0.65, 1.05, top + 0.03),
+        BOOK,
+        mass=0.05,
+        relation="attached_to",
+        color=(220, 200, 60),
+    )
+    writer.add_object(
+        PICTURE,
+        "picture",
+        [box((0.4, 0.02, 0.3))],
+        _translation(-0.3, ROOM_M[1] / 2 - 0.01, 1.4),
+        2,
+        relation="attached_to",
+        mass=0.8,
+        color=(120, 70, 150),
+    )
+
+
+@pytest.fixture(scope="session")
+def scenes_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a registry with `room` (all of the above) and `bare` (room and picture: nothing can move)."""
+    root = tmp_path_factory.mktemp("registry")
+    registry = SceneRegistry(root, create=True)
+    for scene_id in ("room", "bare"):
+        writer = BundleWriter(tmp_path_factory.mktemp(scene_id))
+        add_room(writer)
+        if scene_id == "room":
+            add_furniture(writer)
+        else:
+            writer.add_object(
+                PICTURE,
+                "picture",
+                [box((0.4, 0.02, 0.3))],
+                _translation(0, 1.49, 1.4),
+                2,
+                relation="attached_to",
+                dynamic=False,
+            )
+        writer.seal(scene_id)
+        registry.publish(writer.folder, scene_id)
+    return root
+
+
+@functools.lru_cache(maxsize=1)
+def can_render() -> bool:
+    """Tell whether SAPIEN can render here; asked in another process, because a bad driver may crash."""
+    code = "import sapien; sapien.render.RenderSystem(sapien.Device('cpu'))"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60).returncode == 0
+
+
+@pytest.fixture(autouse=True)
+def _skip_without_vulkan(request: pytest.FixtureRequest) -> None:
+    if request.node.get_closest_marker("render") and not can_render():
+        pytest.skip("SAPIEN cannot render here (see `simrecon doctor`)")
