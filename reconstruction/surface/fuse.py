@@ -1,0 +1,126 @@
+"""Stage 5: depth maps -> surface mesh and free space."""
+
+import numpy as np
+
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.surface.config import SurfaceConfig
+from reconstruction.types import Camera, DepthMaps, PosedFrames, SpaceGrid, Surface
+from registry.errors import InputError
+
+_BOX_MARGIN_M = 0.05
+
+
+def _points(depth: np.ndarray, camera: Camera, world_from_camera: np.ndarray, max_depth: float) -> np.ndarray:
+    """Return world points (m, 3) of every fourth pixel with depth."""
+    z = depth[:, 2::4, 2::4]
+    v, y, x = np.nonzero((z > 0) & (z <= max_depth))
+    zz = z[v, y, x].astype(np.float64)
+    local = np.stack(
+        [(x * 4 + 2.5 - camera.cx) / camera.fx * zz, (y * 4 + 2.5 - camera.cy) / camera.fy * zz, zz], 1
+    )
+    return np.einsum("nij,nj->ni", world_from_camera[v, :3, :3], local) + world_from_camera[v, :3, 3]
+
+
+def _observed_box(
+    posed: PosedFrames, depth: DepthMaps, config: SurfaceConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the space that depth describes, without the farthest strays."""
+    points = _points(depth.depth, depth.camera, posed.world_from_camera, config.max_depth_m)
+    if len(points) < 100:
+        raise InputError(
+            f"surface: only {len(points)} depth samples within {config.max_depth_m:g} m. "
+            "The depth stage found next to nothing: film with more light, texture and sideways motion."
+        )
+    low, high = np.percentile(points, [0.05, 99.95], axis=0)
+    # Cameras count as observed space: what lies around them is free.
+    centers = posed.world_from_camera[:, :3, 3]
+    low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
+    low, high = low - _BOX_MARGIN_M, high + _BOX_MARGIN_M
+    # A floor at z = 0 (if there is one) needs 5 cm of grid below it.
+    if low[2] < 0.1:
+        low[2] = min(low[2], -_BOX_MARGIN_M)
+    return low, high
+
+
+def _fuse_blocks(posed, views, low, high, config: SurfaceConfig, progress: Progress):
+    """Allocate and fill the blocks; coarsen until they fit."""
+    from reconstruction.surface.tsdf import BLOCK, integrate, surface_blocks
+
+    voxel = config.voxel_size_m
+    while True:
+        truncation = config.truncation_voxels * voxel
+        shape = tuple(int(s) for s in np.ceil((high - low) / (BLOCK * voxel)).astype(int) + 1)
+        # Marks of sixteen views are held at once, one byte a block: the dense grid itself must stay small.
+        if np.prod(shape, dtype=np.int64) <= 40 * config.max_blocks:
+            blocks = surface_blocks(views, posed.world_from_camera, low, shape, voxel, truncation)
+            if len(blocks) <= config.max_blocks:
+                break
+        voxel *= 1.25
+    if voxel > config.voxel_size_m:
+        progress.note(
+            f"surface: voxels of {voxel * 1000:.1f} mm instead of {config.voxel_size_m * 1000:.1f} mm, "
+            f"since the scene is large ({', '.join(f'{s:.1f}' for s in high - low)} m)"
+        )
+    return integrate(views, blocks, shape, low, voxel, truncation)
+
+
+def _space(views, low, high, vertices: np.ndarray, config: SurfaceConfig, progress: Progress) -> SpaceGrid:
+    from reconstruction.surface.free_space import carve_space, mark_surface
+
+    voxel = config.space_voxel_m
+    cells = np.prod((high - low) / voxel)
+    if cells > config.max_space_cells:
+        voxel *= float((cells / config.max_space_cells) ** (1 / 3))
+        progress.note(f"surface: free-space voxels of {voxel * 100:.1f} cm, since the scene is large")
+    shape = tuple(int(s) for s in np.ceil((high - low) / voxel).astype(int))
+    space = carve_space(
+        views, low, shape, voxel, margin=config.free_margin_m, completed_margin=config.completed_margin_m,
+        min_rays=config.free_min_rays,
+    )  # fmt: skip
+    mark_surface(space, vertices)
+    return space
+
+
+def fuse_surface(
+    posed: PosedFrames, depth: DepthMaps, config: SurfaceConfig, *, progress: Progress = NO_PROGRESS
+) -> Surface:
+    """Fuse depth maps into the visible surface and the state of space.
+
+    Args:
+        posed: Frames in world space, in metres.
+        depth: Their depth maps in metres.
+        config: Settings.
+        progress: Where steps and decisions are reported.
+    """
+    from reconstruction.surface.extract import extract_mesh
+    from reconstruction.surface.pixels import prepare_views
+    from reconstruction.surface.thinning import drop_small_components, thin
+
+    progress.start(3, "fusing depth")
+    low, high = _observed_box(posed, depth, config)
+    views = prepare_views(
+        depth, posed.world_from_camera, posed.images, reference_depth=config.reference_depth_m,
+        max_depth=config.max_depth_m, completed_weight=config.completed_weight,
+    )  # fmt: skip
+    volume = _fuse_blocks(posed, views, low, high, config, progress)
+    progress.advance()
+    # A vertex that only completed pixels made needs the same number of views, at their lower weight.
+    mesh = extract_mesh(volume, min_views=config.min_views, min_weight=0.02 * config.completed_weight)
+    mesh, dropped = drop_small_components(mesh, config.min_component_m2)
+    fine_vertices = mesh.vertices
+    mesh = thin(mesh, config.max_vertices)
+    if len(mesh.faces) == 0:
+        raise InputError(
+            "surface: no surface was seen by two views in agreement. The cameras or the depth maps do not fit "
+            "together: film more slowly, with overlap between neighbouring views."
+        )
+    if len(mesh.vertices) > config.max_vertices:
+        progress.note(
+            f"surface: {len(mesh.vertices)} vertices, more than the {config.max_vertices} asked for"
+        )
+    progress.advance()
+    space = _space(views, low, high, fine_vertices, config, progress)
+    progress.advance()
+    return Surface(
+        mesh.vertices, mesh.faces, mesh.normals, mesh.colors, mesh.weights, float(volume.voxel_size), space
+    )

@@ -1,0 +1,143 @@
+"""What each depth pixel is worth to the fusion: its weight, its slope, and whether it may free space."""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from reconstruction.types import Camera, DepthMaps
+from registry.geometry import invert_rigid
+
+TILE_PX = 8
+CARVES_NOT, CARVES_COMPLETED, CARVES_MEASURED = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class FusionViews:
+    """Depth maps prepared for the fusion kernels."""
+
+    camera: Camera
+    camera_from_world: np.ndarray  # float64 (n, 4, 4)
+    depth: np.ndarray  # float32 (n, h, w)
+    weight: np.ndarray  # float32 (n, h, w), 0 = makes no surface
+    slope: np.ndarray  # uint8 (n, h, w), 255 * cosine that turns a distance along z into one along the normal
+    carve: np.ndarray  # uint8 (n, h, w): CARVES_*
+    tile_max: np.ndarray  # float32 (n, th, tw) largest depth in each tile of TILE_PX pixels
+    color: np.ndarray  # uint8 (n, h, w, 3)
+
+    def subset(self, rows: np.ndarray) -> "FusionViews":
+        """Return only the given views."""
+        return FusionViews(
+            self.camera, self.camera_from_world[rows], self.depth[rows], self.weight[rows], self.slope[rows],
+            self.carve[rows], self.tile_max[rows], self.color[rows],
+        )  # fmt: skip
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """Return fx, fy, cx, cy."""
+        return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy])
+
+
+@numba.njit(cache=True)
+def _derivative(depth, y, x, dy, dx, jump):  # pragma: no cover - compiled
+    """Return the change of inverse depth per pixel along (dy, dx), and which sides are continuous."""
+    h, w = depth.shape
+    z = depth[y, x]
+    total, span = 0.0, 0
+    before, after = 0, 0  # 0 continuous, +1 the neighbour is farther, -1 nearer, 2 unknown
+    for side in (-1, 1):
+        state = 2
+        for reach in (1, 2):
+            yy, xx = y + side * reach * dy, x + side * reach * dx
+            if yy < 0 or yy >= h or xx < 0 or xx >= w or depth[yy, xx] <= 0.0:
+                break
+            step = depth[yy, xx] / z - 1.0
+            if abs(step) > jump * reach:
+                if reach == 1:
+                    state = 1 if step > 0 else -1
+                break
+            state = 0
+            if reach == 2:
+                total += side * (1.0 / depth[yy, xx] - 1.0 / z)
+                span += 2
+        if side < 0:
+            before = state
+        else:
+            after = state
+    return (total / span if span > 0 else 0.0), before, after
+
+
+@numba.njit(cache=True, parallel=True)
+def _weigh(
+    depth, confidence, k, reference, max_depth, completed_weight, weight, slope, carve
+):  # pragma: no cover
+    n, h, w = depth.shape
+    fx, fy, cx, cy = k
+    for row in numba.prange(n * h):
+        v, y = row // h, row % h
+        for x in range(w):
+            z = depth[v, y, x]
+            c = confidence[v, y, x]
+            if z <= 0.0 or c == 0:
+                continue
+            gx, left, right = _derivative(depth[v], y, x, 0, 1, 0.03)
+            gy, up, down = _derivative(depth[v], y, x, 1, 0, 0.03)
+            # A pixel between a near and a far neighbour lies on neither: depth flies across the edge there.
+            if left * right == -1 or up * down == -1:
+                continue
+            carve[v, y, x] = 2 if c == 2 else 1
+            xn, yn = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            a, b = gx * fx, gy * fy
+            inverse = 1.0 / z
+            cc = inverse - a * xn - b * yn
+            s = inverse / math.sqrt(a * a + b * b + cc * cc)
+            cosine = s / math.sqrt(xn * xn + yn * yn + 1.0)
+            slope[v, y, x] = np.uint8(min(255.0, max(64.0, s * 255.0)))
+            if z > max_depth:
+                continue
+            q = max(cosine, 0.15)
+            q *= min(1.0, (reference / z) ** 2)
+            if left != 0 or right != 0 or up != 0 or down != 0:
+                q *= 0.3
+            weight[v, y, x] = q if c == 2 else q * completed_weight
+
+
+@numba.njit(cache=True, parallel=True)
+def _tile_maximum(depth, tiles):  # pragma: no cover - compiled
+    n, h, w = depth.shape
+    for v in numba.prange(n):
+        for y in range(h):
+            for x in range(w):
+                t = depth[v, y, x]
+                if t > tiles[v, y // TILE_PX, x // TILE_PX]:
+                    tiles[v, y // TILE_PX, x // TILE_PX] = t
+
+
+def prepare_views(
+    depth: DepthMaps,
+    world_from_camera: np.ndarray,
+    images: np.ndarray,
+    *,
+    reference_depth: float,
+    max_depth: float,
+    completed_weight: float,
+) -> FusionViews:
+    """Weigh every pixel of `depth`; images (n, H, W, 3) are resampled to the depth resolution."""
+    import cv2
+
+    d = np.ascontiguousarray(depth.depth, np.float32)
+    n, h, w = d.shape
+    weight, slope = np.zeros((n, h, w), np.float32), np.zeros((n, h, w), np.uint8)
+    carve = np.zeros((n, h, w), np.uint8)
+    k = (depth.camera.fx, depth.camera.fy, depth.camera.cx, depth.camera.cy)
+    confidence = np.ascontiguousarray(depth.confidence)
+    _weigh(d, confidence, k, reference_depth, max_depth, completed_weight, weight, slope, carve)
+    tiles = np.zeros((n, -(-h // TILE_PX), -(-w // TILE_PX)), np.float32)
+    _tile_maximum(d, tiles)
+    color = np.empty((n, h, w, 3), np.uint8)
+    for i in range(n):
+        same = images[i].shape[:2] == (h, w)
+        color[i] = images[i] if same else cv2.resize(images[i], (w, h), interpolation=cv2.INTER_AREA)
+    camera_from_world = np.ascontiguousarray(invert_rigid(world_from_camera))
+    return FusionViews(depth.camera, camera_from_world, d, weight, slope, carve, tiles, color)
