@@ -55,13 +55,13 @@ def _lamps() -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Return (position, colour, weight): a soft warm lamp above the table, cool sky light spread over the ceiling."""
     lamps = []
     for dx, dy in [(0, 0), (0.16, 0.05), (-0.12, 0.14), (-0.06, -0.17), (0.12, -0.13)]:
-        position = np.array([0.55 + dx, -0.75 + dy, _LAMP_HEIGHT_M])
-        lamps.append((position, np.array([1.06, 1.0, 0.90]), 0.42 / 5))
+        position = np.array([-1.0 + dx, 0.3 + dy, _LAMP_HEIGHT_M - 0.2])
+        lamps.append((position, np.array([1.06, 1.0, 0.90]), 0.60 / 5))
     across = np.linspace(WEST_M + 0.4, EAST_M - 0.4, 4)
     along = np.linspace(SOUTH_M + 0.4, NORTH_M - 0.4, 4)
     for x in across:
         for y in along:
-            lamps.append((np.array([x, y, _LAMP_HEIGHT_M + 0.02]), np.array([0.95, 1.0, 1.05]), 0.62 / 16))
+            lamps.append((np.array([x, y, _LAMP_HEIGHT_M + 0.02]), np.array([0.95, 1.0, 1.05]), 0.50 / 16))
     return lamps
 
 
@@ -100,7 +100,7 @@ def _bake_light(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, sh
     focal = shadow_px / 2 / np.tan(np.radians(62))
     camera = Camera(shadow_px, shadow_px, focal, focal, shadow_px / 2, shadow_px / 2)
     # A little light from everywhere, more from above, stands for all further bounces.
-    light = np.repeat((0.17 + 0.07 * normals[:, 2:3]), 3, axis=1)
+    light = np.repeat((0.16 + 0.06 * normals[:, 2:3]), 3, axis=1)
     for position, color, weight in _lamps():
         world_from_camera = np.eye(4)
         world_from_camera[:3, :3] = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1.0]])
@@ -304,8 +304,8 @@ def look_at(position: np.ndarray, target: np.ndarray, roll_rad: float = 0.0) -> 
 
 
 def handheld_path(
-    n_frames: int, *, seed: int = 0, arc_deg: float = 136.0, middle_deg: float = -88.0, radius_m: float = 1.62, height_m: float = 1.42,
-    target: tuple[float, float, float] = (0.02, 0.10, 0.46), shake: float = 1.0,
+    n_frames: int, *, seed: int = 0, arc_deg: float = 136.0, middle_deg: float = -88.0, radius_m: float = 1.42, height_m: float = 1.38,
+    target: tuple[float, float, float] = (0.02, 0.08, 0.56), shake: float = 1.0,
 ) -> np.ndarray:  # fmt: skip
     """Walk an arc around the table as a person does: (n, 4, 4) world_from_camera.
 

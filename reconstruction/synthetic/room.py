@@ -93,9 +93,9 @@ class Spot:
 DEFAULT_PLAN: tuple[Spot, ...] = (
     Spot("table", "floor", 0.0, 0.0, 0.0),
     Spot("shelf", "floor", -1.05, NORTH_M - 0.16, 0.0),
-    Spot("crate", "floor", 1.25, 0.55, -24.0),
+    Spot("crate", "floor", 1.12, 0.62, -24.0),
     Spot("box", "shelf", 0.08, -0.01, 8.0),
-    Spot("picture", "wall_north", 0.35, 0.0, 0.0, "wall", 1.02),
+    Spot("picture", "wall_north", 0.30, 0.0, 0.0, "wall", 0.84),
     Spot("can", "table", -0.34, 0.16, 20.0),
     Spot("carton", "table", -0.30, -0.12, 32.0),
     Spot("mug", "table", -0.04, -0.17, -35.0),
