@@ -1,0 +1,17 @@
+"""Stage 4: the world frame. Gravity, yaw, floor and metres: PosedFrames + DepthMaps (sfm) -> WorldFrame."""
+
+from reconstruction.world.config import WORLD_PRESETS, WorldConfig
+from reconstruction.world.frame import find_world, rescale_for_object
+from reconstruction.world.request import ScaleRequest, parse_scale
+
+VERSION = 1
+
+__all__ = [
+    "VERSION",
+    "WORLD_PRESETS",
+    "ScaleRequest",
+    "WorldConfig",
+    "find_world",
+    "parse_scale",
+    "rescale_for_object",
+]

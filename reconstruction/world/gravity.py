@@ -1,0 +1,176 @@
+"""Which way is up: horizontal planes and walls vote, the cameras' own up says where to look.
+
+People hold a camera without roll, more or less, and pitch it as they like. So each camera's x axis is nearly
+orthogonal to up (a few degrees), while its -y axis is only roughly up. Directions near that are scored by the share of
+the surface that would be horizontal or vertical, the best is refined by iteratively reweighted least squares on the
+sphere, and at last by planes fitted through whole floors, tables and walls, which average over more than any window.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruction.types import PosedFrames
+from reconstruction.world.planes import FittedPlane, fit_planes
+from reconstruction.world.samples import SurfaceSamples
+
+_ROLL_SIGMA_DEG = 4.0
+_PITCH_SIGMA_DEG = 28.0
+_SEARCH_DEG = 60.0
+_VOTE_WIDTH_DEG = 5.0
+_WALL_SHARE = 0.35  # a wall's vote leaves one direction free, and furniture has many upright faces
+_PLANE_SIGMA_DEG = 0.6  # how far a fitted plane may be from level or plumb and still count in full
+_SYSTEMATIC_DEG = 0.15
+_MIN_EVIDENCE = 0.03  # share of the surface
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """The direction of up and how it was found."""
+
+    up: np.ndarray  # float64 (3,) unit, sfm space
+    method: str  # "planes+walls+cameras" | "planes+cameras" | "walls+cameras" | "cameras"
+    sigma_deg: float
+
+
+def find_gravity(posed: PosedFrames, samples: SurfaceSamples) -> Gravity:
+    """Find up in sfm space."""
+    right = posed.world_from_camera[:, :3, 0]
+    rough_up = -posed.world_from_camera[:, :3, 1]
+    prior = camera_up(right, rough_up)
+    start = _best_vote(prior, right, rough_up, samples)
+    up = _refine_on_normals(start, right, samples)
+    level, plumb = _evidence(up, samples)
+    planes = fit_planes(samples, up) if max(level, plumb) > _MIN_EVIDENCE else ()
+    if planes:
+        up, sigma = _refine_on_planes(up, right, planes)
+    else:
+        sigma = _camera_sigma(prior, right)
+    has_level = any(p.level for p in planes)
+    has_plumb = any(not p.level for p in planes)
+    if not has_level and has_plumb:
+        # One wall leaves the turn about its normal to the cameras; two cross.
+        sigma = max(sigma, _camera_sigma(up, right) if _walls_are_parallel(planes) else sigma)
+    parts = ["planes"] * has_level + ["walls"] * has_plumb + ["cameras"]
+    return Gravity(up, "+".join(parts), float(sigma))
+
+
+def camera_up(right: np.ndarray, rough_up: np.ndarray) -> np.ndarray:
+    """Return up as the cameras alone tell it: no roll, pitch unknown but moderate, robust to some turned frames.
+
+    Args:
+        right: The cameras' x axes (n, 3).
+        rough_up: The cameras' -y axes (n, 3).
+    """
+    weights = np.ones(len(right))
+    up = _unit(np.median(rough_up, axis=0))
+    for _ in range(10):
+        roll = (weights[:, None] * right).T @ right / np.sin(np.radians(_ROLL_SIGMA_DEG)) ** 2
+        pitch = (weights[:, None] * rough_up).T @ rough_up / np.sin(np.radians(_PITCH_SIGMA_DEG)) ** 2
+        _, vectors = np.linalg.eigh(roll - pitch)
+        up = vectors[:, 0] * np.sign(vectors[:, 0] @ rough_up.sum(axis=0) or 1.0)
+        error_deg = np.degrees(np.arcsin(np.clip(np.abs(right @ up), 0, 1)))
+        weights = 1.0 / (1.0 + (error_deg / (2 * _ROLL_SIGMA_DEG)) ** 2)
+    return up
+
+
+def _best_vote(
+    prior: np.ndarray, right: np.ndarray, rough_up: np.ndarray, samples: SurfaceSamples
+) -> np.ndarray:
+    """Return the direction near the cameras' up that makes most of the surface level or plumb."""
+    directions = _fibonacci_sphere(4000)
+    bins = np.zeros(len(directions))
+    nearest = np.concatenate(
+        [(chunk @ directions.T).argmax(axis=1) for chunk in np.array_split(samples.normals, 64)]
+    )
+    np.add.at(bins, nearest, samples.weights)
+    used = bins > 0
+    normals, mass = directions[used], bins[used] / bins.sum()
+    candidates = _fibonacci_sphere(20000)
+    candidates = candidates[candidates @ prior > np.cos(np.radians(_SEARCH_DEG))]
+    cosine = candidates @ normals.T
+    width = np.radians(_VOTE_WIDTH_DEG)
+    level = np.exp(-0.5 * (np.arccos(np.clip(cosine, -1, 1)) / width) ** 2)
+    plumb = np.exp(-0.5 * (np.arcsin(np.clip(cosine, -1, 1)) / width) ** 2)
+    votes = (level + _WALL_SHARE * plumb) @ mass
+    roll = np.arcsin(np.clip(candidates @ right.T, -1, 1)) / np.radians(_ROLL_SIGMA_DEG)
+    # A Cauchy-like penalty: a few turned frames must not veto, and neither may the mean of many.
+    roll_cost = np.log1p(0.5 * roll**2).mean(axis=1)
+    pitch = np.arccos(np.clip(candidates @ _unit(rough_up.mean(axis=0)), -1, 1)) / np.radians(
+        _PITCH_SIGMA_DEG
+    )
+    return candidates[np.argmax(np.log(votes + 0.02) - roll_cost - 0.5 * pitch**2)]
+
+
+def _refine_on_normals(up: np.ndarray, right: np.ndarray, samples: SurfaceSamples) -> np.ndarray:
+    """Refine by reweighted least squares: level normals along up, plumb ones and camera x axes across it."""
+    for width_deg in (8.0, 6.0, 5.0, 4.0, 3.0, 3.0, 3.0, 3.0):
+        width = np.radians(width_deg)
+        cosine = np.clip(samples.normals @ up, -1, 1)
+        level = samples.weights * _biweight(np.arccos(np.abs(cosine)) / (2 * width))
+        plumb = _WALL_SHARE * samples.weights * _biweight(np.arcsin(cosine) / (2 * width))
+        n = samples.normals
+        matrix = level.sum() * np.eye(3) - (level[:, None] * n).T @ n + (plumb[:, None] * n).T @ n
+        # The cameras decide only what the surface leaves open.
+        matrix += 1e-3 * samples.weights.sum() * right.T @ right / len(right)
+        _, vectors = np.linalg.eigh(matrix)
+        up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
+    return up
+
+
+def _refine_on_planes(
+    up: np.ndarray, right: np.ndarray, planes: tuple[FittedPlane, ...]
+) -> tuple[np.ndarray, float]:
+    """Refine by whole planes; those that are not level or plumb after all lose their weight."""
+    camera = right.T @ right / len(right) / np.radians(_ROLL_SIGMA_DEG) ** 2
+    normals = np.array([p.normal for p in planes])
+    level = np.array([p.level for p in planes])
+    share = np.array([p.area for p in planes]) / sum(p.area for p in planes)
+    sigma = np.radians(np.hypot(_PLANE_SIGMA_DEG, [p.sigma_deg for p in planes]))
+    for _ in range(20):
+        cosine = np.clip(np.abs(normals @ up), 0, 1)
+        error = np.where(level, np.arccos(cosine), np.arcsin(cosine)) / sigma
+        weight = len(planes) * share / sigma**2 / (1 + error**2) ** 2
+        matrix = camera.copy()
+        for n, w, is_level in zip(normals, weight, level):
+            matrix += w * (np.eye(3) - np.outer(n, n) if is_level else np.outer(n, n))
+        values, vectors = np.linalg.eigh(matrix)
+        up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
+    # The second smallest eigenvalue is the information about the least certain turn.
+    return up, float(
+        np.degrees(np.hypot(1 / np.sqrt(max(values[1] - values[0], 1e-9)), np.radians(_SYSTEMATIC_DEG)))
+    )
+
+
+def _evidence(up: np.ndarray, samples: SurfaceSamples) -> tuple[float, float]:
+    cosine = samples.normals @ up
+    total = samples.weights.sum()
+    level = samples.weights[np.abs(cosine) > np.cos(np.radians(8))].sum() / total
+    return float(level), float(samples.weights[np.abs(cosine) < np.sin(np.radians(8))].sum() / total)
+
+
+def _walls_are_parallel(planes: tuple[FittedPlane, ...]) -> bool:
+    normals = np.array([p.normal for p in planes])
+    return bool(np.abs(normals @ normals.T).min() > np.cos(np.radians(20)))
+
+
+def _camera_sigma(up: np.ndarray, right: np.ndarray) -> float:
+    """Return how sure the cameras alone are: the spread of their roll, which one holder does not average away."""
+    roll_deg = np.degrees(np.arcsin(np.clip(right @ up, -1, 1)))
+    return float(max(1.5, 1.4826 * np.median(np.abs(roll_deg))))
+
+
+def _biweight(x: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(x) < 1, (1 - x**2) ** 2, 0.0)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(np.linalg.norm(vector), 1e-12)
+
+
+def _fibonacci_sphere(count: int) -> np.ndarray:
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    angle = np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z**2)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)

@@ -1,0 +1,111 @@
+"""Metres from printed ArUco or AprilTag markers of known size (OpenCV)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from reconstruction.types import PosedFrames
+from registry.errors import UsageError
+from registry.geometry import invert_rigid
+
+_MAX_REPROJECTION_PX = 2.0
+_MAX_SIDE_SPREAD = 0.10  # relative: a square has four equal sides
+_MIN_ANGLE_DEG = 2.0  # between the views of a corner
+
+
+@dataclass(frozen=True)
+class MarkerSide:
+    """A marker found in several frames: the length of its side in sfm units."""
+
+    dictionary: str
+    id: int
+    side: float
+    views: int
+    relative_sigma: float
+
+
+def detect_markers(
+    posed: PosedFrames, dictionaries: tuple[str, ...], rows: np.ndarray
+) -> dict[tuple[str, int], dict[int, np.ndarray]]:
+    """Return {(dictionary, marker id): {frame row: corners (4, 2) in pixels, centres at .5}}."""
+    known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    found: dict[tuple[str, int], dict[int, np.ndarray]] = {}
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    for name in dictionaries:
+        if name not in known:
+            raise UsageError(f"marker dictionary {name!r}: there are {', '.join(known)}")
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+        for row in rows:
+            gray = cv2.cvtColor(np.asarray(posed.images[row]), cv2.COLOR_RGB2GRAY)
+            corners, ids, _ = detector.detectMarkers(gray)
+            flat = [] if ids is None else ids.ravel().tolist()
+            for marker_id, quad in zip(flat, corners):
+                # The same id twice in one image is two prints of it: neither can be followed.
+                seen = found.setdefault((name, marker_id), {})
+                seen[int(row)] = np.full((4, 2), np.nan) if int(row) in seen else quad[0] + 0.5
+    for seen in found.values():
+        for row in [r for r, quad in seen.items() if np.isnan(quad).any()]:
+            del seen[row]
+    return found
+
+
+def measure_markers(posed: PosedFrames, dictionaries: tuple[str, ...]) -> list[MarkerSide]:
+    """Triangulate every marker that two or more frames see; false detections do not survive as squares."""
+    sides = []
+    for (name, marker_id), seen in sorted(
+        detect_markers(posed, dictionaries, np.arange(len(posed.images))).items()
+    ):
+        if len(seen) < 2:
+            continue
+        corners = _triangulate_quad(posed, seen)
+        if corners is None:
+            continue
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+        flatness = abs(np.linalg.det(corners[1:] - corners[0])) / lengths.mean() ** 3
+        diagonals = np.linalg.norm(corners[:2] - corners[2:], axis=1) / (np.sqrt(2) * lengths.mean())
+        if (
+            np.ptp(lengths) > _MAX_SIDE_SPREAD * lengths.mean()
+            or flatness > 0.1
+            or abs(diagonals - 1).max() > 0.1
+        ):
+            continue
+        pixels = np.mean([np.linalg.norm(q - np.roll(q, -1, axis=0), axis=1).mean() for q in seen.values()])
+        sigma = np.hypot(0.5 / pixels / np.sqrt(len(seen)), lengths.std() / lengths.mean() / 2)
+        sides.append(MarkerSide(name, marker_id, float(lengths.mean()), len(seen), float(max(sigma, 0.003))))
+    return sides
+
+
+def _triangulate_quad(posed: PosedFrames, seen: dict[int, np.ndarray]) -> np.ndarray | None:
+    """Return the corners (4, 3), or None where they do not agree across the frames."""
+    rows = sorted(seen)
+    keep = list(rows)
+    for _ in range(len(rows)):
+        projections = posed.camera.matrix @ invert_rigid(posed.world_from_camera[keep])[:, :3]
+        pixels = np.stack([seen[r] for r in keep])
+        corners = np.stack([_triangulate(projections, pixels[:, k]) for k in range(4)])
+        homogeneous = np.einsum("nij,kj->nki", projections, np.column_stack([corners, np.ones(4)]))
+        if (homogeneous[..., 2] <= 0).any():
+            return None
+        error = np.linalg.norm(homogeneous[..., :2] / homogeneous[..., 2:] - pixels, axis=-1).mean(axis=1)
+        if error.max() <= _MAX_REPROJECTION_PX:
+            return corners if _parallax_deg(posed, keep, corners) >= _MIN_ANGLE_DEG else None
+        del keep[int(error.argmax())]
+        if len(keep) < 2:
+            return None
+    return None
+
+
+def _parallax_deg(posed: PosedFrames, rows: list[int], corners: np.ndarray) -> float:
+    rays = corners.mean(axis=0) - posed.world_from_camera[rows, :3, 3]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+
+
+def _triangulate(projections: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the point (3,) seen at `pixels` (n, 2) through `projections` (n, 3, 4), by the linear method."""
+    rows = pixels[:, :, None] * projections[:, 2:3] - projections[:, :2]
+    _, _, vt = np.linalg.svd(rows.reshape(-1, 4) / np.linalg.norm(rows.reshape(-1, 4), axis=1, keepdims=True))
+    return vt[-1, :3] / vt[-1, 3]

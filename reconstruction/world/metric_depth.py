@@ -1,0 +1,82 @@
+"""Metres from a learned metric depth model: a seam, and one backend through `transformers`. Never the default."""
+
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from reconstruction.types import Camera, DepthMaps, PosedFrames
+from reconstruction.world.config import WorldConfig
+from reconstruction.world.samples import choose_frames
+from registry.errors import EnvironmentMissing, InputError
+
+_FRAMES = 8
+_MODEL_SIGMA = 0.08  # relative: what such models are off by as a whole on indoor benchmarks
+_MIN_PIXELS = 500
+
+
+class MetricDepthBackend(Protocol):
+    """Predicts depth in metres from single images."""
+
+    name: str
+
+    def predict(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return z-depth in metres, float32 (h, w), for an RGB image uint8 (h, w, 3)."""
+
+
+class TransformersBackend:
+    """A depth-estimation model of the Hugging Face hub (or a local folder)."""
+
+    name = "transformers"
+
+    def __init__(self, model: str) -> None:
+        try:
+            import torch
+            from transformers import pipeline
+        except ImportError as error:
+            raise EnvironmentMissing(
+                f"world: metric depth needs {error.name}; `pip install 'simrecon[metric-depth]'`, or leave out "
+                "--set world.metric_depth=transformers"
+            ) from error
+        device = 0 if torch.cuda.is_available() else -1
+        try:
+            self._pipeline = pipeline("depth-estimation", model=model, device=device)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise EnvironmentMissing(
+                f"world: the metric depth model {model!r} cannot be loaded ({error}); download it first, or name "
+                "its folder with --set world.metric_depth_model=DIR"
+            ) from error
+
+    def predict(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+        """See `MetricDepthBackend.predict`."""
+        from PIL import Image
+
+        predicted = self._pipeline(Image.fromarray(image))["predicted_depth"]
+        depth = np.asarray(predicted.squeeze().float().cpu(), np.float32)
+        return cv2.resize(depth, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+
+
+def load_backend(config: WorldConfig) -> MetricDepthBackend | None:
+    """Return the backend that the config asks for, or None."""
+    return TransformersBackend(config.metric_depth_model) if config.metric_depth == "transformers" else None
+
+
+def metres_per_unit(backend: MetricDepthBackend, posed: PosedFrames, depth: DepthMaps) -> tuple[float, float]:
+    """Return metres per sfm unit and its relative 1-sigma: the median ratio of predicted to measured depth."""
+    ratios = []
+    for row in choose_frames(len(posed.images), _FRAMES):
+        measured = np.where(np.asarray(depth.confidence[row]) >= 2, np.asarray(depth.depth[row]), 0)
+        size = (depth.camera.width, depth.camera.height)
+        image = cv2.resize(np.asarray(posed.images[row]), size, interpolation=cv2.INTER_AREA)
+        predicted = backend.predict(image, depth.camera)
+        good = (measured > 0) & (predicted > 0) & np.isfinite(predicted)
+        if good.sum() >= _MIN_PIXELS:
+            ratios.append(np.median(predicted[good] / measured[good]))
+    if not ratios:
+        raise InputError(
+            f"world: the metric depth backend {backend.name} and the measured depth have next to no pixel in common; "
+            "leave out --set world.metric_depth, or use --scale"
+        )
+    centre = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(np.array(ratios) / centre - 1)))
+    return centre, float(np.hypot(_MODEL_SIGMA, spread / np.sqrt(len(ratios))))

@@ -1,0 +1,153 @@
+"""Planes through the sampled surface: level ones (floor, tables) by height, plumb ones (walls) by direction.
+
+Fits run over all frames at once. A plane's area is counted in cells of a grid, so that what many frames see does not
+count more than what few see.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruction.world.samples import SurfaceSamples
+
+_BAND_SHARE = 0.012  # half the thickness of a plane's band, as a share of the median depth
+_CELL_SHARE = 0.04  # side of the cells that measure area
+_MIN_CELLS = 40
+_NORMAL_DEG = 15.0
+_MAX_PLANES = 6
+
+
+@dataclass(frozen=True)
+class FittedPlane:
+    """A plane through many samples: normal . x = offset."""
+
+    normal: np.ndarray  # float64 (3,) unit
+    offset: float
+    level: bool  # True: horizontal, False: vertical
+    area: float  # in sfm units squared
+    sigma_deg: float  # of the normal, from the scatter between frames
+
+
+def fit_planes(samples: SurfaceSamples, up: np.ndarray) -> tuple[FittedPlane, ...]:
+    """Find the largest level and plumb planes, given up within a few degrees."""
+    depth = float(np.median(samples.depths))
+    cosine = samples.normals @ up
+    tolerance = np.radians(_NORMAL_DEG)
+    found = []
+    level = np.abs(cosine) > np.cos(tolerance)
+    found += _peel(samples, level, np.broadcast_to(up, samples.normals.shape), True, depth)
+    for direction in _wall_directions(samples, up):
+        near = np.abs(samples.normals @ direction) > np.cos(tolerance)
+        found += _peel(samples, near, np.broadcast_to(direction, samples.normals.shape), False, depth)
+    return tuple(found)
+
+
+def _peel(
+    samples: SurfaceSamples, member: np.ndarray, axis: np.ndarray, level: bool, depth: float
+) -> list[FittedPlane]:
+    """Take the largest plane along `axis`, remove its samples, and repeat."""
+    band, direction = _BAND_SHARE * depth, axis[0]
+    rest = np.flatnonzero(member)
+    found: list[FittedPlane] = []
+    while len(rest) >= 200 and len(found) < _MAX_PLANES:
+        heights = samples.points[rest] @ direction
+        peak = strongest_height(heights, samples.weights[rest], band)
+        inside = rest[np.abs(heights - peak) < 3 * band]
+        plane = _fit(samples, inside, direction, peak, band, level, depth)
+        if plane is not None:
+            found.append(plane)
+        elif len(inside) < 0.02 * member.sum():
+            break
+        rest = rest[np.abs(heights - peak) >= 3 * band]
+    return found
+
+
+def strongest_height(heights: np.ndarray, weights: np.ndarray, band: float) -> float:
+    """Return the height that most samples are near to, by a smoothed histogram."""
+    low = heights.min() - 2 * band
+    index = ((heights - low) / (0.5 * band)).astype(np.int64)
+    histogram = np.bincount(np.minimum(index, 200_000), weights=weights)
+    smooth = np.convolve(histogram, [0.25, 0.75, 1.0, 0.75, 0.25], mode="same")
+    return float(low + 0.5 * band * (smooth.argmax() + 0.5))
+
+
+def _fit(
+    samples: SurfaceSamples,
+    rows: np.ndarray,
+    axis: np.ndarray,
+    peak: float,
+    band: float,
+    level: bool,
+    depth: float,
+) -> FittedPlane | None:
+    normal, offset = axis, peak
+    for factor in (3.0, 2.0, 1.5, 1.0, 1.0, 1.0):
+        off = samples.points[rows] @ normal - offset
+        weight = samples.weights[rows] * np.maximum(1 - (off / (factor * band)) ** 2, 0.0) ** 2
+        # Depth noise grows with depth, so far points count less, or they would tilt the plane by their leverage.
+        weight = weight / (samples.depths[rows] / depth) ** 2
+        if (weight > 0).sum() < 100:
+            return None
+        normal, offset = _weighted_plane(samples.points[rows], weight, axis)
+        if np.abs(normal @ axis) < np.cos(np.radians(_NORMAL_DEG)):
+            return None
+    inside = rows[weight > 0]
+    area = covered_area(samples.points[inside], normal, _CELL_SHARE * depth)
+    if area < _MIN_CELLS * (_CELL_SHARE * depth) ** 2:
+        return None
+    return FittedPlane(normal, offset, level, area, _scatter_deg(samples, inside, normal, axis))
+
+
+def _weighted_plane(points: np.ndarray, weight: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, float]:
+    mean = weight @ points / weight.sum()
+    centred = points - mean
+    _, vectors = np.linalg.eigh((weight[:, None] * centred).T @ centred)
+    normal = vectors[:, 0] * np.sign(vectors[:, 0] @ axis or 1.0)
+    return normal, float(normal @ mean)
+
+
+def _scatter_deg(samples: SurfaceSamples, rows: np.ndarray, normal: np.ndarray, axis: np.ndarray) -> float:
+    """Return the standard error of the normal: the plane fitted to five interleaved groups of frames."""
+    errors = []
+    for group in range(5):
+        part = rows[samples.frames[rows] % 5 == group]
+        if len(part) >= 60:
+            other, _ = _weighted_plane(samples.points[part], samples.weights[part], axis)
+            errors.append(np.degrees(np.arccos(np.clip(abs(other @ normal), 0, 1))))
+    return float(np.sqrt(np.mean(np.square(errors)) / len(errors))) if len(errors) >= 2 else 3.0
+
+
+def covered_area(points: np.ndarray, normal: np.ndarray, cell: float) -> float:
+    """Return the area of the grid cells on a plane that hold points."""
+    return len(np.unique(plane_cells(points, normal, cell), axis=0)) * cell**2
+
+
+def plane_cells(points: np.ndarray, normal: np.ndarray, cell: float) -> np.ndarray:
+    """Return the 2D grid cells (m, 2) of points projected along a normal."""
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(normal, first)], axis=1)
+    return np.floor(points @ axes / cell).astype(np.int64)
+
+
+def _wall_directions(samples: SurfaceSamples, up: np.ndarray) -> list[np.ndarray]:
+    """Return the dominant horizontal directions of plumb normals, folded by 180 degrees, at most four."""
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    plumb = np.abs(samples.normals @ up) < np.sin(np.radians(_NORMAL_DEG))
+    angle = np.arctan2(samples.normals[plumb] @ second, samples.normals[plumb] @ first) % np.pi
+    histogram = np.bincount(
+        (angle / np.pi * 90).astype(int) % 90, weights=samples.weights[plumb], minlength=90
+    )
+    smooth = histogram + 0.7 * (np.roll(histogram, 1) + np.roll(histogram, -1))
+    smooth += 0.3 * (np.roll(histogram, 2) + np.roll(histogram, -2))
+    found: list[np.ndarray] = []
+    for _ in range(4):
+        best = int(smooth.argmax())
+        if smooth[best] < 0.02 * samples.weights.sum():
+            break
+        turn = (best + 0.5) / 90 * np.pi
+        found.append(np.cos(turn) * first + np.sin(turn) * second)
+        smooth[(np.arange(best - 7, best + 8)) % 90] = 0
+    return found
