@@ -1,0 +1,9 @@
+"""Stage 6: cut the fused surface into floor, walls and separate things, from geometry and color alone."""
+
+from reconstruction.instances.config import INSTANCES_PRESETS, InstancesConfig
+from reconstruction.instances.find import find_instances
+from reconstruction.instances.overrides import apply_overrides
+
+VERSION = 1
+
+__all__ = ["INSTANCES_PRESETS", "VERSION", "InstancesConfig", "apply_overrides", "find_instances"]

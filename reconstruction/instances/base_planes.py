@@ -1,0 +1,234 @@
+"""Floor, walls and ceiling: the planes that bound the room, and which vertices lie on them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.mesh_graph import MeshGraph
+from reconstruction.types import BaseEntity, Plane
+
+_MAX_WALLS = 8
+
+
+@dataclass(frozen=True)
+class FittedPlane:
+    """A plane of the room and the vertices on it."""
+
+    label: str
+    plane: np.ndarray  # float64 (4,) n . x + d = 0, n into the room
+    band_m: float  # vertices within this distance are on it
+    members: np.ndarray  # bool (v,)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Return signed distances (n,), positive in the room."""
+        return points @ self.plane[:3] + self.plane[3]
+
+
+def _band(residuals: np.ndarray, low: float, high: float) -> float:
+    sigma = 1.4826 * float(np.median(np.abs(residuals - np.median(residuals)))) if len(residuals) else low
+    return float(np.clip(3.0 * sigma, low, high))
+
+
+def fit_floor(graph: MeshGraph, config: InstancesConfig) -> FittedPlane | None:
+    """Fit the floor near z = 0; None where too little of it was seen."""
+    z = graph.points[:, 2]
+    flat = (graph.normals[:, 2] > 0.8) & (np.abs(z) < 0.06)
+    if graph.areas[flat].sum() < config.min_floor_area_m2:
+        return None
+    histogram, bounds = np.histogram(z[flat], bins=np.arange(-0.06, 0.0601, 0.005), weights=graph.areas[flat])
+    peak = int(np.argmax(np.convolve(histogram, [1, 2, 1], "same")))
+    height = 0.5 * (bounds[peak] + bounds[peak + 1])
+    slope = np.zeros(2)
+    for _ in range(3):  # trimmed least squares of z = slope . xy + height
+        residual = z - graph.points[:, :2] @ slope - height
+        near = flat & (np.abs(residual) < 0.02)
+        design = np.column_stack([graph.points[near, :2], np.ones(near.sum())]) * np.sqrt(
+            graph.areas[near, None]
+        )
+        solution = np.linalg.lstsq(design, z[near] * np.sqrt(graph.areas[near]), rcond=None)[0]
+        if np.linalg.norm(solution[:2]) > 0.03:  # 1.7 degrees: objects have tilted the fit
+            break
+        slope, height = solution[:2], float(solution[2])
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    scale = np.linalg.norm(normal)
+    plane = np.append(normal, -height) / scale
+    residual = graph.points @ plane[:3] + plane[3]
+    band = _band(residual[flat & (np.abs(residual) < 0.03)], 0.01, 0.03)
+    up = graph.normals[:, 2]
+    members = (residual < band) & (up > 0.6)
+    members |= residual < 0.5 * band
+    return FittedPlane("floor", plane, band, members)
+
+
+def fit_walls(graph: MeshGraph, taken: np.ndarray, config: InstancesConfig) -> list[FittedPlane]:
+    """Find the large vertical planes with nothing of the room behind them."""
+    upright = (np.abs(graph.normals[:, 2]) < 0.35) & ~taken
+    candidates: list[tuple[np.ndarray, np.ndarray, float]] = []
+    free = upright.copy()
+    for _ in range(3 * _MAX_WALLS):
+        found = _strongest_upright_plane(graph, free, config)
+        if found is None:
+            break
+        plane, inliers, area = found
+        free &= ~inliers
+        candidates.append((plane, inliers, area))
+    walls = []
+    for plane, inliers, area in candidates:
+        if len(walls) < _MAX_WALLS and _bounds_the_room(graph, plane, inliers, area, candidates, config):
+            distance = graph.points @ plane[:3] + plane[3]
+            band = _band(distance[inliers], 0.012, 0.035)
+            members = ~taken & (distance < band) & (distance > -0.08)
+            members &= (graph.normals @ plane[:3] > 0.55) | (distance < 0.5 * band)
+            members &= _within_extent(graph, plane, inliers)
+            walls.append(FittedPlane("wall", plane, band, members))
+            taken = taken | members
+    return walls
+
+
+def _strongest_upright_plane(
+    graph: MeshGraph, free: np.ndarray, config: InstancesConfig
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Return (plane, inliers, area) of the vertical plane with most free area; None when none is wall-sized."""
+    index = np.flatnonzero(free)
+    if graph.areas[index].sum() < config.min_wall_area_m2:
+        return None
+    azimuth = np.arctan2(graph.normals[index, 1], graph.normals[index, 0])
+    areas = graph.areas[index]
+    histogram = np.bincount((np.degrees(azimuth) % 360).astype(int) % 360, weights=areas, minlength=360)
+    padded = np.concatenate([histogram[-6:], histogram, histogram[:6]])
+    smooth = np.convolve(padded, np.hanning(13), "valid")
+    best: tuple[float, np.ndarray] | None = None
+    for _ in range(6):
+        peak = int(np.argmax(smooth))
+        direction = np.radians(peak + 0.5)
+        smooth[(np.arange(peak - 15, peak + 16)) % 360] = 0
+        normal = np.array([np.cos(direction), np.sin(direction), 0.0])
+        facing = graph.normals[index] @ normal > 0.9
+        offsets = graph.points[index[facing]] @ normal
+        if len(offsets) == 0:
+            continue
+        bins = np.arange(offsets.min() - 0.03, offsets.max() + 0.04, 0.01)
+        counts = np.convolve(np.histogram(offsets, bins, weights=areas[facing])[0], np.ones(5), "same")
+        place = int(np.argmax(counts))
+        if best is None or counts[place] > best[0]:
+            best = (counts[place], np.append(normal, -(bins[place] + 0.005)))
+    if best is None or best[0] < 0.5 * config.min_wall_area_m2:
+        return None
+    return _refined(graph, free, best[1], config)
+
+
+def _refined(
+    graph: MeshGraph, free: np.ndarray, plane: np.ndarray, config: InstancesConfig
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    for width in (0.06, 0.04, 0.03):
+        distance = graph.points @ plane[:3] + plane[3]
+        inliers = free & (np.abs(distance) < width) & (graph.normals @ plane[:3] > 0.8)
+        if inliers.sum() < 10:
+            return None
+        weights = graph.areas[inliers]
+        xy = graph.points[inliers, :2]
+        center = np.average(xy, axis=0, weights=weights)
+        spread = ((xy - center) * weights[:, None]).T @ (xy - center)
+        normal = np.linalg.eigh(spread)[1][:, 0]
+        if normal @ plane[:2] < 0:
+            normal = -normal
+        if normal @ plane[:2] < 0.97:  # a short piece cannot tell its own direction
+            normal = plane[:2]
+        plane = np.array([normal[0], normal[1], 0.0, -normal @ center])
+    distance = graph.points @ plane[:3] + plane[3]
+    inliers = free & (np.abs(distance) < 0.04) & (graph.normals @ plane[:3] > 0.75)
+    area = float(graph.areas[inliers].sum())
+    return (plane, inliers, area) if area >= 0.5 * config.min_wall_area_m2 else None
+
+
+def _along(graph: MeshGraph, plane: np.ndarray) -> np.ndarray:
+    return graph.points[:, :2] @ np.array([-plane[1], plane[0]])
+
+
+def _within_extent(graph: MeshGraph, plane: np.ndarray, inliers: np.ndarray) -> np.ndarray:
+    along = _along(graph, plane)
+    low, high = np.percentile(along[inliers], [0.5, 99.5])
+    return (along > low - 0.15) & (along < high + 0.15)
+
+
+def _bounds_the_room(graph, plane, inliers, area, candidates, config: InstancesConfig) -> bool:
+    """Tell a wall from the side of a piece of furniture."""
+    if area < config.min_wall_area_m2:
+        return False
+    along = _along(graph, plane)
+    low, high = np.percentile(along[inliers], [1, 99])
+    bottom, top = np.percentile(graph.points[inliers, 2], [1, 99])
+    if high - low < config.min_wall_width_m or top - bottom < 0.45 or top < 0.8:
+        return False
+    distance = graph.points @ plane[:3] + plane[3]
+    behind = (distance < -0.12) & (along > low) & (along < high)
+    if graph.areas[behind].sum() > 0.10 * area:
+        return False
+    for other, other_inliers, other_area in candidates:
+        # A parallel plane of wall size not far behind is the wall; this one is a front of furniture before it.
+        if other @ np.append(plane[:3], 0) < 0.95 or other_area < 0.7 * area:
+            continue
+        gap = -float(np.median(distance[other_inliers]))
+        if 0.08 < gap < 1.0:
+            return False
+    return True
+
+
+def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: InstancesConfig) -> FittedPlane | None:
+    """Find a ceiling: a large down-facing plane above 1.8 m."""
+    down = (graph.normals[:, 2] < -0.85) & (graph.points[:, 2] > 1.8) & ~taken
+    if graph.areas[down].sum() < config.min_wall_area_m2:
+        return None
+    z = graph.points[down, 2]
+    histogram, bounds = np.histogram(z, bins=np.arange(1.8, z.max() + 0.04, 0.02), weights=graph.areas[down])
+    height = float(bounds[int(np.argmax(histogram))] + 0.01)
+    near = down & (np.abs(graph.points[:, 2] - height) < 0.04)
+    if graph.areas[near].sum() < config.min_wall_area_m2 or (graph.points[:, 2] > height + 0.1).mean() > 0.01:
+        return None
+    height = float(np.average(graph.points[near, 2], weights=graph.areas[near]))
+    members = ~taken & (graph.points[:, 2] > height - 0.04)
+    return FittedPlane("ceiling", np.array([0, 0, -1.0, height]), 0.04, members)
+
+
+def base_entity(number: int, fitted: FittedPlane, graph: MeshGraph) -> BaseEntity:
+    """Return the entity of a fitted plane, its outline the convex hull of its vertices (trimmed of strays)."""
+    outline = base_outline(graph.points[fitted.members], fitted.plane)
+    return BaseEntity(number, fitted.label, Plane(fitted.plane, outline), True)
+
+
+def base_outline(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Return the convex outline (k, 3) of points projected onto a plane, trimmed of strays."""
+    axis_u, axis_v = plane_axes(plane)
+    uv = np.column_stack([points @ axis_u, points @ axis_v])
+    low, high = np.percentile(uv, [0.1, 99.9], axis=0)
+    hull = cv2.convexHull(np.clip(uv, low, high).astype(np.float32)).reshape(-1, 2).astype(np.float64)
+    return _on_plane(hull, plane)
+
+
+def assumed_floor(number: int, points: np.ndarray) -> BaseEntity:
+    """Return a floor at z = 0 under everything, marked as not observed."""
+    if len(points):
+        low, high = np.percentile(points[:, :2], [0.5, 99.5], axis=0)
+    else:
+        low, high = np.full(2, -1.0), np.full(2, 1.0)
+    low, high = low - 0.25, high + 0.25
+    corners = np.array(
+        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
+    )
+    return BaseEntity(number, "floor", Plane(np.array([0, 0, 1.0, 0]), corners), False)
+
+
+def plane_axes(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit vectors (u, v) in a plane, u x v = n; for upright planes v is up and u is horizontal."""
+    normal = plane[:3]
+    reference = np.array([0, 0, 1.0]) if abs(normal[2]) < 0.7 else np.array([0, 1.0, 0])
+    axis_u = np.cross(reference, normal)
+    axis_u /= np.linalg.norm(axis_u)
+    return axis_u, np.cross(normal, axis_u)
+
+
+def _on_plane(uv: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    axis_u, axis_v = plane_axes(plane)
+    return uv[:, :1] * axis_u + uv[:, 1:] * axis_v - plane[3] * plane[:3]

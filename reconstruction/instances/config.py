@@ -1,0 +1,54 @@
+"""Settings of the instances stage."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class InstancesConfig:
+    """How the surface is cut into things."""
+
+    min_object_m: float = 0.03
+    """Things whose second-largest extent is below this are not objects."""
+
+    min_object_vertices: int = 25
+    """Things with fewer surface vertices than this are fragments."""
+
+    contact_height_m: float = 0.008
+    """What rises above a support plane by more than this (or by the plane's own noise) stands on it."""
+
+    bridge_gap_m: float = 0.02
+    """Pieces of surface closer than this may belong to one thing."""
+
+    min_support_area_m2: float = 0.004
+    """Smaller up-facing patches carry nothing."""
+
+    min_wall_area_m2: float = 0.4
+    """Smaller vertical planes are not walls."""
+
+    min_wall_width_m: float = 0.7
+    """Narrower vertical planes are not walls."""
+
+    min_floor_area_m2: float = 0.1
+    """With less up-facing surface near z = 0 the floor counts as not observed."""
+
+    min_picture_m: float = 0.10
+    """The shorter side of the smallest picture that is looked for on a wall."""
+
+    wall_color_contrast: float = 9.0
+    """CIELAB distance from the wall's own color at which a part of it may be a picture."""
+
+    split_color_contrast: float = 14.0
+    """CIELAB distance between touching patches below which they are never cut apart."""
+
+    split_angle_deg: float = 18.0
+    """Mean concave angle along the contact of two patches below which they are never cut apart."""
+
+    snap_radius_px: int = 3
+    """How far the borders of id maps may move to a color edge, at depth resolution."""
+
+
+INSTANCES_PRESETS = {
+    "fast": InstancesConfig(snap_radius_px=0),
+    "default": InstancesConfig(),
+    "quality": InstancesConfig(),
+}

@@ -1,0 +1,255 @@
+"""The stage itself: base planes, pictures, things, boxes and labels, id maps."""
+
+import cv2
+import numpy as np
+
+from reconstruction.instances.base_planes import (
+    FittedPlane,
+    assumed_floor,
+    base_entity,
+    fit_ceiling,
+    fit_floor,
+    fit_walls,
+)
+from reconstruction.instances.boxes import UprightBox, upright_box, with_bottom
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.id_maps import render_id_maps
+from reconstruction.instances.labels import ShapeFacts, coarse_label
+from reconstruction.instances.mesh_graph import MeshGraph
+from reconstruction.instances.pictures import find_pictures
+from reconstruction.instances.segmentation import Thing, segment
+from reconstruction.progress import Progress
+from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
+
+
+def find_instances(
+    posed: PosedFrames, depth: DepthMaps, surface: Surface, config: InstancesConfig, *, progress: Progress
+) -> InstanceSet:
+    """Cut the surface into base entities and separate things.
+
+    Args:
+        posed: keyframes with cameras in world space.
+        depth: their depth in metres.
+        surface: the fused surface in world space, floor at z = 0, walls roughly along the axes.
+        config: thresholds.
+        progress: told of decisions: a floor that had to be assumed, an empty room.
+
+    Returns:
+        The instances; ids count from 1, base entities first (floor, walls, ceiling), then objects by size.
+    """
+    progress.start(4, "base planes and things")
+    graph = MeshGraph.from_surface(surface)
+    planes, owner = _fit_base(graph, config)
+    progress.advance()
+    base = _base_entities(graph, planes, progress)
+    things = _pictures(graph, planes, owner, config)
+    hung = np.zeros(len(graph.points), bool)
+    for thing in things:
+        hung[thing.vertices] = True
+    behind = _behind_base(graph, planes)
+    rest = np.flatnonzero((owner == 0) & ~hung & ~behind)
+    progress.advance()
+    things += _mark_attached(graph, segment(graph, rest, config), planes)
+    progress.advance()
+    vertex_instance = np.where(hung, 0, owner).astype(np.int32)
+    objects = describe(graph, things, base, vertex_instance)
+    progress.advance()
+    if not objects:
+        progress.note("No separate things were found: the scene is an empty room.")
+    id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, progress=progress)
+    return InstanceSet(vertex_instance, base, objects, id_maps)
+
+
+def _fit_base(graph: MeshGraph, config: InstancesConfig) -> tuple[list[FittedPlane], np.ndarray]:
+    """Return the fitted planes (a floor first, if seen) and the id of the plane that owns each vertex (0 = none)."""
+    owner = np.zeros(len(graph.points), np.int32)
+    planes: list[FittedPlane] = []
+    floor = fit_floor(graph, config)
+    first = 1
+    if floor is not None:
+        planes.append(floor)
+        owner[floor.members] = 1
+    for wall in fit_walls(graph, owner > 0, config):
+        planes.append(wall)
+        owner[wall.members & (owner == 0)] = first + len([p for p in planes if p.label != "floor"])
+    ceiling = fit_ceiling(graph, owner > 0, config)
+    if ceiling is not None:
+        planes.append(ceiling)
+        owner[ceiling.members & (owner == 0)] = first + len([p for p in planes if p.label != "floor"])
+    return planes, owner
+
+
+def _base_entities(graph: MeshGraph, planes: list[FittedPlane], progress: Progress) -> tuple[BaseEntity, ...]:
+    base: list[BaseEntity] = []
+    if not planes or planes[0].label != "floor":
+        progress.note("No floor was seen near z = 0: one is assumed under everything.")
+        base.append(assumed_floor(1, graph.points))
+    for plane in planes:
+        base.append(base_entity(len(base) + 1, plane, graph))
+    return tuple(base)
+
+
+def _pictures(
+    graph: MeshGraph, planes: list[FittedPlane], owner: np.ndarray, config: InstancesConfig
+) -> list[Thing]:
+    found: list[Thing] = []
+    used = np.zeros(len(owner), bool)
+    for plane in planes:
+        if plane.label != "wall":
+            continue
+        taken = (owner > 0) & ~plane.members
+        for vertices in find_pictures(graph, plane, taken | used, owner == 0, config):
+            used[vertices] = True
+            found.append(Thing(vertices, attached=True))
+    return found
+
+
+def _behind_base(graph: MeshGraph, planes: list[FittedPlane]) -> np.ndarray:
+    """Mark vertices below the floor or behind a wall: reflections, what a window shows, and noise."""
+    out = np.zeros(len(graph.points), bool)
+    for plane in planes:
+        distance = plane.distance(graph.points)
+        beyond = distance < -plane.band_m
+        if plane.label == "wall":
+            axis = np.array([-plane.plane[1], plane.plane[0]])
+            along = graph.points[:, :2] @ axis
+            low, high = np.percentile(along[plane.members], [0.5, 99.5])
+            beyond &= (along > low - 0.05) & (along < high + 0.05)
+        out |= beyond
+    return out
+
+
+def _mark_attached(graph: MeshGraph, things: list[Thing], planes: list[FittedPlane]) -> list[Thing]:
+    """Mark things that touch a wall and have nothing below them."""
+    for thing in things:
+        points = graph.points[thing.vertices]
+        if thing.rests_on is not None or points[:, 2].min() < 0.15:
+            continue
+        for plane in planes:
+            if plane.label == "wall" and np.percentile(plane.distance(points), 5) < 0.06:
+                thing.attached = True
+    return things
+
+
+def describe(
+    graph: MeshGraph, things: list[Thing], base: tuple[BaseEntity, ...], vertex_instance: np.ndarray
+) -> tuple[Instance, ...]:
+    """Number things by size, write their ids into `vertex_instance` and describe them."""
+    boxes = {id(t): upright_box(graph.points[t.vertices], graph.areas[t.vertices]) for t in things}
+    order = sorted(things, key=lambda t: (-float(np.prod(boxes[id(t)].extents_m)), int(t.vertices[0])))
+    number = {id(t): len(base) + 1 + i for i, t in enumerate(order)}
+    out = []
+    for thing in order:
+        vertex_instance[thing.vertices] = number[id(thing)]
+        box = _box_on_support(graph, thing, boxes[id(thing)], base)
+        carries = sum(1 for t in things if t.rests_on is thing)
+        on_floor = (
+            not thing.attached and thing.rests_on is None and box.center[2] - 0.5 * box.extents_m[2] < 0.1
+        )
+        label, confidence = coarse_label(
+            shape_facts(graph, thing.vertices, box, on_floor, thing.attached, carries)
+        )
+        hint = number[id(thing.rests_on)] if thing.rests_on is not None else 1 if on_floor else 0
+        if thing.attached:
+            hint = _nearest_wall(graph, thing, base)
+        out.append(
+            Instance(
+                number[id(thing)],
+                label,
+                confidence,
+                box.center,
+                box.yaw_rad,
+                box.extents_m,
+                hint,
+                thing.attached,
+            )
+        )
+    return tuple(out)
+
+
+def _nearest_wall(graph: MeshGraph, thing: Thing, base: tuple[BaseEntity, ...]) -> int:
+    walls = [b for b in base if b.label == "wall"]
+    if not walls:
+        return 0
+    points = graph.points[thing.vertices]
+    gaps = [abs(float(np.median(points @ b.surface.plane[:3] + b.surface.plane[3]))) for b in walls]
+    return walls[int(np.argmin(gaps))].id
+
+
+def _box_on_support(
+    graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[BaseEntity, ...]
+) -> UprightBox:
+    """Let the box reach the surface that the thing rests on, whose contact no camera sees."""
+    if thing.attached:
+        return _box_to_wall(graph, thing, box, base)
+    bottom = box.center[2] - 0.5 * box.extents_m[2]
+    if thing.rests_on is None:
+        return (
+            with_bottom(box, 0.0) if base[0].observed and bottom < max(0.06, 0.15 * box.extents_m[2]) else box
+        )
+    under = thing.rests_on.vertices
+    near = (
+        np.abs(graph.points[under, :2] - box.center[:2]) < 0.5 * np.linalg.norm(box.extents_m[:2]) + 0.03
+    ).all(1)
+    carrying = under[near & (graph.normals[under, 2] > 0.7) & (graph.points[under, 2] < bottom + 0.02)]
+    if len(carrying) < 5:
+        return box
+    level = (
+        float(np.median(graph.points[carrying, 2][graph.points[carrying, 2] > bottom - 0.05], axis=0))
+        if (graph.points[carrying, 2] > bottom - 0.05).any()
+        else bottom
+    )
+    return with_bottom(box, min(level, bottom + 0.01))
+
+
+def _box_to_wall(graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[BaseEntity, ...]) -> UprightBox:
+    """Return a box parallel to the wall, from the wall to the front of the thing."""
+    wall = next((b for b in base if b.id == _nearest_wall(graph, thing, base)), None)
+    if wall is None:
+        return box
+    normal = wall.surface.plane[:3]
+    yaw = float(np.arctan2(normal[1], normal[0]))
+    points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
+    turned = upright_box(points, areas, yaw)
+    distance = points @ normal + wall.surface.plane[3]
+    front = max(float(np.percentile(distance, 80)), 0.015)
+    along = np.array([-np.sin(yaw), np.cos(yaw)])
+    center = turned.center.copy()
+    center[:2] = (turned.center[:2] @ along) * along + (0.5 * front - wall.surface.plane[3]) * normal[:2]
+    return UprightBox(center, yaw, np.array([front, turned.extents_m[1], turned.extents_m[2]]))
+
+
+def shape_facts(
+    graph: MeshGraph, vertices: np.ndarray, box: UprightBox, on_floor: bool, attached: bool, carries: int
+) -> ShapeFacts:
+    """Measure what labels are guessed from."""
+    points, normals, areas = graph.points[vertices], graph.normals[vertices], graph.areas[vertices]
+    plan = float(np.prod(box.extents_m[:2]))
+    top = box.center[2] + 0.5 * box.extents_m[2]
+    up = normals[:, 2] > 0.8
+    near_top = up & (points[:, 2] > top - max(0.03, 0.12 * box.extents_m[2]))
+    heights = points[up, 2]
+    step = 0.04
+    levels = (
+        np.histogram(heights, np.arange(0, top + 2 * step, step), weights=areas[up])[0]
+        if up.any()
+        else np.zeros(1)
+    )
+    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+    local = np.abs((points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]])) / (0.5 * box.extents_m[:2])
+    middle = (local.max(axis=1) < 0.45) & up
+    hollow = bool(middle.any() and np.median(points[middle, 2]) < top - max(0.015, 0.3 * box.extents_m[2]))
+    hull = cv2.contourArea(cv2.convexHull(points[:, :2].astype(np.float32))) / max(plan, 1e-9)
+    lab = graph.lab[vertices]
+    green = (lab[:, 1] < -8) & (lab[:, 2] > 5)
+    return ShapeFacts(
+        box.extents_m,
+        on_floor,
+        attached,
+        carries,
+        float(areas[near_top].sum()) / max(plan, 1e-9),
+        int((levels > 0.25 * plan).sum()),
+        hollow,
+        0.65 < hull < 0.87 and 0.8 < box.extents_m[0] / box.extents_m[1] < 1.25,
+        float(green.mean()),
+    )

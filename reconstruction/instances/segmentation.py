@@ -1,0 +1,173 @@
+"""Cut what remains above the base into things: pieces, then supports, then touching neighbors, recursively."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.mesh_graph import MeshGraph, pieces
+from reconstruction.instances.splitting import split_touching
+from reconstruction.instances.supports import contact_height, find_supports, stands_on
+
+_MAX_DEPTH = 4
+
+
+@dataclass
+class Thing:
+    """A thing while it is being found; `rests_on` is another thing or None (the base)."""
+
+    vertices: np.ndarray  # int (n,) sorted
+    rests_on: "Thing | None" = None
+    depth: int = 0
+    attached: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+def segment(graph: MeshGraph, rest: np.ndarray, config: InstancesConfig) -> list[Thing]:
+    """Cut vertices `rest` (indices, without the base) into things; parents come before what rests on them."""
+    bridge = max(config.bridge_gap_m, 1.6 * graph.spacing_m)
+    bodies = _join_parts(graph, pieces(graph, rest, bridge), config)
+    things: list[Thing] = []
+    for body in bodies:
+        things.extend(_decompose(graph, body, None, 0, config))
+    return _absorb_fragments(graph, things, config)
+
+
+def _decompose(
+    graph: MeshGraph, body: np.ndarray, rests_on: Thing | None, depth: int, config: InstancesConfig
+) -> list[Thing]:
+    """Split a connected body into itself and the things that stand on its supports."""
+    own = Thing(body, rests_on, depth)
+    if len(body) < config.min_object_vertices or depth >= _MAX_DEPTH:
+        return [own]
+    remaining = body
+    carried: list[np.ndarray] = []
+    for support in find_supports(graph, body, config):
+        if not np.isin(support.vertices, remaining, assume_unique=True).mean() > 0.5:
+            continue  # it lies on something that was taken off already, whose own turn comes
+        level = support.height_m + contact_height(support, config)
+        above = remaining[graph.points[remaining, 2] > level]
+        above = np.setdiff1d(above, support.vertices, assume_unique=True)
+        for candidate in pieces(graph, above):
+            if len(candidate) < config.min_object_vertices:
+                break_area = graph.areas[candidate].sum()
+                if break_area < 1e-4:
+                    break
+                continue
+            if stands_on(graph, remaining, support, candidate, config):
+                carried.append(candidate)
+                remaining = np.setdiff1d(remaining, candidate, assume_unique=True)
+    own.vertices = remaining
+    out: list[Thing] = []
+    parts = split_touching(graph, remaining, config) if depth > 0 or not carried else [remaining]
+    out.append(Thing(parts[0], rests_on, depth))
+    for part in parts[1:]:
+        out.append(Thing(part, _carrier(graph, part, out[0], rests_on), depth))
+    carriers = list(out)
+    for candidate in carried:
+        parent = _nearest_below(graph, candidate, carriers)
+        out.extend(_decompose(graph, candidate, parent, depth + 1, config))
+    return out
+
+
+def _carrier(graph: MeshGraph, part: np.ndarray, main: Thing, rests_on: Thing | None) -> Thing | None:
+    """A part split off its neighbor rests on it if it is over it, beside it on the same support otherwise."""
+    low = float(np.percentile(graph.points[part, 2], 3))
+    inside = graph.points[main.vertices]
+    span_low, span_high = np.percentile(inside[:, :2], [3, 97], axis=0)
+    center = np.median(graph.points[part, :2], axis=0)
+    within = bool(((center > span_low) & (center < span_high)).all())
+    return main if within and low > float(np.percentile(inside[:, 2], 3)) + 0.003 else rests_on
+
+
+def _nearest_below(graph: MeshGraph, candidate: np.ndarray, carriers: list[Thing]) -> Thing:
+    if len(carriers) == 1:
+        return carriers[0]
+    points = graph.points[candidate]
+    foot = points[points[:, 2] < points[:, 2].min() + 0.02]
+    gaps = [float(np.median(cKDTree(graph.points[c.vertices]).query(foot)[0])) for c in carriers]
+    return carriers[int(np.argmin(gaps))]
+
+
+def _join_parts(graph: MeshGraph, found: list[np.ndarray], config: InstancesConfig) -> list[np.ndarray]:
+    """Join legs and torn pieces to the furniture above them that they must belong to."""
+    bodies = [piece for piece in found if len(piece) >= config.min_object_vertices]
+    crumbs = [piece for piece in found if len(piece) < config.min_object_vertices]
+    changed = True
+    while changed:
+        changed = False
+        for i, lower in enumerate(bodies):
+            for j, upper in enumerate(bodies):
+                if i != j and _is_leg_of(graph, lower, upper):
+                    bodies[j] = np.sort(np.concatenate([upper, lower]))
+                    del bodies[i]
+                    changed = True
+                    break
+            if changed:
+                break
+    if not bodies or not crumbs:
+        return bodies
+    owner = np.concatenate([np.full(len(body), i) for i, body in enumerate(bodies)])
+    tree = cKDTree(graph.points[np.concatenate(bodies)])
+    extra: dict[int, list[np.ndarray]] = {}
+    for crumb in crumbs:
+        distance, index = tree.query(graph.points[crumb])
+        if distance.min() < 0.04:
+            extra.setdefault(int(owner[index[np.argmin(distance)]]), []).append(crumb)
+    return [np.sort(np.concatenate([body, *extra.get(i, [])])) for i, body in enumerate(bodies)]
+
+
+def _is_leg_of(graph: MeshGraph, lower: np.ndarray, upper: np.ndarray) -> bool:
+    """A slim piece under a larger one that reaches up to nearly its underside is its leg (or its side)."""
+    if graph.areas[lower].sum() > graph.areas[upper].sum():
+        return False
+    low, high = graph.points[lower], graph.points[upper]
+    top_of_lower = float(np.percentile(low[:, 2], 98))
+    bottom, top = np.percentile(high[:, 2], [2, 90])
+    if low[:, 2].min() > bottom or top < 0.2 or top_of_lower > top + 0.02:
+        return False
+    margin = 0.05
+    inside = ((low[:, :2] > high[:, :2].min(0) - margin) & (low[:, :2] < high[:, :2].max(0) + margin)).all(
+        axis=1
+    )
+    if inside.mean() < 0.8:
+        return False
+    slim = bool(np.sort(np.ptp(low, axis=0))[0] < 0.12 and np.ptp(low[:, 2]) > 0.05)
+    gap = top - top_of_lower
+    return gap < 0.15 * top or (slim and gap < 0.7 * top)
+
+
+def _absorb_fragments(graph: MeshGraph, things: list[Thing], config: InstancesConfig) -> list[Thing]:
+    """Give pieces too small to be things to what they touch; drop those that touch nothing."""
+    kept: list[Thing] = []
+    small: list[Thing] = []
+    for thing in things:
+        if len(thing.vertices) == 0:
+            small.append(thing)
+            continue
+        low, high = np.percentile(graph.points[thing.vertices], [2, 98], axis=0)
+        large = (
+            np.sort(high - low)[1] >= 0.8 * config.min_object_m
+            and len(thing.vertices) >= config.min_object_vertices
+        )
+        (kept if large else small).append(thing)
+    heirs: dict[int, Thing | None] = {}
+    if kept:
+        owner = np.concatenate([np.full(len(t.vertices), i) for i, t in enumerate(kept)])
+        tree = cKDTree(graph.points[np.concatenate([t.vertices for t in kept])])
+        for thing in small:
+            if len(thing.vertices) == 0:
+                heirs[id(thing)] = thing.rests_on
+                continue
+            distance, index = tree.query(graph.points[thing.vertices])
+            heir = kept[int(owner[index[np.argmin(distance)]])] if distance.min() < 0.03 else None
+            heirs[id(thing)] = heir
+            if heir is not None:
+                heir.vertices = np.sort(np.concatenate([heir.vertices, thing.vertices]))
+    for thing in kept:
+        while thing.rests_on is not None and id(thing.rests_on) in heirs:
+            thing.rests_on = heirs[id(thing.rests_on)]
+        if thing.rests_on is thing:
+            thing.rests_on = None
+    return kept

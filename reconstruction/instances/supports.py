@@ -1,0 +1,218 @@
+"""Up-facing planar regions that carry things, and the test whether something stands on one or belongs to it."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import binary_dilation, binary_fill_holes
+from scipy.spatial import cKDTree
+
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.mesh_graph import MeshGraph, pieces
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """A region of the ground plan as a grid of cells."""
+
+    origin: np.ndarray  # float64 (2,)
+    cell_m: float
+    filled: np.ndarray  # bool (nx, ny) outline with holes and bays filled
+    occupied: np.ndarray  # bool (nx, ny) where surface was seen
+
+    @classmethod
+    def of(cls, points_xy: np.ndarray, cell_m: float) -> "Footprint":
+        """Rasterize points (n, 2); a nearly convex shape is filled to its convex hull."""
+        margin = 4
+        origin = points_xy.min(axis=0) - margin * cell_m
+        cells = np.floor((points_xy - origin) / cell_m).astype(np.int32)
+        occupied = np.zeros(cells.max(axis=0) + margin + 1, np.uint8)
+        occupied[cells[:, 0], cells[:, 1]] = 1
+        kernel = np.ones((3, 3), np.uint8)
+        occupied = cv2.morphologyEx(occupied, cv2.MORPH_CLOSE, kernel).astype(bool)
+        hull = cv2.convexHull(np.ascontiguousarray(cells[:, ::-1]))
+        convex = np.zeros(occupied.shape, np.uint8)
+        cv2.fillConvexPoly(convex, hull, 1)
+        filled = binary_fill_holes(occupied)
+        if filled.sum() >= 0.7 * convex.sum():
+            filled = filled | convex.astype(bool)
+        return cls(origin, cell_m, filled, occupied)
+
+    @property
+    def area_m2(self) -> float:
+        """Return the filled area."""
+        return float(self.filled.sum()) * self.cell_m**2
+
+    def contains(self, points_xy: np.ndarray, margin_cells: int = 0) -> np.ndarray:
+        """Return which points (n, 2) lie over the filled region, grown by some cells."""
+        grid = binary_dilation(self.filled, iterations=margin_cells) if margin_cells else self.filled
+        cells = np.floor((points_xy - self.origin) / self.cell_m).astype(np.int64)
+        inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
+        out = np.zeros(len(cells), bool)
+        out[inside] = grid[cells[inside, 0], cells[inside, 1]]
+        return out
+
+
+@dataclass(frozen=True)
+class SupportRegion:
+    """One horizontal up-facing region."""
+
+    vertices: np.ndarray  # int (n,) sorted
+    height_m: float
+    noise_m: float  # robust spread of its heights
+    footprint: Footprint
+    lab: np.ndarray  # float64 (3,) median color
+
+
+def find_supports(graph: MeshGraph, chosen: np.ndarray, config: InstancesConfig) -> list[SupportRegion]:
+    """Find the horizontal up-facing regions among vertices `chosen`, lowest first."""
+    flat = chosen[graph.normals[chosen, 2] > 0.85]
+    levels: list[np.ndarray] = []
+    for piece in pieces(graph, flat):
+        if graph.areas[piece].sum() >= 0.25 * config.min_support_area_m2:
+            levels.extend(_split_by_height(graph, piece))
+    levels = [piece for piece in levels if graph.areas[piece].sum() >= 0.25 * config.min_support_area_m2]
+    merged = _merge_levels(graph, levels)
+    regions = []
+    for piece in merged:
+        if graph.areas[piece].sum() < config.min_support_area_m2:
+            continue
+        z = graph.points[piece, 2]
+        height = float(np.median(z))
+        noise = 1.4826 * float(np.median(np.abs(z - height)))
+        footprint = Footprint.of(graph.points[piece, :2], max(0.01, graph.spacing_m))
+        regions.append(SupportRegion(piece, height, noise, footprint, np.median(graph.lab[piece], axis=0)))
+    return sorted(regions, key=lambda region: (region.height_m, int(region.vertices[0])))
+
+
+def _split_by_height(graph: MeshGraph, piece: np.ndarray) -> list[np.ndarray]:
+    """Cut a connected up-facing piece where its heights form separate levels."""
+    z = graph.points[piece, 2]
+    if np.percentile(z, 98) - np.percentile(z, 2) < 0.02:
+        return [piece]
+    step = 0.004
+    bounds = np.arange(z.min() - 2 * step, z.max() + 3 * step, step)
+    histogram = np.histogram(z, bounds, weights=graph.areas[piece])[0]
+    smooth = np.convolve(histogram, [0.25, 0.5, 0.25], "same")
+    peaks = [
+        i
+        for i in range(1, len(smooth) - 1)
+        if smooth[i] >= smooth[i - 1] and smooth[i] > smooth[i + 1] and smooth[i] * 3 > 0.002
+    ]
+    peaks.sort(key=lambda i: -smooth[i])
+    kept: list[int] = []
+    for peak in peaks:
+        if all(abs(peak - other) * step > 0.015 for other in kept):
+            kept.append(peak)
+    out = []
+    for peak in kept:
+        near = piece[np.abs(z - (bounds[peak] + 0.5 * step)) < 0.008]
+        out.extend(pieces(graph, near))
+    return out
+
+
+def _merge_levels(graph: MeshGraph, levels: list[np.ndarray]) -> list[np.ndarray]:
+    """Join regions of the same height whose outlines are near: things standing between them hide the rest."""
+    boxes = [
+        (graph.points[p].min(axis=0)[:2], graph.points[p].max(axis=0)[:2], np.median(graph.points[p, 2]))
+        for p in levels
+    ]
+    parent = list(range(len(levels)))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            i = parent[i]
+        return i
+
+    for i in range(len(levels)):
+        for j in range(i + 1, len(levels)):
+            apart = np.maximum(boxes[i][0] - boxes[j][1], boxes[j][0] - boxes[i][1]).max()
+            alike = np.abs(np.median(graph.lab[levels[i]], 0) - np.median(graph.lab[levels[j]], 0)).max() < 25
+            if abs(boxes[i][2] - boxes[j][2]) < 0.012 and apart < 0.06 and alike:
+                parent[max(root(i), root(j))] = min(root(i), root(j))
+    groups: dict[int, list[np.ndarray]] = {}
+    for i, piece in enumerate(levels):
+        groups.setdefault(root(i), []).append(piece)
+    return [np.sort(np.concatenate(group)) for group in groups.values()]
+
+
+def stands_on(
+    graph: MeshGraph, body: np.ndarray, support: SupportRegion, candidate: np.ndarray, config: InstancesConfig
+) -> bool:
+    """Decide whether `candidate`, a piece of `body` above a support plane, is a separate thing standing on it."""
+    level = support.height_m + contact_height(support, config)
+    points = graph.points[candidate]
+    step = max(0.012, 1.5 * graph.spacing_m)
+    foot = points[points[:, 2] < max(level, points[:, 2].min()) + step]
+    if points[:, 2].min() > level + 0.02 or len(foot) < 3:
+        return False
+    if support.footprint.contains(foot[:, :2], 1).mean() < 0.6:
+        return False
+    extents = points.max(axis=0) - points.min(axis=0)
+    if np.sort(extents)[1] < config.min_object_m or len(candidate) < config.min_object_vertices:
+        return False
+    color_gap = float(np.linalg.norm(np.median(graph.lab[candidate], axis=0) - support.lab))
+    rise = float(np.percentile(points[:, 2], 95)) - support.height_m
+    if rise < max(0.025, 5 * support.noise_m) and color_gap < 8.0:
+        return False  # a bump of the support itself
+    return not _belongs_to_body(graph, body, support, candidate, foot, color_gap)
+
+
+def contact_height(support: SupportRegion, config: InstancesConfig) -> float:
+    """Return how far above a support plane a separate thing begins."""
+    return float(np.clip(3.0 * support.noise_m, config.contact_height_m, 0.02))
+
+
+def _belongs_to_body(
+    graph: MeshGraph,
+    body: np.ndarray,
+    support: SupportRegion,
+    candidate: np.ndarray,
+    foot: np.ndarray,
+    color_gap: float,
+) -> bool:
+    """Tell sides, backs, rims and posts, which continue the body, from things put onto it."""
+    cell = support.footprint.cell_m
+    foot_print = Footprint.of(foot[:, :2], cell)
+    whole = Footprint.of(graph.points[candidate, :2], cell)
+    ratio = foot_print.area_m2 / max(support.footprint.area_m2, 1e-6)
+    # Seen support within the foot's outline: a ring (rim, sides), not a thing, which would hide what it stands on.
+    inner = graph.points[support.vertices, :2]
+    convex = _convex(foot_print)
+    seen_inside = convex.contains(inner).sum() * cell**2 * (graph.areas[support.vertices].mean() / cell**2)
+    seen_share = seen_inside / max(convex.area_m2, 1e-6)
+    if convex.area_m2 > 0.55 * support.footprint.area_m2 and seen_share > 0.45:
+        return True
+    # Continuation: right below the foot, outside the support, the same side goes on downwards.
+    points = graph.points[body]
+    below = (points[:, 2] < support.height_m - 0.012) & (points[:, 2] > support.height_m - 0.05)
+    side = below & (np.abs(graph.normals[body, 2]) < 0.6)
+    if side.any():
+        distance, _ = cKDTree(points[side, :2]).query(
+            foot[:, :2], distance_upper_bound=max(0.018, 1.8 * cell)
+        )
+        if np.isfinite(distance).mean() > 0.4 and color_gap < 30.0:
+            return True
+    # A back or arm: as long as the support, the same color, and larger than things usually are.
+    span = _span_ratio(graph, support, candidate)
+    overhang = 1.0 - support.footprint.contains(graph.points[candidate, :2], 2).mean()
+    if (
+        span > 0.6
+        and color_gap < 12.0
+        and (whole.area_m2 > 0.8 * support.footprint.area_m2 or overhang > 0.25)
+    ):
+        return True
+    return ratio > 0.9 and color_gap < 8.0
+
+
+def _convex(footprint: Footprint) -> Footprint:
+    cells = np.argwhere(footprint.occupied).astype(np.int32)
+    grid = np.zeros(footprint.occupied.shape, np.uint8)
+    cv2.fillConvexPoly(grid, cv2.convexHull(np.ascontiguousarray(cells[:, ::-1])), 1)
+    return Footprint(footprint.origin, footprint.cell_m, grid.astype(bool), footprint.occupied)
+
+
+def _span_ratio(graph: MeshGraph, support: SupportRegion, candidate: np.ndarray) -> float:
+    """Return how much of the support's longer or shorter side the candidate spans, whichever is more."""
+    base = np.ptp(graph.points[support.vertices, :2], axis=0)
+    return float((np.ptp(graph.points[candidate, :2], axis=0) / np.maximum(base, 1e-6)).max())
