@@ -1,0 +1,66 @@
+"""Configuration of the assets stage."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class AssetsConfig:
+    """How complete, textured objects with physics are made from what the video saw."""
+
+    voxel_min_m: float = 0.002
+    """Finest voxel of an object's volume."""
+    cells_along_longest: int = 72
+    """Voxels along the longest side of a small object; furniture is limited by `max_voxels`."""
+    max_voxels: int = 1_100_000
+    """Memory and time limit of one object's volume; larger objects get coarser voxels."""
+    min_points: int = 60
+    """Objects with fewer depth pixels over all frames become boxes."""
+    min_thickness_m: float = 0.004
+    """Seen shells whose other side was not seen become at least this thick (and at least two voxels)."""
+    flat_thickness_m: float = 0.012
+    """Thickness given to things that are flush with a wall."""
+    symmetry: bool = True
+    """Complete by rotation and mirror symmetry where what was seen agrees."""
+    enclosed_directions: int = 3
+    """An unseen voxel is solid if it meets the inside of seen surface in this many of 8 horizontal directions."""
+    faces_small: int = 4000
+    """Face budget of an object below `furniture_m`."""
+    faces_furniture: int = 9000
+    """Face budget of a larger object."""
+    furniture_m: float = 0.5
+    """Longest side from which a thing counts as furniture: unseen space below overhangs stays empty."""
+    texture_min_px: int = 128
+    """Smallest side of an object's square texture."""
+    texture_max_px: int = 1024
+    """Largest side of an object's or base surface's square texture."""
+    texture_frames: int = 14
+    """Most frames that one texture is blended from."""
+    base_texel_m: float = 0.008
+    """Texel size of floor and walls, coarser where `texture_max_px` is reached."""
+    hulls_small: int = 16
+    """Most convex pieces of a small object's collision shape."""
+    hulls_furniture: int = 28
+    """Most convex pieces of furniture."""
+    convex_enough: float = 0.93
+    """Solids that fill this share of their convex hull collide as that hull."""
+    collision_faces: int = 1200
+    """Faces of the decimated mesh that is decomposed."""
+    coacd_threshold: float = 0.05
+    """Concavity at which CoACD stops cutting; hollow things use half of it."""
+    hull_vertices: int = 48
+    """Most vertices of one convex piece (PhysX allows 255)."""
+    seed: int = 0
+    """Seed of the decomposition."""
+
+
+ASSETS_PRESETS = {
+    "fast": AssetsConfig(
+        cells_along_longest=56, max_voxels=500_000, faces_small=2500, faces_furniture=6000, texture_max_px=512,
+        texture_frames=8, base_texel_m=0.015, hulls_small=12, hulls_furniture=20,
+    ),
+    "default": AssetsConfig(),
+    "quality": AssetsConfig(
+        cells_along_longest=96, max_voxels=2_500_000, faces_small=6000, faces_furniture=15000, texture_frames=24,
+        base_texel_m=0.006, hulls_small=24, hulls_furniture=32,
+    ),
+}  # fmt: skip

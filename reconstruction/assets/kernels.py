@@ -1,0 +1,148 @@
+"""Compiled loops of the assets stage."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+_EDGE = 0.025  # a neighbour that is nearer or farther by this share of depth lies across an edge
+
+
+@njit(cache=True, parallel=True)
+def incidence_cosines(depth, fx, fy, cx, cy):  # pragma: no cover - compiled
+    """Cosine between ray and surface normal per pixel (n, h, w); 0 where depth jumps or is unknown."""
+    n, h, w = depth.shape
+    out = np.zeros((n, h, w), np.float32)
+    for job in prange(n * h):
+        f, y = job // h, job % h
+        if y == 0 or y == h - 1:
+            continue
+        for x in range(1, w - 1):
+            z = depth[f, y, x]
+            if z <= 0:
+                continue
+            zl, zr, zu, zd = depth[f, y, x - 1], depth[f, y, x + 1], depth[f, y - 1, x], depth[f, y + 1, x]
+            limit = _EDGE * z
+            if zl <= 0 or zr <= 0 or zu <= 0 or zd <= 0:
+                continue
+            # Pixels beside something nearer, and those that fly between two surfaces, carry no evidence.
+            if z - min(min(zl, zr), min(zu, zd)) > limit:
+                continue
+            left, right = abs(zl - z) < limit, abs(zr - z) < limit
+            up, down = abs(zu - z) < limit, abs(zd - z) < limit
+            xl, xr = (x - 0.5 - cx) / fx, (x + 1.5 - cx) / fx
+            yu, yd = (y - 0.5 - cy) / fy, (y + 1.5 - cy) / fy
+            xm, ym = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            if not (left or right) or not (up or down):
+                continue
+            ax = (xr * zr if right else xm * z) - (xl * zl if left else xm * z)
+            ay = (ym * zr if right else ym * z) - (ym * zl if left else ym * z)
+            az = (zr if right else z) - (zl if left else z)
+            bx = (xm * zd if down else xm * z) - (xm * zu if up else xm * z)
+            by = (yd * zd if down else ym * z) - (yu * zu if up else ym * z)
+            bz = (zd if down else z) - (zu if up else z)
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            size = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if size < 1e-15:
+                continue
+            ray = math.sqrt(xm * xm + ym * ym + 1.0)
+            out[f, y, x] = abs(nx * xm + ny * ym + nz) / (size * ray)
+    return out
+
+
+@njit(cache=True, inline="always")
+def _own_depth(depth, ids, f, target, u, v, w, h):  # pragma: no cover - compiled
+    """Bilinear depth where the four pixels around belong to the object and are one surface, else the nearest."""
+    iu, iv = int(u), int(v)
+    here = depth[f, iv, iu]
+    x0, y0 = int(math.floor(u - 0.5)), int(math.floor(v - 0.5))
+    if x0 < 0 or y0 < 0 or x0 + 1 >= w or y0 + 1 >= h:
+        return here
+    a, b = depth[f, y0, x0], depth[f, y0, x0 + 1]
+    c, d = depth[f, y0 + 1, x0], depth[f, y0 + 1, x0 + 1]
+    if ids[f, y0, x0] != target or ids[f, y0, x0 + 1] != target:
+        return here
+    if ids[f, y0 + 1, x0] != target or ids[f, y0 + 1, x0 + 1] != target:
+        return here
+    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    if low <= 0 or high - low > _EDGE * here:
+        return here
+    tx, ty = u - 0.5 - x0, v - 0.5 - y0
+    return (a * (1 - tx) + b * tx) * (1 - ty) + (c * (1 - tx) + d * tx) * ty
+
+
+@njit(cache=True, inline="always")
+def _beside_own(ids, f, target, iu, iv, w, h):  # pragma: no cover - compiled
+    """Whether a pixel borders one of the object: the outline is only known to a pixel."""
+    if iu > 0 and ids[f, iv, iu - 1] == target:
+        return True
+    if iu < w - 1 and ids[f, iv, iu + 1] == target:
+        return True
+    if iv > 0 and ids[f, iv - 1, iu] == target:
+        return True
+    return iv < h - 1 and ids[f, iv + 1, iu] == target
+
+
+@njit(cache=True, parallel=True)
+def fuse_object(
+    depth, confidence, ids, cosine, frames, camera_from_grid, fx, fy, cx, cy, target, shape, origin, voxel, trunc, tau
+):  # pragma: no cover - compiled
+    """Sum the evidence of all frames in every voxel of one object's grid.
+
+    Returns (nx, ny, nz) each: soft-maximum numerator and denominator of signed distances to the object's seen
+    surface, number of frames whose ray passed through, number of frames that saw the object's surface before it.
+    """
+    nx, ny, nz = shape
+    numerator = np.zeros((nx, ny, nz), np.float32)
+    denominator = np.zeros((nx, ny, nz), np.float32)
+    freed = np.zeros((nx, ny, nz), np.uint16)
+    behind = np.zeros((nx, ny, nz), np.uint16)
+    h, w = depth.shape[1:]
+    for i in prange(nx):
+        gx = origin[0] + (i + 0.5) * voxel
+        for j in range(ny):
+            gy = origin[1] + (j + 0.5) * voxel
+            for k in range(nz):
+                gz = origin[2] + (k + 0.5) * voxel
+                num, den, n_free, n_behind = 0.0, 0.0, 0, 0
+                for q in range(len(frames)):
+                    f = frames[q]
+                    m = camera_from_grid[q]
+                    z = m[2, 0] * gx + m[2, 1] * gy + m[2, 2] * gz + m[2, 3]
+                    if z < 0.05:
+                        continue
+                    xn = (m[0, 0] * gx + m[0, 1] * gy + m[0, 2] * gz + m[0, 3]) / z
+                    yn = (m[1, 0] * gx + m[1, 1] * gy + m[1, 2] * gz + m[1, 3]) / z
+                    u, v = fx * xn + cx, fy * yn + cy
+                    if u < 0 or v < 0 or u >= w or v >= h:
+                        continue
+                    iu, iv = int(u), int(v)
+                    d = depth[f, iv, iu]
+                    if d <= 0:
+                        continue
+                    cos = cosine[f, iv, iu]
+                    ray = math.sqrt(xn * xn + yn * yn + 1.0)
+                    if ids[f, iv, iu] == target:
+                        d = _own_depth(depth, ids, f, target, u, v, w, h)
+                        along = (d - z) * ray
+                        s = along * max(cos, 0.25)
+                        if along < -trunc and s < -0.5 * trunc:
+                            n_behind += 1
+                            continue
+                        weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
+                        if s >= trunc:
+                            if cos > 0:
+                                n_free += 1
+                            continue
+                        soft = weight * math.exp(max(s, -trunc) / tau)
+                        num += soft * max(s, -trunc)
+                        den += soft
+                    elif cos > 0:
+                        s = (d - z) * ray * max(cos, 0.1)
+                        if s > 0.6 * trunc and not _beside_own(ids, f, target, iu, iv, w, h):
+                            n_free += 1
+                numerator[i, j, k] = num
+                denominator[i, j, k] = den
+                freed[i, j, k] = n_free
+                behind[i, j, k] = n_behind
+    return numerator, denominator, freed, behind

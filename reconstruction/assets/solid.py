@@ -1,0 +1,196 @@
+"""From a signed distance field to one watertight, manifold, light mesh; boxes where nothing better is known."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruction.assets.completion import CompletedField
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A closed triangle mesh, outward normals."""
+
+    vertices: np.ndarray  # float64 (v, 3)
+    faces: np.ndarray  # int32 (f, 3)
+
+    @property
+    def volume(self) -> float:
+        """Return the enclosed volume in cubic metres."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return float(np.einsum("nk,nk->n", a, np.cross(b, c)).sum() / 6)
+
+    @property
+    def extents(self) -> np.ndarray:
+        """Return the size of the axis-aligned box (3,)."""
+        return np.ptp(self.vertices, axis=0)
+
+
+def extract(field: CompletedField) -> Solid | None:
+    """Return the zero surface of a field, its largest body and others of at least 4 % of its volume."""
+    from skimage.measure import marching_cubes
+
+    if not (field.distance < 0).any():
+        return None
+    vertices, faces, _, _ = marching_cubes(field.distance, 0.0, gradient_direction="ascent")
+    solid = Solid(field.origin + (vertices + 0.5) * field.voxel_m, faces.astype(np.int32))
+    if solid.volume < 0:
+        solid = Solid(solid.vertices, solid.faces[:, ::-1].copy())
+    return _without_crumbs(solid)
+
+
+def _without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
+    """Drop small bodies, and bodies inside others (closed cavities)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    f = solid.faces
+    n = len(solid.vertices)
+    edges = coo_matrix((np.ones(2 * len(f)), (np.r_[f[:, 0], f[:, 1]], np.r_[f[:, 1], f[:, 2]])), shape=(n, n))
+    _, label = connected_components(edges, directed=False)
+    face_label = label[f[:, 0]]
+    a, b, c = (solid.vertices[f[:, k]] for k in range(3))
+    volumes = np.bincount(face_label, weights=np.einsum("nk,nk->n", a, np.cross(b, c)) / 6, minlength=label.max() + 1)
+    keep = volumes > share * volumes.max()
+    if volumes.max() <= 0:
+        return None
+    return compact(Solid(solid.vertices, f[keep[face_label]]))
+
+
+def compact(solid: Solid) -> Solid:
+    """Drop vertices that no face uses."""
+    used, inverse = np.unique(solid.faces, return_inverse=True)
+    return Solid(solid.vertices[used], inverse.reshape(-1, 3).astype(np.int32))
+
+
+def taubin(solid: Solid, iterations: int, fixed: np.ndarray) -> Solid:
+    """Smooth without shrinking (Taubin 1995); vertices marked `fixed` (v,) keep their height."""
+    from scipy.sparse import coo_matrix
+
+    if iterations == 0:
+        return solid
+    f, n = solid.faces, len(solid.vertices)
+    rows, columns = np.r_[f[:, 0], f[:, 1], f[:, 2]], np.r_[f[:, 1], f[:, 2], f[:, 0]]
+    neighbours = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n)).tocsr()
+    neighbours = ((neighbours + neighbours.T) > 0).astype(np.float64)
+    average = neighbours.multiply(1.0 / np.maximum(neighbours.sum(axis=1), 1)).tocsr()
+    vertices = solid.vertices.copy()
+    height = vertices[fixed, 2].copy()
+    for _ in range(iterations):
+        for factor in (0.5, -0.53):
+            vertices = vertices + factor * (average @ vertices - vertices)
+            vertices[fixed, 2] = height
+    return Solid(vertices, solid.faces)
+
+
+def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
+    """Decimate to a manifold mesh of at most about `max_faces` faces."""
+    import fast_simplification
+
+    start = solid
+    if len(solid.faces) > max_faces:
+        vertices, faces = fast_simplification.simplify(
+            np.asarray(solid.vertices, np.float32), np.asarray(solid.faces, np.int32), target_count=int(max_faces), agg=4
+        )
+        light = compact(Solid(vertices.astype(np.float64), faces.astype(np.int32)))
+        closed = to_manifold(light)
+        if closed is not None and abs(closed.volume - start.volume) < 0.05 * start.volume + 1e-7:
+            return closed
+        solid = _simplify_manifold(start, max_faces, tolerance_m)
+    closed = to_manifold(solid)
+    return solid if closed is None else closed
+
+
+def to_manifold(solid: Solid) -> Solid | None:
+    """Return the mesh as manifold3d accepts it, or None where it is not a closed manifold."""
+    import manifold3d
+
+    mesh = manifold3d.Mesh(
+        vert_properties=np.ascontiguousarray(solid.vertices, np.float32),
+        tri_verts=np.ascontiguousarray(solid.faces, np.uint32),
+    )
+    mesh.merge()
+    body = manifold3d.Manifold(mesh)
+    if body.status() != manifold3d.Error.NoError or body.is_empty() or body.volume() <= 0:
+        return None
+    return from_manifold(body)
+
+
+def from_manifold(body) -> Solid:  # noqa: ANN001 - manifold3d is imported on use
+    """Read a manifold3d body."""
+    out = body.to_mesh()
+    return Solid(np.asarray(out.vert_properties[:, :3], np.float64), np.asarray(out.tri_verts, np.int32))
+
+
+def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
+    import manifold3d
+
+    mesh = manifold3d.Mesh(
+        vert_properties=np.ascontiguousarray(solid.vertices, np.float32),
+        tri_verts=np.ascontiguousarray(solid.faces, np.uint32),
+    )
+    mesh.merge()
+    body = manifold3d.Manifold(mesh)
+    if body.status() != manifold3d.Error.NoError:
+        return solid
+    for factor in (0.3, 0.6, 1.0, 2.0, 4.0):
+        light = body.simplify(tolerance_m * factor)
+        if light.num_tri() <= max_faces:
+            break
+    return from_manifold(light)
+
+
+def box_solid(low: np.ndarray, high: np.ndarray) -> Solid:
+    """Return the closed box between two corners."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    faces = np.array(
+        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+         [1, 5, 7], [1, 7, 3]], np.int32,
+    )  # fmt: skip
+    return Solid(np.asarray(low) + corners * (np.asarray(high) - np.asarray(low)), faces)
+
+
+def hull_solid(points: np.ndarray) -> Solid:
+    """Return the convex hull of points as a closed mesh with outward normals."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    faces = hull.simplices.copy()
+    center = points[hull.vertices].mean(axis=0)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    inward = np.einsum("nk,nk->n", np.cross(b - a, c - a), a - center) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return compact(Solid(np.asarray(points, np.float64), faces.astype(np.int32)))
+
+
+def fit_cuboid(points: np.ndarray, normals: np.ndarray, solid: Solid, tolerance_m: float) -> Solid | None:
+    """Return a box if that is what was seen: nearly all seen points lie on three or more of its faces, none inside.
+
+    The box stands on z = 0; each side lies where the points on it are, unseen sides where the completed solid ends.
+    """
+    low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+    low[2] = 0.0
+    size = high - low
+    if size.min() < 0.008:
+        return None
+    use = np.linalg.norm(normals, axis=1) > 0.5
+    p, n = points[use], normals[use]
+    if len(p) < 100:
+        return None
+    seen = 0
+    for axis in range(3):
+        for bound, sign in ((low, -1), (high, 1)):
+            on = (n[:, axis] * sign > 0.85) & (np.abs(p[:, axis] - bound[axis]) < max(4 * tolerance_m, 0.1 * size[axis]))
+            if on.sum() > 0.02 * len(p) and not (axis == 2 and sign < 0):
+                bound[axis] = np.median(p[on, axis])
+                seen += 1
+    if seen < 2 or (high - low).min() < 0.008:
+        return None
+    to_faces = np.minimum(np.abs(points - low), np.abs(points - high)).min(axis=1)
+    beyond = np.maximum(np.maximum(low - points, points - high), 0).max(axis=1)
+    fits = (to_faces < tolerance_m) & (beyond < tolerance_m)
+    flat = np.abs(n).max(axis=1) > 0.85
+    box = box_solid(low, high)
+    if fits.mean() < 0.9 or flat.mean() < 0.75 or solid.volume < 0.8 * box.volume:
+        return None
+    return box

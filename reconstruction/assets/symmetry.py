@@ -1,0 +1,132 @@
+"""Rotation and mirror symmetry about vertical axes and planes: found where the seen part agrees, then applied."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from reconstruction.assets.volume import ObjectVolume
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """A symmetry that what was seen supports."""
+
+    kind: str  # "rotation" | "mirror-x" | "mirror-y"
+    center: np.ndarray  # float64 (2,) axis, or a point of the mirror plane, grid frame
+    agreement: float
+
+
+def fit_axis(points: np.ndarray, normals: np.ndarray) -> np.ndarray | None:
+    """Return x, y of the vertical axis that the surface normals meet, if one exists: float64 (2,)."""
+    flat = normals[:, :2]
+    size = np.linalg.norm(flat, axis=1)
+    use = size > 0.4
+    if use.sum() < 60:
+        return None
+    n, p = flat[use] / size[use, None], points[use, :2]
+    across = np.stack([-n[:, 1], n[:, 0]], -1)
+    target = np.einsum("nk,nk->n", across, p)
+    weight = np.ones(len(p))
+    center = p.mean(axis=0)
+    for _ in range(12):
+        a = across * weight[:, None]
+        matrix = a.T @ across
+        if np.linalg.cond(matrix) > 60:
+            return None
+        center = np.linalg.solve(matrix, a.T @ target)
+        residual = np.abs(across @ center - target)
+        weight = 1.0 / np.maximum(residual, 0.1 * np.median(residual) + 1e-4)
+    return center
+
+
+def rotate_complete(volume: ObjectVolume, axis: np.ndarray, sign: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Complete about a vertical axis: every ring of equal radius and height takes what most of it is known to be.
+
+    Args:
+        volume: The evidence.
+        axis: x, y of the axis (2,).
+        sign: Not used where nothing is known; kept for callers that pass completed fields.
+
+    Returns:
+        Signed distance (nx, ny, nz), whether it is known now, and the share of surface voxels that agree.
+    """
+    v = volume.voxel_m
+    x, y = volume.centers(0) - axis[0], volume.centers(1) - axis[1]
+    radius = np.hypot(x[:, None], y[None])
+    ring = np.floor(radius / v).astype(np.int64)
+    n_rings, nz = int(ring.max()) + 1, volume.distance.shape[2]
+    index = (ring[:, :, None] * nz + np.arange(nz)).ravel()
+    known = volume.known.ravel()
+    clipped = np.clip(volume.distance, -volume.trunc_m, volume.trunc_m).ravel()
+    total = np.bincount(index, minlength=n_rings * nz)
+    count = np.bincount(index[known], minlength=n_rings * nz)
+    mean = np.bincount(index[known], weights=clipped[known], minlength=n_rings * nz) / np.maximum(count, 1)
+    inside = np.bincount(index[known], weights=(clipped[known] < 0).astype(float), minlength=n_rings * nz)
+    share = inside / np.maximum(count, 1)
+    # Which surface voxels agree with their ring?
+    tolerance = max(1.2 * v, 2.0 * volume.noise_m)
+    near = known & (np.abs(clipped) < volume.trunc_m * 0.6)
+    ring_mean = mean[index]
+    agree = near & (np.abs(ring_mean - clipped) < tolerance)
+    score = float(agree.sum() / max(near.sum(), 1))
+    decided = (count > 0.08 * total) & ((share > 0.75) | (share < 0.25)) & (count > 3)
+    fill = ~known & decided[index]
+    out = volume.distance.ravel().copy()
+    out[fill] = ring_mean[fill]
+    smooth = known & decided[index] & (np.abs(ring_mean - clipped) < tolerance)
+    out[smooth] = 0.3 * clipped[smooth] + 0.7 * ring_mean[smooth]
+    return out.reshape(volume.distance.shape).astype(np.float32), (known | fill).reshape(volume.known.shape), score
+
+
+def _sample(volume: ObjectVolume, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    cell = ((points - volume.origin) / volume.voxel_m - 0.5).T
+    value = map_coordinates(volume.distance, cell, order=1, mode="nearest")
+    nearest = np.round(cell).astype(int)
+    inside = np.all((nearest >= 0) & (nearest < np.array(volume.distance.shape)[:, None]), axis=0)
+    nearest = np.clip(nearest, 0, np.array(volume.distance.shape)[:, None] - 1)
+    return value, volume.known[tuple(nearest)] & inside
+
+
+def find_mirror(volume: ObjectVolume, points: np.ndarray, axis: int) -> Symmetry | None:
+    """Find the mirror plane across `axis` (0: x, 1: y) near the middle that the seen points support best."""
+    thin = points[:: max(1, len(points) // 4000)]
+    low, high = np.percentile(thin[:, axis], [1, 99])
+    middle, reach = (low + high) / 2, 0.15 * (high - low)
+    steps = int(np.clip(np.ceil(reach / volume.voxel_m), 1, 14))
+    tolerance = max(1.5 * volume.voxel_m, 2.5 * volume.noise_m)
+    best, best_score = None, 0.0
+    for offset in np.linspace(-reach, reach, 2 * steps + 1):
+        mirrored = thin.copy()
+        mirrored[:, axis] = 2 * (middle + offset) - mirrored[:, axis]
+        value, known = _sample(volume, mirrored)
+        agree = (known & (np.abs(value) < tolerance)).mean()
+        violate = (known & (value >= tolerance)).mean()
+        buried = (known & (value <= -tolerance)).mean()
+        wrong = violate + 0.5 * buried
+        if agree < 0.25 or wrong > 0.06 + 0.08 * agree:
+            continue
+        score = agree - 3 * wrong - 0.05 * abs(offset) / max(reach, 1e-9)
+        if score > best_score:
+            center = np.zeros(2)
+            center[axis] = middle + offset
+            best, best_score = Symmetry(f"mirror-{'xy'[axis]}", center, float(agree)), score
+    return best
+
+
+def mirror_complete(volume: ObjectVolume, found: Symmetry) -> tuple[np.ndarray, np.ndarray]:
+    """Give unknown voxels what their mirror images are known to be."""
+    axis = 0 if found.kind == "mirror-x" else 1
+    n = volume.distance.shape[axis]
+    position = (2 * found.center[axis] - volume.centers(axis) - volume.origin[axis]) / volume.voxel_m - 0.5
+    low = np.floor(position).astype(int)
+    t = (position - low).astype(np.float32)
+    valid = (low >= 0) & (low + 1 < n)
+    a, b = np.clip(low, 0, n - 1), np.clip(low + 1, 0, n - 1)
+    view = [1, 1, 1]
+    view[axis] = n
+    t, valid = t.reshape(view), valid.reshape(view)
+    value = np.take(volume.distance, a, axis) * (1 - t) + np.take(volume.distance, b, axis) * t
+    known = np.take(volume.known, a, axis) & np.take(volume.known, b, axis) & valid
+    fill = known & ~volume.known
+    return np.where(fill, value, volume.distance).astype(np.float32), volume.known | fill
