@@ -1,0 +1,8 @@
+"""Stage 3: posed frames -> a depth map of every keyframe."""
+
+from reconstruction.depth.config import DEPTH_PRESETS, DepthConfig
+from reconstruction.depth.estimate import estimate_depth
+
+VERSION = 1
+
+__all__ = ["DEPTH_PRESETS", "VERSION", "DepthConfig", "estimate_depth"]

@@ -1,0 +1,150 @@
+"""Stage 3: posed frames -> depth maps."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from reconstruction.depth.config import DepthConfig
+from reconstruction.depth.views import ViewPlan, plan_views
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.types import Camera, DepthMaps, PosedFrames
+from registry.geometry import invert_rigid
+
+
+def _sized(camera: Camera, side: int) -> Camera:
+    scale = min(1.0, side / max(camera.width, camera.height))
+    return camera.resized(max(16, round(camera.width * scale)), max(16, round(camera.height * scale)))
+
+
+def _gray(images: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return float32 gray frames (n, h, w) at the camera's resolution."""
+    import cv2
+
+    out = np.empty((len(images), camera.height, camera.width), np.float32)
+    for i, image in enumerate(images):
+        gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        out[i] = cv2.resize(gray, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return out
+
+
+def _warps(posed: PosedFrames, camera: Camera, i: int, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (s, 3, 3) and (s, 3): a pixel p of frame i at inverse depth rho is at h_inf @ p + rho * shift."""
+    k, k_inv = camera.matrix, np.linalg.inv(camera.matrix)
+    relative = invert_rigid(posed.world_from_camera[sources]) @ posed.world_from_camera[i]
+    return k @ relative[:, :3, :3] @ k_inv, relative[:, :3, 3] @ k.T
+
+
+class _Workers:
+    """Runs a function for every frame on a few threads; the kernels release the interpreter."""
+
+    def __init__(self, threads: int):
+        import os
+
+        self.threads = (
+            threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads or 2
+        )
+
+    def each(self, n: int, work: Callable[[int], None], label: str, progress: Progress) -> None:
+        progress.start(n, label)
+        work(0)  # compiles the kernels once, before threads start
+        progress.advance()
+        with ThreadPoolExecutor(self.threads) as pool:
+            for _ in pool.map(work, range(1, n)):
+                progress.advance()
+
+
+def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers, progress):
+    """Sweep, aggregate and refine every frame; return inverse depth and correlation (n, h, w)."""
+    import cv2
+
+    from reconstruction.depth.refine import fit_slopes, refine
+    from reconstruction.depth.sgm import aggregate, winner
+    from reconstruction.depth.sweep import sweep_costs
+
+    small = _sized(camera, config.sweep_side_px)
+    fine_gray, small_gray = _gray(posed.images, camera), _gray(posed.images, small)
+    shape = (camera.height, camera.width)
+    rho_all = np.zeros((len(fine_gray), *shape), np.float32)
+    score_all = np.full((len(fine_gray), *shape), -1.0, np.float32)
+    p1 = np.int32(max(1, round(127 * config.smooth_small)))
+    p2 = np.int32(round(127 * config.smooth_large))
+
+    def work(i: int) -> None:
+        sources = plan.sources[i][plan.sources[i] >= 0]
+        if len(sources) == 0:
+            return
+        rhos = np.linspace(1.0 / plan.far[i], 1.0 / plan.near[i], config.planes)
+        h_inf, shift = _warps(posed, small, i, sources)
+        cost = np.empty((small.height, small.width, config.planes), np.uint8)
+        sweep_costs(small_gray[i], small_gray[sources], h_inf, shift, rhos, config.noise_gray, cost)
+        total = np.zeros(cost.shape, np.uint16)
+        aggregate(cost, small_gray[i], p1, p2, 8.0, total)
+        coarse = np.empty((small.height, small.width), np.float32)
+        winner(total, rhos, coarse)
+        rho = cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+        h_inf, shift = _warps(posed, camera, i, sources)
+        fitted, gx, gy, score = (np.empty(shape, np.float32) for _ in range(4))
+        # The first step covers the spacing of the sweep's planes, later ones go for fractions of a pixel.
+        for step_px in (0.7, 0.35, 0.2, 0.2)[: config.refine_rounds]:
+            fit_slopes(rho, 0.012, fitted, gx, gy)
+            refine(
+                fine_gray[i],
+                fine_gray[sources],
+                h_inf,
+                shift,
+                fitted,
+                gx,
+                gy,
+                step_px,
+                config.noise_gray,
+                rho,
+                score,
+            )
+        rho_all[i], score_all[i] = rho, score
+
+    workers.each(len(fine_gray), work, "measuring depth", progress)
+    return rho_all, score_all
+
+
+def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthConfig, workers, progress):
+    """Keep what other views confirm; return depth and the number of agreeing views (n, h, w)."""
+    from reconstruction.depth.consistency import check_view, remove_speckles
+
+    k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    weight = np.clip(score, 0.0, 1.0) ** 2
+    fused, count = np.zeros_like(depth), np.zeros(depth.shape, np.uint8)
+
+    def work(i: int) -> None:
+        rows = plan.neighbors[i]
+        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
+        check_view(
+            i, rows, depth, weight, relative, k, config.agree_depth, config.agree_px, count[i], fused[i]
+        )
+        good = (count[i] >= config.min_agreeing) & (score[i] >= config.min_correlation)
+        # A window without contrast correlates with anything a little: such depth needs more witnesses.
+        fused[i] *= good
+        fused[i] *= remove_speckles(fused[i], config.min_speckle_px, 0.02)
+
+    workers.each(len(depth), work, "comparing views", progress)
+    return fused, count
+
+
+def estimate_depth(posed: PosedFrames, config: DepthConfig, *, progress: Progress = NO_PROGRESS) -> DepthMaps:
+    """Estimate one depth map for every posed keyframe, in the units of the poses.
+
+    Args:
+        posed: Frames with cameras and sparse points, in any space and scale.
+        config: Settings.
+        progress: Where steps and decisions are reported.
+    """
+    camera = _sized(posed.camera, config.depth_side_px)
+    plan = plan_views(posed, config)
+    workers = _Workers(config.threads)
+    rho, score = _measure(posed, camera, plan, config, workers, progress)
+    raw = np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0).astype(np.float32)
+    depth, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
+    confidence = np.where(depth > 0, 2, 0).astype(np.uint8)
+    share = float((confidence == 2).mean())
+    progress.note(f"depth: {100 * share:.0f} % of the pixels measured")
+    return DepthMaps(camera, depth, confidence)
