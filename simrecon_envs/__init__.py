@@ -1,11 +1,11 @@
 """Gymnasium environments of reconstructed scenes.
 
-Importing this package registers every scene of the default registry as `SimRecon/<scene id>`, reading only the
-registry's index:
+Importing this package registers every scene of the default registry as `SimRecon/<scene id>`, reading only
+the registry's index:
 
     import gymnasium as gym, simrecon_envs
-    env = gym.make("SimRecon/scene0001")                # batched torch tensors, as every ManiSkill environment
-    env = simrecon_envs.make_cpu("scene0001")           # unbatched NumPy, for stable-baselines3 and the like
+    env = gym.make("SimRecon/scene0001")         # batched torch tensors, as every ManiSkill environment
+    env = simrecon_envs.make_cpu("scene0001")    # unbatched NumPy, for stable-baselines3 and the like
 
 Nothing heavy (torch, sapien, mani_skill) is loaded before the first `make`.
 """

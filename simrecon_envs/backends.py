@@ -10,8 +10,8 @@ _BLIND_OBS_MODES = (None, "state", "state_dict", "none")
 def choose_render_backend(wanted: str, obs_mode: str | None, render_mode: str | None) -> str:
     """Return ManiSkill's name of the render backend.
 
-    "auto" is "none" unless pictures are asked for: without a renderer an environment is made and stepped faster, and
-    works on machines without a Vulkan driver.
+    "auto" is "none" unless pictures are asked for: without a renderer an environment is made and stepped
+    faster, and works on machines without a Vulkan driver.
 
     Raises:
         EnvironmentMissing: pictures are asked for, and nothing can render here.
@@ -21,7 +21,7 @@ def choose_render_backend(wanted: str, obs_mode: str | None, render_mode: str | 
         return _working_backend() if pictures else "none"
     if wanted == "none" and pictures:
         raise EnvironmentMissing(
-            f"render_backend='none' cannot give pictures (obs_mode={obs_mode!r}, render_mode={render_mode!r}); "
+            f"render_backend='none' gives no pictures (obs_mode={obs_mode!r}, render_mode={render_mode!r}); "
             "leave render_backend out, or choose obs_mode='state' without a render_mode"
         )
     return wanted

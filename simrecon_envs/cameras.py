@@ -49,11 +49,13 @@ def from_capture(world_from_camera: np.ndarray, params: np.ndarray, width: int, 
     """Return the viewpoint of a frame of the video: same pose, square picture that covers the larger side."""
     world_from_sapien = np.asarray(world_from_camera)[:3, :3] @ SAPIEN_CAMERA_FROM_OPENCV[:3, :3].T
     fov = 2 * np.arctan(max(width / 2 / params[0], height / 2 / params[1]))
-    return Viewpoint(np.asarray(world_from_camera)[:3, 3], quat_from_matrix(world_from_sapien), float(min(fov, 1.6)))
+    return Viewpoint(
+        np.asarray(world_from_camera)[:3, 3], quat_from_matrix(world_from_sapien), float(min(fov, 1.6))
+    )
 
 
 def workspace_view(solids: list[ConvexSolid], placement: Placement, middle: np.ndarray) -> Viewpoint:
-    """Return the view of the observation camera: onto the target, from beside or opposite the robot, unhidden."""
+    """Return the observation camera's view: onto the target, from beside or opposite the robot, unhidden."""
     focus = placement.target.center if placement.target is not None else middle
     grid = _grid_around(solids, focus, 2.0)
     offsets = np.array([[0, 0, 0], [0.08, 0, 0], [-0.08, 0, 0], [0, 0.08, 0], [0, -0.08, 0], [0, 0, 0.15]])
@@ -62,8 +64,8 @@ def workspace_view(solids: list[ConvexSolid], placement: Placement, middle: np.n
     for turn_deg in (150, -150, 120, -120, 180, 90, -90, 60, -60, 30, -30):
         for distance, lift in ((0.80, 0.55), (0.65, 0.60), (1.0, 0.50), (0.45, 0.75), (0.35, 0.50)):
             angle = placement.yaw_rad + np.pi + np.deg2rad(turn_deg)
-            eye = focus + [distance * np.cos(angle), distance * np.sin(angle), lift]
-            view = look_at(eye, focus + [0, 0, 0.05], _WORKSPACE_FOV_RAD)
+            eye = focus + np.array([distance * np.cos(angle), distance * np.sin(angle), lift])
+            view = look_at(eye, focus + np.array([0, 0, 0.05]), _WORKSPACE_FOV_RAD)
             hidden = 1 - view.seen_share(points, grid) + 2.0 * float(grid.occupied(eye))
             ranked.append((round(hidden, 4), len(ranked), view))
     return min(ranked, key=lambda entry: entry[:2])[2]
@@ -72,7 +74,9 @@ def workspace_view(solids: list[ConvexSolid], placement: Placement, middle: np.n
 def room_view(
     bundle: SceneBundle, solids: list[ConvexSolid], placement: Placement | None, robot_points: np.ndarray
 ) -> Viewpoint:
-    """Return a view that shows the robot, its target and much of the scene: a frame's camera, or one beside it."""
+    """Return a view of the robot, its target and much of the scene: from a frame's camera, or a better
+    place.
+    """
     boxes: dict[int, list[np.ndarray]] = {item.id: [] for item in bundle.objects}
     for solid in solids:
         if solid.owner in boxes:
@@ -88,7 +92,8 @@ def room_view(
     focus = np.mean([points.mean(axis=0) for points, _ in groups], axis=0) if groups else np.zeros(3)
     grid = _grid_around(solids, focus, 5.0, cell_m=0.05)
     best, best_score = None, -np.inf
-    for view, bonus in _room_candidates(bundle, focus):
+    everything = np.concatenate([points for points, _ in groups]) if groups else focus[None]
+    for view, bonus in _room_candidates(bundle, focus, everything):
         if grid.occupied(view.eye):
             continue
         score = bonus + sum(weight * view.seen_share(points, grid) for points, weight in groups)
@@ -98,26 +103,37 @@ def room_view(
             score -= 0.5 * abs(np.log(max(distance, 0.1) / 1.8))
         if score > best_score + 1e-9:
             best, best_score = view, score
-    return best if best is not None else look_at(focus + [2.0, -2.0, 1.8], focus, 1.0)
+    return best if best is not None else look_at(focus + np.array([2.0, -2.0, 1.8]), focus, 1.0)
 
 
-def _room_candidates(bundle: SceneBundle, focus: np.ndarray) -> list[tuple[Viewpoint, float]]:
+def _framing(eye: np.ndarray, focus: np.ndarray, points: np.ndarray) -> Viewpoint:
+    """Return the view towards `focus` whose picture is filled by most of the points (n, 3)."""
+    forward = (focus - eye) / np.linalg.norm(focus - eye)
+    rays = points - eye
+    cosine = rays @ forward / np.linalg.norm(rays, axis=1).clip(1e-6)
+    half = np.percentile(np.arccos(cosine.clip(-1, 1)), 90)
+    return look_at(eye, focus, float(np.clip(2.2 * half, 0.5, 1.25)))
+
+
+def _room_candidates(
+    bundle: SceneBundle, focus: np.ndarray, points: np.ndarray
+) -> list[tuple[Viewpoint, float]]:
     cameras = bundle.cameras
     count = len(cameras.indices)
     views = []
-    for row in np.unique(np.linspace(0, count - 1, min(count, _MAX_CAPTURE_CANDIDATES)).astype(int)) if count else []:
-        captured = from_capture(
-            cameras.world_from_camera[row], cameras.params, cameras.width, cameras.height
-        )
+    for row in (
+        np.unique(np.linspace(0, count - 1, min(count, _MAX_CAPTURE_CANDIDATES)).astype(int)) if count else []
+    ):
+        captured = from_capture(cameras.world_from_camera[row], cameras.params, cameras.width, cameras.height)
         # Where the person stood is in the room and sees it; turning towards the focus keeps that.
         views.append((captured, 0.3))
-        views.append((look_at(captured.eye, focus, 1.0), 0.3))
+        views.append((_framing(captured.eye, focus, points), 0.3))
     for radius in (1.4, 1.8, 2.3):
         for step in range(16):
             for lift in (0.7, 1.1):
                 angle = 2 * np.pi * step / 16
-                eye = focus + [radius * np.cos(angle), radius * np.sin(angle), lift]
-                views.append((look_at(eye, focus, 1.0), 0.0))
+                eye = focus + np.array([radius * np.cos(angle), radius * np.sin(angle), lift])
+                views.append((_framing(eye, focus, points), 0.0))
     return views
 
 

@@ -56,7 +56,9 @@ def read_obj_vertices(path: Path) -> np.ndarray:
     except (OSError, ValueError) as error:
         raise SceneAssetsMissing(f"collision mesh {path}: cannot be read ({error})") from error
     if len(vertices) < 4 or not np.isfinite(vertices).all():
-        raise SceneAssetsMissing(f"collision mesh {path}: {len(vertices)} finite vertices, expected at least 4")
+        raise SceneAssetsMissing(
+            f"collision mesh {path}: {len(vertices)} finite vertices, expected at least 4"
+        )
     return vertices
 
 
@@ -132,7 +134,9 @@ class OccupancyGrid:
         cell_m: float = 0.025,
         margin_m: float = 0.01,
     ) -> None:
-        """Fill the grid. A cell counts as filled if its centre is nearer than the margin plus half its diagonal."""
+        """Fill the grid. A cell counts as filled if its centre is nearer than the margin plus half its
+        diagonal.
+        """
         self.lower = np.asarray(lower, np.float64)
         self.cell_m = cell_m
         shape = np.maximum(np.ceil((np.asarray(upper) - self.lower) / cell_m).astype(int), 1)
@@ -144,7 +148,8 @@ class OccupancyGrid:
             if (high <= low).any():
                 continue
             centers = [self.lower[a] + (np.arange(low[a], high[a]) + 0.5) * cell_m for a in range(3)]
-            # The signed distance to a convex solid's half-spaces is separable, so no list of points is needed.
+            # The signed distance to a convex solid's half-spaces is separable, so no list of points is
+            # needed.
             inside = np.ones(tuple(high - low), bool)
             for nx, ny, nz, d in solid.half_spaces:
                 level = (nx * centers[0])[:, None, None] + (ny * centers[1])[None, :, None]
@@ -152,14 +157,18 @@ class OccupancyGrid:
             self.filled[low[0] : high[0], low[1] : high[1], low[2] : high[2]] |= inside
 
     def occupied(self, points: np.ndarray) -> np.ndarray:
-        """Return (...,) whether world points (..., 3) lie in filled cells; outside the box nothing is filled."""
+        """Return (...,) whether world points (..., 3) lie in filled cells; outside the box nothing is
+        filled.
+        """
         cell = np.floor((np.asarray(points) - self.lower) / self.cell_m).astype(int)
         inside = ((cell >= 0) & (cell < self.filled.shape)).all(axis=-1)
         cell = np.where(inside[..., None], cell, 0)
         return self.filled[cell[..., 0], cell[..., 1], cell[..., 2]] & inside
 
     def visible(self, eye: np.ndarray, points: np.ndarray, keep_off_m: float = 0.06) -> np.ndarray:
-        """Return (n,) whether the straight way from `eye` (3,) to points (n, 3) is free up to just before them."""
+        """Return (n,) whether the straight way from `eye` (3,) to points (n, 3) is free up to just before
+        them.
+        """
         rays = np.asarray(points, np.float64) - eye
         lengths = np.linalg.norm(rays, axis=1)
         steps = int(np.ceil(lengths.max(initial=0.1) / self.cell_m)) + 1

@@ -1,8 +1,9 @@
 """What to pick up, and where the robot stands to reach it: bundle + robot -> Placement. NumPy only.
 
-A mounted arm stands on a pedestal whose top is at the height of what the target stands on (as in most tabletop
-tasks), or on the support itself where there is no room beside it; a mobile robot stands on the floor. Candidates lie
-on circles around the target; the first one in order of preference wins where the robot's rest pose touches nothing.
+A mounted arm stands on a pedestal whose top is at the height of what the target stands on (as in most
+tabletop tasks), or on the support itself where there is no room beside it; a mobile robot stands on the
+floor. Candidates lie on circles around the target; the first one in order of preference wins where the
+robot's rest pose touches nothing.
 """
 
 from dataclasses import dataclass
@@ -79,12 +80,23 @@ def describe_target(bundle: SceneBundle, item: BundleObject, solids: list[Convex
     problem = "" if not loaded else "something stands on it or hangs from it"
     narrow = int(np.argmin(widths))
     return Target(
-        item.id, item.label, (low + high) / 2, low[2], high[2], float(widths[narrow]), float(angles[narrow]), problem
+        item.id,
+        item.label,
+        (low + high) / 2,
+        low[2],
+        high[2],
+        float(widths[narrow]),
+        float(angles[narrow]),
+        problem,
     )
 
 
 def candidate_targets(
-    bundle: SceneBundle, solids: list[ConvexSolid], movable: set[int], traits: RobotTraits, config: PlacementConfig
+    bundle: SceneBundle,
+    solids: list[ConvexSolid],
+    movable: set[int],
+    traits: RobotTraits,
+    config: PlacementConfig,
 ) -> list[Target]:
     """Return the movable objects, best to pick up first; those with a problem come last."""
     scored = []
@@ -95,7 +107,9 @@ def candidate_targets(
         problems = [target.problem] if target.problem else []
         opening = traits.gripper_opening_m - config.grip_margin_m
         if target.grip_width_m > opening:
-            problems.append(f"{100 * target.grip_width_m:.1f} cm wide, the gripper takes {100 * opening:.1f} cm")
+            problems.append(
+                f"{100 * target.grip_width_m:.1f} cm wide, the gripper takes {100 * opening:.1f} cm"
+            )
         if item.mass_kg > min(config.max_grip_mass_kg, traits.payload_kg):
             problems.append(f"weighs {item.mass_kg:.1f} kg")
         if target.top_m - target.bottom_m < config.min_height_m:
@@ -203,7 +217,9 @@ def _ring(
                     [[*(target.center[:2] + a * outward), target.top_m + 0.10 + 0.3 * a] for a in along]
                 )
                 blocked = float(others.occupied(way).mean())
-                ranked.append((abs(radius - best) / (most - least) + 2.0 * blocked, direction, position, angle + np.pi))
+                ranked.append(
+                    (abs(radius - best) / (most - least) + 2.0 * blocked, direction, position, angle + np.pi)
+                )
     ranked.sort(key=lambda entry: (round(entry[0], 6), entry[1]))
     return [(position, yaw) for _, _, position, yaw in ranked]
 
@@ -212,8 +228,8 @@ def _sees_over_walls(walls: OccupancyGrid, placement: Placement, target: Target)
     """Tell whether no wall is between the robot and the target, so that both are in the same room."""
     shares = np.linspace(0, 1, 40)[:, None]
     for lift in (0.1, 0.5):
-        start = placement.position + [0, 0, lift]
-        if walls.occupied(start + shares * (target.center + [0, 0, 0.05] - start)).any():
+        start = placement.position + np.array([0, 0, lift])
+        if walls.occupied(start + shares * (target.center + np.array([0, 0, 0.05]) - start)).any():
             return False
     return True
 
@@ -240,7 +256,7 @@ def _stands(
             # It stands on the support: what is below 5 cm is its foot, which touches on purpose.
             floor = top
             points = points[points[:, 2] > 0.05]
-            foot = placement.to_world(disk + [0, 0, 0.05])
+            foot = placement.to_world(disk + np.array([0, 0, 0.05]))
             if grid.occupied(foot).any():
                 return None
     world = placement.to_world(points)
@@ -259,7 +275,9 @@ def _disk(radius: float) -> np.ndarray:
 
 
 def _support_top(solids: list[ConvexSolid], disk: np.ndarray, height: float) -> float | None:
-    """Return the height of the level surface just below `height` that carries all of the disk (n, 3), or None."""
+    """Return the height of the level surface just below `height` that carries all of the disk (n, 3), or
+    None.
+    """
     carried = np.zeros(len(disk), bool)
     tops = []
     for solid in solids:
@@ -283,12 +301,18 @@ def _buried_share(target: Target, solids: list[ConvexSolid]) -> float:
     side = np.array([np.cos(target.grip_yaw_rad), np.sin(target.grip_yaw_rad)])
     grip = max(target.center[2], target.top_m - 0.03)
     reach = target.grip_width_m / 2 + 0.03
-    fingers = np.array([[*(target.center[:2] + s * reach * side), z] for s in (-1, 1) for z in (grip, target.top_m)])
+    fingers = np.array(
+        [[*(target.center[:2] + s * reach * side), z] for s in (-1, 1) for z in (grip, target.top_m)]
+    )
     return float(np.maximum(grid.occupied(above).mean(), grid.occupied(fingers).mean()))
 
 
 def _place_anywhere(
-    solids: list[ConvexSolid], target: Target | None, shape: RobotShape, traits: RobotTraits, config: PlacementConfig
+    solids: list[ConvexSolid],
+    target: Target | None,
+    shape: RobotShape,
+    traits: RobotTraits,
+    config: PlacementConfig,
 ) -> Placement:
     """Stand free as near to the target (or the middle of the scene) as can be, on the floor."""
     lower = np.min([s.lower for s in solids], axis=0) if solids else np.zeros(3)

@@ -1,7 +1,8 @@
 """Rows of the registry's index -> Gymnasium ids. Imports Gymnasium and the registry, nothing heavy.
 
-Ids are unversioned (`SimRecon/scene0001`): what changes is the bundle, which has a revision. The revision that was
-current at registration travels in the kwargs; `SceneEnv` says what it does when the scene has a newer one.
+Ids are unversioned (`SimRecon/scene0001`): what changes is the bundle, which has a revision. The revision
+that was current at registration travels in the kwargs; `SceneEnv` says what it does when the scene has a
+newer one.
 """
 
 import difflib
@@ -27,8 +28,8 @@ def env_id(scene: str) -> str:
 def register_scenes(root: Path | str | None = None) -> list[str]:
     """Register every scene of a registry; may be called again at any time, and after scenes came or went.
 
-    Scenes that this function registered earlier from the same registry and that are gone are dropped. A scene of the
-    same name in another registry is replaced: the last call wins.
+    Scenes that this function registered earlier from the same registry and that are gone are dropped. A scene
+    of the same name in another registry is replaced: the last call wins.
 
     Args:
         root: The registry's folder; the default registry where left out.
@@ -47,13 +48,16 @@ def register_scenes(root: Path | str | None = None) -> list[str]:
         if known not in ids:
             del gym.registry[known]
     for name, record in zip(ids, records):
-        # Straight into the table: `gym.register` searches all of it on every call and warns when one is replaced.
+        # Straight into the table: `gym.register` searches all of it on every call and warns when one is
+        # replaced.
         gym.registry[name] = _spec(name, record, folder)
     return ids
 
 
 def register_default_scenes() -> list[str]:
-    """Register the default registry's scenes; a damaged one gives a warning, because an import must succeed."""
+    """Register the default registry's scenes; a damaged one gives a warning, because an import must
+    succeed.
+    """
     try:
         return register_scenes()
     except SimReconError as error:
@@ -96,14 +100,12 @@ def _spec(name: str, record: SceneRecord, folder: str) -> EnvSpec:
         id=name,
         entry_point=_ENTRY_POINT,
         max_episode_steps=MAX_EPISODE_STEPS,
-        # ManiSkill's environments return batched tensors, which Gymnasium's checker and time limit do not know.
+        # ManiSkill's environments return batched tensors, which Gymnasium's checker does not know.
         disable_env_checker=True,
         kwargs={"scene_id": record.scene_id, "revision": record.revision, "registry": folder},
         additional_wrappers=(
             WrapperSpec(
-                name="MSTimeLimit",
-                entry_point="mani_skill.utils.registration:TimeLimitWrapper",
-                kwargs={"max_episode_steps": MAX_EPISODE_STEPS},
+                name="BatchedTimeLimit", entry_point="simrecon_envs.wrappers:BatchedTimeLimit", kwargs={}
             ),
         ),
     )
@@ -116,7 +118,8 @@ def _registry_of(spec: EnvSpec) -> str | None:
 def _not_found(name: str, ids: list[str], registry: Path | str | None) -> str:
     place = registry if registry is not None else default_registry_root()
     if not ids:
-        return f"{name} does not exist: the registry {place} is empty; make a scene with `simrecon reconstruct VIDEO`"
+        hint = "make a scene with `simrecon reconstruct VIDEO`"
+        return f"{name} does not exist: the registry {place} is empty; {hint}"
     near = difflib.get_close_matches(name, ids, n=1)
     shown = ", ".join(ids[:10]) + (f" and {len(ids) - 10} more" if len(ids) > 10 else "")
     meant = f" Did you mean {near[0]}?" if near else ""

@@ -33,7 +33,7 @@ _SMALL_ARM = RobotTraits(False, (0.15, 0.22, 0.32), (-0.10, 0.20), 0.06, 0.3, 0.
 TRAITS = {
     "panda": _ARM,
     "panda_wristcam": _ARM,
-    "fetch": RobotTraits(True, (0.60, 0.75, 0.95), (0.30, 1.20), 0.10, 3.0, 0.30),
+    "fetch": RobotTraits(True, (0.50, 0.62, 0.85), (0.30, 1.20), 0.10, 3.0, 0.30),
     "so100": _SMALL_ARM,
     "koch-v1.1": _SMALL_ARM,
 }
@@ -132,7 +132,9 @@ def _surface_points(shape: object) -> np.ndarray:
     elif isinstance(shape, physx.PhysxCollisionShapePlane):
         return np.zeros((0, 3))
     else:
-        mesh = trimesh.Trimesh(np.asarray(shape.vertices) * np.asarray(shape.scale), shape.triangles, process=False)
+        mesh = trimesh.Trimesh(
+            np.asarray(shape.vertices) * np.asarray(shape.scale), shape.triangles, process=False
+        )
     vertices, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SAMPLE_SPACING_M, max_iter=12)
     return np.asarray(vertices)
 

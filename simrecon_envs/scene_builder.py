@@ -1,12 +1,12 @@
 """A scene bundle in a ManiSkill scene: actors are built once per reconfigure, posed once per reset.
 
-| in the bundle                                             | actor                                              |
-|-----------------------------------------------------------|----------------------------------------------------|
-| floor, wall, ceiling                                      | static, convex slabs (a box behind the plane where the bundle has none) |
-| object, `dynamic: false`                                  | static                                             |
-| object attached to something that is (in the end) static  | static                                             |
-| object attached to a dynamic one                          | welded: shapes, mass and inertia join the parent's actor |
-| other objects                                             | dynamic, with the bundle's mass, centre of mass, inertia, friction, restitution |
+| in the bundle                            | actor                                                    |
+|------------------------------------------|----------------------------------------------------------|
+| floor, wall, ceiling                     | static, convex slabs (where there are none: a box behind its plane) |
+| object, `dynamic: false`                 | static                                                   |
+| object attached to what is static        | static                                                   |
+| object attached to a dynamic one         | welded: its shapes, mass and inertia join the parent's actor |
+| other objects                            | dynamic: the bundle's mass, inertia, friction, restitution |
 
 Welding is the stiffest fixed joint there is: no drive that could stretch, on the CPU and on the GPU alike.
 """
@@ -27,7 +27,6 @@ from registry.geometry import (
     invert_rigid,
     matrix_from_quat,
     quat_from_matrix,
-
     transform_points,
 )
 
@@ -45,7 +44,9 @@ _WHEEL_BIT, _BASE_BIT = 30, 31
 
 @dataclass(frozen=True)
 class Body:
-    """One actor to be: an object and what is welded to it. `specs` and `visuals` are in the root object's space."""
+    """One actor to be: an object and what is welded to it. `specs` and `visuals` are in the root object's
+    space.
+    """
 
     root: int
     name: str
@@ -122,7 +123,9 @@ class SceneBuilder:
                 position[:, :2] += noise[0] * np.clip(draws[:, :2], -2, 2)
                 half = 0.5 * noise[1] * np.clip(draws[:, 2], -2, 2)
                 zero = np.zeros(count)
-                rotation = matrix_from_quat(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)) @ rotation
+                rotation = (
+                    matrix_from_quat(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)) @ rotation
+                )
             self.objects[body.root].actor.set_pose(
                 Pose.create_from_pq(
                     torch.as_tensor(position, dtype=torch.float32, device=device),
@@ -138,11 +141,14 @@ class SceneBuilder:
             sapien.Pose([0, 0, -_GROUND_BELOW_FLOOR_M], [0.7071068, 0, -0.7071068, 0]), material
         )
         if scene.can_render():
-            # A plain plate around the scene; well below a reconstructed floor that may lie a little under z = 0.
+            # A plain plate around the scene; well below a reconstructed floor that may lie a little under z =
+            # 0.
             lower, upper = self.extent
             half = [*((upper - lower)[:2] / 2 + _GROUND_MARGIN_M), 0.01]
             center = [*((upper + lower)[:2] / 2), -0.06]
-            ground.add_box_visual(sapien.Pose(center), half_size=half, material=_matte([0.55, 0.55, 0.55, 1.0]))
+            ground.add_box_visual(
+                sapien.Pose(center), half_size=half, material=_matte([0.55, 0.55, 0.55, 1.0])
+            )
         ground.initial_pose = sapien.Pose()
         drivable = [ground.build_static(name="ground")]
         for base in self.bundle.base:
@@ -236,17 +242,24 @@ def bodies_of(bundle: SceneBundle) -> list[Body]:
         world_from_root = items[root].world_from_object
         specs = tuple(_spec(bundle, items[key]) for key in keys)
         visuals = tuple(
-            (str(bundle.resolve(items[key].visual)), invert_rigid(world_from_root) @ items[key].world_from_object)
+            (
+                str(bundle.resolve(items[key].visual)),
+                invert_rigid(world_from_root) @ items[key].world_from_object,
+            )
             for key in keys
         )
         bodies.append(
-            Body(root, f"{items[root].label}_{root}", specs, visuals, np.asarray(world_from_root), moves(root))
+            Body(
+                root, f"{items[root].label}_{root}", specs, visuals, np.asarray(world_from_root), moves(root)
+            )
         )
     return bodies
 
 
 def merged_mass(body: Body) -> BodySpec:
-    """Return a spec in the root's space whose mass, centre of mass and inertia are those of all specs together."""
+    """Return a spec in the root's space whose mass, centre of mass and inertia are those of all specs
+    together.
+    """
     if len(body.specs) == 1:
         return replace(body.specs[0], world_from_object=np.eye(4))
     total = sum(spec.mass_kg for spec in body.specs)

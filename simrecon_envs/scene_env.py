@@ -1,10 +1,13 @@
-"""`SceneEnv`: a ManiSkill environment of one reconstructed scene. `gym.make("SimRecon/scene0001")` makes it."""
+"""`SceneEnv`: one reconstructed scene as a ManiSkill environment, made by
+`gym.make("SimRecon/scene0001")`.
+"""
 
 import logging
 import warnings
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import sapien
 import torch
@@ -46,22 +49,27 @@ class SceneEnv(BaseEnv):
     | agent/qpos                   | (b, d)       | float32 | joint | rad, m | there is a robot   |
     | agent/qvel                   | (b, d)       | float32 | joint | rad/s, m/s | there is a robot |
     | extra/tcp_pose               | (b, 7)       | float32 | world | m, - | the robot has a hand |
-    | extra/is_grasped             | (b,)         | bool    | -     | -    | task "pick"          |
+    | extra/is_grasped             | (b, 1)       | bool    | -     | -    | task "pick"          |
     | extra/target_pose            | (b, 7)       | float32 | world | m, - | task "pick", state   |
     | extra/tcp_to_target          | (b, 3)       | float32 | world | m    | task "pick", state   |
     | extra/target_lift            | (b, 1)       | float32 | world | m    | task "pick", state   |
     | extra/object_poses           | (b, 7 n)     | float32 | world | m, - | n > 0 movable objects, state |
 
     `target_pose` is that of the target's box centre (with the object's orientation); `object_poses` are the
-    bundle's `world_from_object`, in the order of `movable_ids`. "state" is all of this in one (b, k) float32 vector.
-    "rgb", "rgbd" and the other visual modes of ManiSkill leave out the rows marked "state" and add
+    bundle's `world_from_object`, in the order of `movable_ids`. "state" is all of this in one (b, k) float32
+    vector. "rgb", "rgbd" and the other visual modes of ManiSkill leave out the rows marked "state" and add
 
-    | sensor_data/CAMERA/rgb       | (b, h, w, 3) | uint8   | image | -    | cameras: base_camera and the robot's own |
-    | sensor_data/CAMERA/depth     | (b, h, w, 1) | int16   | image | mm   | z-depth, 0 = nothing |
-    | sensor_param/CAMERA/…        | intrinsic_cv (b, 3, 3) px, extrinsic_cv (b, 3, 4) camera_from_world, cam2world_gl (b, 4, 4) |
+    | sensor_data/CAMERA/rgb       | (b, h, w, 3) | uint8   | image | -    | rgb in the mode      |
+    | sensor_data/CAMERA/depth     | (b, h, w, 1) | int16   | image | mm   | depth in the mode; z-depth, 0 = nothing |
+    | sensor_param/CAMERA/intrinsic_cv  | (b, 3, 3) | float32 | image | px  |                     |
+    | sensor_param/CAMERA/extrinsic_cv  | (b, 3, 4) | float32 | camera_from_world, OpenCV axes | m | |
+    | sensor_param/CAMERA/cam2world_gl  | (b, 4, 4) | float32 | world_from_camera, OpenGL axes | m | |
 
-    Attributes: `task`, `task_note` (why the task is not what was asked for, or hard), `instruction`, `target_id`,
-    `movable_ids`, `placement`, `bundle`, `revision_note`.
+    CAMERA is `base_camera`, which overlooks the target, and whatever the robot carries (`hand_camera`,
+    `fetch_head` …).
+
+    Attributes: `task`, `task_note` (why the task is not what was asked for, or hard), `instruction`,
+    `target_id`, `movable_ids`, `placement`, `bundle`, `revision_note`.
     """
 
     SUPPORTED_ROBOTS = None  # every robot of ManiSkill whose files are here; see `robots.usable_robots`
@@ -89,20 +97,23 @@ class SceneEnv(BaseEnv):
 
         Args:
             scene_id: Scene of the registry.
-            revision: Which revision of it was registered. Where the scene has a newer one by now, the newer one is
+            revision: Which revision of it was registered. Where the scene has a newer one by now, the newer
+                one is
                 used, with a warning and a text in `revision_note`: the old files are gone with it.
             registry: The registry's folder; the default registry where None.
             strict_revision: Raise instead of using another revision.
             task: "pick" (pick up the target) or "none" (no success, reward 0).
             target: "auto" (what is easiest to pick up), an object's id, or a label.
-            pose_noise: Standard deviation of a random shift of each movable object at reset (m), or of shift and
+            pose_noise: Standard deviation of a random shift of each movable object at reset (m), or of shift
+                and
                 turn (m, rad). A little noise can make objects overlap where they stand close together.
             robot_uids: A robot of ManiSkill, or "none".
             task_config: Thresholds of the task.
             obs_mode: As in ManiSkill; "state" where None.
             render_mode: None, "rgb_array", "sensors", "all" or "human".
-            render_backend: "auto" renders only if a mode asks for pictures; "gpu", "cpu" and "none" as in ManiSkill.
-            **kwargs: As for ManiSkill's `BaseEnv` (num_envs, control_mode, reward_mode, sim_backend, sensor_configs …).
+            render_backend: "auto" renders only if a mode asks for pictures; "gpu", "cpu" and "none" as in
+            ManiSkill. **kwargs: As for ManiSkill's `BaseEnv` (num_envs, control_mode, reward_mode,
+            sim_backend, sensor_configs …).
 
         Raises:
             SceneNotFound: the registry has no such scene; the message lists what there is.
@@ -113,7 +124,9 @@ class SceneEnv(BaseEnv):
         if task not in TASKS:
             raise UsageError(f"scene {scene_id}: task {task!r} is not one of {', '.join(TASKS)}")
         if not isinstance(robot_uids, str):
-            raise UsageError(f"scene {scene_id}: robot_uids: expected the name of one robot, got {robot_uids!r}")
+            raise UsageError(
+                f"scene {scene_id}: robot_uids: expected the name of one robot, got {robot_uids!r}"
+            )
         if robot_uids != "none":
             check_robot(robot_uids)
         self.bundle, self.revision_note = _load(scene_id, revision, registry, strict_revision)
@@ -124,7 +137,9 @@ class SceneEnv(BaseEnv):
         self._solids = scene_solids(self.bundle)
         self.builder = SceneBuilder(self.bundle, scene_extent(self._solids))
         self.movable_ids = tuple(body.root for body in self.builder.bodies if body.dynamic)
-        self._shape = robot_shape(robot_uids) if robot_uids != "none" else RobotShape(np.zeros((0, 3)), None, False)
+        self._shape = (
+            robot_shape(robot_uids) if robot_uids != "none" else RobotShape(np.zeros((0, 3)), None, False)
+        )
         self._plan(task, target, robot_uids)
         self.target_initial_height: torch.Tensor | None = None
         super().__init__(
@@ -167,7 +182,8 @@ class SceneEnv(BaseEnv):
             problems = [text for text in (self.target.problem, self.placement.note) if text]
             self.task_note = "; ".join(problems)
             item = next(o for o in self.bundle.objects if o.id == self.target_id)
-            # The box centre in object space, so that the target's position is the middle of what is to be gripped.
+            # The box centre in object space, so that the target's position is the middle of what is to be
+            # gripped.
             offset = self.target.center - item.world_from_object[:3, 3]
             self._target_center = torch.as_tensor(
                 item.world_from_object[:3, :3].T @ offset, dtype=torch.float32
@@ -222,14 +238,20 @@ class SceneEnv(BaseEnv):
 
     def _load_lighting(self, options: dict) -> None:
         # The textures come from a video and carry the room's light already: mostly ambient, a little shape.
-        self.scene.set_ambient_light([0.75, 0.75, 0.75])
-        self.scene.add_directional_light([0.4, 0.3, -1.0], [0.9, 0.9, 0.88], shadow=self.enable_shadow)
-        self.scene.add_directional_light([-0.5, -0.6, -0.6], [0.35, 0.35, 0.38])
+        self.scene.set_ambient_light([0.6, 0.6, 0.6])
+        self.scene.add_directional_light([0.4, 0.3, -1.0], [0.8, 0.8, 0.78], shadow=self.enable_shadow)
+        self.scene.add_directional_light([-0.5, -0.6, -0.6], [0.3, 0.3, 0.33])
 
     def _root_pose(self) -> sapien.Pose:
         return sapien.Pose(self.placement.position, self.placement.quat_wxyz)
 
     # ---- Episodes.
+
+    def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        """Reset as ManiSkill does; Gymnasium's own generator is seeded, too, as its checker expects."""
+        if seed is not None:
+            gym.Env.reset(self, seed=int(np.ravel(seed)[0]))
+        return super().reset(seed=seed, options=options)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
@@ -294,7 +316,7 @@ class SceneEnv(BaseEnv):
         if hasattr(self.agent, "tcp"):
             obs["tcp_pose"] = self.agent.tcp.pose.raw_pose
         if self.target is not None:
-            obs["is_grasped"] = info["is_grasped"]
+            obs["is_grasped"] = info["is_grasped"][:, None]
         if not self.obs_mode_struct.use_state:
             return obs
         if self.target is not None:
@@ -310,7 +332,9 @@ class SceneEnv(BaseEnv):
 
 def _camera(uid: str, view: Viewpoint, size_px: int) -> CameraConfig:
     pose = sapien.Pose(view.eye, view.quat_wxyz)
-    return CameraConfig(uid=uid, pose=pose, width=size_px, height=size_px, fov=view.fov_rad, near=0.01, far=100)
+    return CameraConfig(
+        uid=uid, pose=pose, width=size_px, height=size_px, fov=view.fov_rad, near=0.01, far=100
+    )
 
 
 def _load(scene_id: str, revision: str | None, registry: str | None, strict: bool) -> tuple[SceneBundle, str]:
@@ -327,8 +351,8 @@ def _load(scene_id: str, revision: str | None, registry: str | None, strict: boo
         option = "" if registry is None else f" --registry {root}"
         raise SceneAssetsMissing(
             f"scene {scene_id}: its files in {root} are gone or damaged: {error}. "
-            f"`simrecon verify {scene_id}{option}` says more; `simrecon reconstruct VIDEO --scene {scene_id}{option}` "
-            "makes it again"
+            f"`simrecon verify {scene_id}{option}` says more; make it again with "
+            f"`simrecon reconstruct VIDEO --scene {scene_id}{option}`"
         ) from error
     if revision is None or bundle.revision == revision:
         return bundle, ""

@@ -1,0 +1,146 @@
+"""Pictures and videos of an environment: for the demo, the command line and people."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from registry import UsageError
+from simrecon_envs.registration import make
+from simrecon_envs.scripted import PickScript
+
+POLICIES = ("pick", "random", "still")
+
+
+def record_rollout(
+    scene: str,
+    out_mp4: Path | str,
+    steps: int = 100,
+    policy: str = "pick",
+    seed: int = 0,
+    *,
+    robot: str = "panda",
+    registry: Path | str | None = None,
+    size_px: int = 512,
+) -> dict[str, Any]:
+    """Record a rollout as a video.
+
+    Args:
+        scene: `scene0001` or `SimRecon/scene0001`.
+        out_mp4: The video's file; written whole or not at all.
+        steps: Control steps, 1/20 s each; one picture a step.
+        policy: "pick" (a script reaches for the target, grips and lifts it), "random" or "still".
+        seed: Of the reset and of the random actions.
+        robot: A robot of ManiSkill.
+        registry: The registry's folder; the default registry where None.
+        size_px: Width and height of the pictures.
+
+    Returns:
+        {"steps", "success", "return", "target_id", "instruction", "task_note", "policy"}; `policy` is the one
+        that was used: "random" where there is nothing to pick up.
+
+    Raises:
+        EnvironmentMissing: nothing can render here.
+    """
+    if policy not in POLICIES:
+        raise UsageError(f"policy {policy!r} is not one of {', '.join(POLICIES)}")
+    kwargs = {"control_mode": "pd_ee_delta_pose"} if policy == "pick" else {}
+    env = make(
+        scene,
+        registry=registry,
+        render_mode="rgb_array",
+        robot_uids=robot,
+        max_episode_steps=steps + 1,
+        human_render_camera_configs={"width": size_px, "height": size_px},
+        **kwargs,
+    )
+    try:
+        return _record(env, Path(out_mp4), steps, policy, seed)
+    finally:
+        env.close()
+
+
+def _record(env: gym.Env, out_mp4: Path, steps: int, policy: str, seed: int) -> dict[str, Any]:
+    import imageio.v2 as imageio
+
+    scene_env = env.unwrapped
+    env.reset(seed=seed)
+    env.action_space.seed(seed)
+    if policy == "pick" and scene_env.target is None:
+        policy = "random"
+    script = PickScript(scene_env) if policy == "pick" else None
+    still = np.zeros(env.action_space.shape, np.float32)
+    out_mp4.parent.mkdir(parents=True, exist_ok=True)
+    partial = out_mp4.with_name(f".{out_mp4.stem}-{os.getpid()}.mp4")
+    total, success = 0.0, False
+    try:
+        with imageio.get_writer(
+            partial, fps=scene_env.control_freq, codec="libx264", macro_block_size=2
+        ) as video:
+            video.append_data(_picture(env))
+            for _ in range(steps):
+                if script is not None:
+                    action = script.action()
+                else:
+                    action = env.action_space.sample() if policy == "random" else still
+                _, reward, _, _, info = env.step(action)
+                total += float(reward)
+                success = success or bool(info.get("success", False))
+                video.append_data(_picture(env))
+        os.replace(partial, out_mp4)
+    finally:
+        partial.unlink(missing_ok=True)
+    return {
+        "steps": steps,
+        "success": success,
+        "return": total,
+        "target_id": scene_env.target_id,
+        "instruction": scene_env.instruction,
+        "task_note": scene_env.task_note,
+        "policy": policy,
+    }
+
+
+def render_scene_picture(
+    scene: str,
+    out_png: Path | str,
+    *,
+    robot: str = "none",
+    registry: Path | str | None = None,
+    size_px: int = 768,
+) -> Path:
+    """Render the assembled scene from a viewpoint that shows much of it; returns the picture's file.
+
+    Args:
+        scene: `scene0001` or `SimRecon/scene0001`.
+        out_png: The picture's file.
+        robot: A robot of ManiSkill to show in it, or "none".
+        registry: The registry's folder; the default registry where None.
+        size_px: Width and height.
+
+    Raises:
+        EnvironmentMissing: nothing can render here.
+    """
+    import imageio.v2 as imageio
+
+    env = make(
+        scene,
+        registry=registry,
+        render_mode="rgb_array",
+        robot_uids=robot,
+        human_render_camera_configs={"width": size_px, "height": size_px},
+    )
+    try:
+        env.reset(seed=0)
+        out_png = Path(out_png)
+        out_png.parent.mkdir(parents=True, exist_ok=True)
+        imageio.imwrite(out_png, _picture(env))
+    finally:
+        env.close()
+    return out_png
+
+
+def _picture(env: gym.Env) -> np.ndarray:
+    return np.asarray(env.render()[0].cpu(), dtype=np.uint8)
