@@ -96,17 +96,18 @@ class VideoReader:
             f"frames: {self.path} has no video track. Give a video file or a folder of jpg or png images."
         )
 
-    def frames(self) -> Iterator[tuple[int, float, object]]:
-        """Yield (frame number from 0, seconds from the first frame, av.VideoFrame).
+    def frames(self) -> Iterator[tuple[int, float, bool, object]]:
+        """Yield (frame number from 0, seconds from the first frame, intact, av.VideoFrame).
 
-        Damaged packets are skipped and counted; the file's end, early or not, ends the iteration.
+        Damaged packets are skipped and counted; what follows them is smeared, so it is not intact until the next
+        independently coded frame. The file's end, early or not, ends the iteration.
         """
         import av
 
         self.damaged_packets = 0
         with self._open() as container:
             stream = self._stream(container)
-            number, first, last = 0, None, -1.0
+            number, first, last, intact = 0, None, -1.0, True
             packets = container.demux(stream)
             while True:
                 try:
@@ -120,6 +121,7 @@ class VideoReader:
                     decoded = packet.decode()
                 except av.error.FFmpegError:
                     self.damaged_packets += 1
+                    intact = False
                     if packet.dts is None and packet.size == 0:  # the flush itself failed
                         return
                     continue
@@ -131,7 +133,8 @@ class VideoReader:
                         time = (first or 0.0) + number / (self.nominal_fps or 30.0)
                     first = time if first is None else first
                     last = max(time - first, last + 1e-6)  # strictly increasing even where stamps are broken
-                    yield number, last, frame
+                    intact = (intact or frame.key_frame) and not frame.is_corrupt
+                    yield number, last, intact, frame
                     number += 1
 
     def _learn_geometry(self, frame, stream) -> None:

@@ -12,7 +12,14 @@ import cv2
 import numpy as np
 
 from reconstruction.decoding import ImageFolder, VideoReader, file_sha256, working_size
-from reconstruction.keyframes import ANALYSIS_SIDE_PX, FrameStats, MotionMeter, Spacing, choose_keyframes
+from reconstruction.keyframes import (
+    ANALYSIS_SIDE_PX,
+    FrameStats,
+    MotionMeter,
+    Spacing,
+    choose_keyframes,
+    repeats_of,
+)
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import FrameSet, VideoSource
 from registry.errors import InputError, UsageError
@@ -84,17 +91,21 @@ def load_frames(video: Path, config: FramesConfig, *, progress: Progress = NO_PR
 
 def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSet:
     reader = VideoReader(path)
-    stats, times = _measure_video(reader, config, progress)
+    stats, times, smeared = _measure_video(reader, config, progress)
     _note_decoding(reader, len(times), progress)
     usable = _usable_frames(stats, len(times), config, str(path), progress)
+    usable, smeared = _without_smeared(stats, usable, smeared, config, progress)
+    usable = _without_held_out(stats, usable, config, progress)
     chosen = choose_keyframes(stats, usable, _spacing(config))
     _require_enough(len(chosen), config, str(path))
     keep = [stats.indices[row] for row in chosen]
-    held = _spread(np.arange(0, len(times), HELD_OUT_EVERY), config.max_held_out)
+    held = [i for i in range(0, len(times), HELD_OUT_EVERY) if i not in smeared]
+    held = _spread(np.array(held, int), config.max_held_out)
     images = _decode_chosen(reader, {*keep, *held}, config, progress)
     missing = [i for i in keep if i not in images]
     if missing:
         raise InputError(f"frames: {path} changed while it was read: frame {missing[0]} is gone. Run again.")
+    shape = images[keep[0]].shape
     span = times[-1] - times[0]
     fps = (len(times) - 1) / span if span > 0 else reader.nominal_fps
     source = VideoSource(
@@ -113,9 +124,9 @@ def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSe
         indices=np.array(keep, np.int32),
         times_s=np.array([times[i] for i in keep]),
         sharpness=np.array([stats.sharpness[row] for row in chosen], np.float32),
-        held_out_images=np.stack([images[i] for i in held]),
+        held_out_images=np.stack([images[i] for i in held]) if held else np.zeros((0, *shape), np.uint8),
         held_out_indices=np.array(held, np.int32),
-        held_out_times_s=np.array([times[i] for i in held]),
+        held_out_times_s=np.array([times[i] for i in held], np.float64),
         focal_prior_px=reader.focal_prior_px(config.max_side_px),
         ordered=True,
     )
@@ -123,21 +134,55 @@ def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSe
 
 def _measure_video(
     reader: VideoReader, config: FramesConfig, progress: Progress
-) -> tuple[FrameStats, list[float]]:
-    """Pass 1: return the statistics of analysed frames and the times of all frames."""
+) -> tuple[FrameStats, list[float], set[int]]:
+    """Pass 1: return statistics of analysed frames, the times of all frames, numbers of those smeared by damage."""
     progress.start(reader.announced_frames, "measuring frames")
-    meter, times = MotionMeter(), []
+    meter, times, smeared = MotionMeter(), [], set()
     stride = max(1, round(reader.nominal_fps / config.max_analysis_fps))
     # A variable-rate file may announce a wrong rate: the stride only ever skips frames closer than this.
     spacing_s = 0.6 * stride / max(reader.nominal_fps, 1e-6) if stride > 1 else 0.0
     last = -np.inf
-    for number, time_s, frame in reader.frames():
+    for number, time_s, intact, frame in reader.frames():
         times.append(time_s)
-        if number % HELD_OUT_EVERY != 0 and (stride == 1 or time_s - last >= spacing_s):
+        if not intact:
+            smeared.add(number)
+        held_out = number % HELD_OUT_EVERY == 0  # measured too: it keeps the chain of motion whole
+        if held_out or stride == 1 or time_s - last >= spacing_s:
             meter.add(number, time_s, reader.to_gray(frame, ANALYSIS_SIDE_PX))
             last = time_s
         progress.advance()
-    return meter.stats, times
+    return meter.stats, times, smeared
+
+
+def _without_smeared(
+    stats: FrameStats, usable: np.ndarray, smeared: set[int], config: FramesConfig, progress: Progress
+) -> tuple[np.ndarray, set[int]]:
+    """Take frames smeared by damaged data from the usable ones, unless hardly any would be left."""
+    if not smeared:
+        return usable, smeared
+    intact = usable & ~np.isin(stats.indices, list(smeared))
+    if intact.sum() < max(config.min_keyframes // 2, 0.3 * usable.sum()):
+        progress.note(
+            f"{len(smeared)} frames after damaged data may be smeared; used all the same: others are too few"
+        )
+        return usable, set()
+    progress.note(f"{len(smeared)} frames after damaged data are smeared: not used")
+    return intact, smeared
+
+
+def _without_held_out(
+    stats: FrameStats, usable: np.ndarray, config: FramesConfig, progress: Progress
+) -> np.ndarray:
+    """Take held-out frames, and repeats of them in a video with duplicated frames, from the usable ones (n,) bool."""
+    held_out = np.array(stats.indices) % HELD_OUT_EVERY == 0
+    repeats = repeats_of(stats, held_out) & usable
+    without = usable & ~held_out & ~repeats
+    if repeats.any() and len(choose_keyframes(stats, without, _spacing(config))) < config.min_keyframes // 2:
+        progress.note(
+            f"{int(repeats.sum())} frames repeat held-out ones and are used all the same: others are too few"
+        )
+        return usable & ~held_out
+    return without
 
 
 def _decode_chosen(
@@ -147,7 +192,7 @@ def _decode_chosen(
     progress.start(len(wanted), "decoding keyframes")
     images: dict[int, np.ndarray] = {}
     last = max(wanted)
-    for number, _, frame in reader.frames():
+    for number, _, _, frame in reader.frames():
         if number in wanted:
             images[number] = reader.to_rgb(frame, config.max_side_px)
             progress.advance()

@@ -31,6 +31,7 @@ class FrameStats:
         default_factory=list
     )  # path in shares of the longer image side, non-decreasing
     similarity: list[float] = field(default_factory=list)  # share of points tracked from the reference
+    change: list[float] = field(default_factory=list)  # mean gray difference from the frame before
 
 
 class MotionMeter:
@@ -43,6 +44,7 @@ class MotionMeter:
         self._points: np.ndarray | None = None
         self._at_reference = 0.0
         self._lost_in_a_row = 0
+        self._before: np.ndarray | None = None
 
     def add(self, index: int, time_s: float, gray: np.ndarray) -> None:
         """Measure one frame: uint8 (h, w), longer side about ANALYSIS_SIDE_PX."""
@@ -58,6 +60,8 @@ class MotionMeter:
         position, similarity = self._move(small)
         s.position.append(max(position, s.position[-1] if s.position else 0.0))
         s.similarity.append(similarity)
+        s.change.append(255.0 if self._before is None else float(cv2.absdiff(small, self._before).mean()))
+        self._before = small
 
     def _move(self, small: np.ndarray) -> tuple[float, float]:
         if self._reference is None:
@@ -105,6 +109,12 @@ def _textured_share(small: np.ndarray) -> float:
     rows, columns = strength.shape[0] // 16 * 16, strength.shape[1] // 16 * 16
     blocks = strength[:rows, :columns].reshape(rows // 16, 16, columns // 16, 16).max(axis=(1, 3))
     return float((blocks > _TEXTURED_EIGENVALUE).mean())
+
+
+def repeats_of(stats: FrameStats, originals: np.ndarray, same_below: float = 0.25) -> np.ndarray:
+    """Return which frames (n,) bool are the same picture as one of `originals` (n,) bool, through runs of repeats."""
+    run = np.cumsum(np.array(stats.change) >= same_below)
+    return np.isin(run, run[originals]) & ~originals
 
 
 def relative_sharpness(stats: FrameStats, window_s: float = 0.75) -> np.ndarray:

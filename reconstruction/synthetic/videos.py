@@ -5,12 +5,21 @@ Every maker of `BAD_VIDEOS` and `HARD_VIDEOS` takes the path to write and is det
 
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from reconstruction.synthetic.film import Sensor, film_room, handheld_path, pan_path, phone_camera, prepare
+from reconstruction.synthetic.film import (
+    FilmSet,
+    Sensor,
+    film_room,
+    handheld_path,
+    pan_path,
+    phone_camera,
+    prepare,
+)
 from reconstruction.synthetic.room import build_room
 
 _TICKS_PER_S = 90000
@@ -73,10 +82,14 @@ def short_film(
     blank_walls: bool = False, objects: Sequence[str] | None = None, sensor: Sensor | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Return frames uint8 (n, h, w, 3) of a generated room, quickly made (coarse light)."""
-    room = build_room(seed, objects, step_m=0.08, density=0.5, blank_walls=blank_walls)
     path = handheld_path(n_frames, seed=seed) if path is None else path
-    film_set = prepare(room, shadow_px=256)
+    film_set = _quick_set(seed, tuple(objects) if objects is not None else None, blank_walls)
     return film_room(film_set, phone_camera(width, height), path, sensor, seed=seed, supersample=1)
+
+
+@lru_cache(maxsize=2)  # tests make many films of the same room
+def _quick_set(seed: int, objects: tuple[str, ...] | None, blank_walls: bool) -> FilmSet:
+    return prepare(build_room(seed, objects, step_m=0.08, density=0.5, blank_walls=blank_walls), shadow_px=256)
 
 
 def _noisy(image: np.ndarray, n_frames: int, sigma: float = 1.6) -> np.ndarray:
@@ -177,6 +190,15 @@ def write_cut_off(path: Path) -> None:
     path.write_bytes(data[: int(0.6 * len(data))])
 
 
+def write_damaged(path: Path) -> None:
+    """A file with bytes overwritten in the middle, as a failing memory card leaves it."""
+    write_video(path, short_film(96))
+    data = bytearray(path.read_bytes())
+    for start in (int(0.4 * len(data)), int(0.6 * len(data))):
+        data[start : start + 4000] = b"\0" * 4000
+    path.write_bytes(bytes(data))
+
+
 def write_variable_rate(path: Path) -> None:
     """Phones drop frames in the dark: times are uneven."""
     frames = short_film(60)
@@ -189,6 +211,7 @@ HARD_VIDEOS: dict[str, Callable[[Path], None]] = {
     "half_duplicated": write_half_duplicated,
     "portrait": write_portrait,
     "cut_off": write_cut_off,
+    "damaged": write_damaged,
     "variable_rate": write_variable_rate,
 }
 """Inputs with a fault that must work all the same."""
