@@ -35,7 +35,7 @@ def assemble(
             "every object needs exactly one parent and there must be no cycle"
         )
     progress.start(len(edges) + config.joint_rounds, "placing objects")
-    placer = Placer(assets, config)
+    placer = Placer(assets, edges, config)
     for edge in _lowest_first(edges, by_id):
         placement = placer.place(by_id[edge.child], edge)
         for note in placement.notes if not placement.stands else ():

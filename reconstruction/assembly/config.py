@@ -27,7 +27,7 @@ class AssemblyConfig:
     """Time an object is given to come to rest."""
     good_turn_deg: float = 1.0
     """An object that turns less than this while it settles needs no repair."""
-    max_turn_deg: float = 4.0
+    max_turn_deg: float = 8.0
     """An object that turns more has tipped."""
     max_slide_m: float = 0.015
     """An object that slides farther has slipped."""

@@ -1,6 +1,6 @@
 """Place one object: furniture on the floor, hanging things against their wall, everything else by letting it settle."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +8,9 @@ import numpy as np
 from reconstruction.assembly.base import base_slabs
 from reconstruction.assembly.collision import cut, flatten_foot
 from reconstruction.assembly.config import AssemblyConfig
+from reconstruction.assembly.tops import level_tops
 from reconstruction.assembly.workbench import Settled, Workbench, make_clear, object_spec
+from reconstruction.scene_graph.surfaces import sample_object
 from reconstruction.types import AssetSet, BaseAsset, ConvexPart, Edge, ObjectAsset
 from registry.geometry import rigid, transform_points
 from registry.simulation import BASE_FRICTION, BASE_RESTITUTION, BodySpec, pose_change
@@ -36,6 +38,7 @@ class Placement:
     edge: Edge
     pose: np.ndarray  # (4, 4)
     parts: tuple[ConvexPart, ...]
+    unflattened: tuple[ConvexPart, ...]  # before its foot was
     dynamic: bool
     band_mm: float  # how much of its foot was flattened
     notes: tuple[str, ...]
@@ -96,9 +99,14 @@ def upright(pose: np.ndarray, max_tilt_deg: float) -> np.ndarray:
 class Placer:
     """Places objects one after another on the workbench, parents before children."""
 
-    def __init__(self, assets: AssetSet, config: AssemblyConfig) -> None:
+    def __init__(self, assets: AssetSet, edges: Sequence[Edge], config: AssemblyConfig) -> None:
         """Start with the base."""
         self.config = config
+        self._samples = {o.id: sample_object(o) for o in assets.objects}
+        self._carried: dict[int, list[int]] = {}
+        for edge in edges:
+            if edge.relation == "supported_by":
+                self._carried.setdefault(edge.parent, []).append(edge.child)
         self.base = {b.id: b for b in assets.base}
         self.bench = Workbench(base_specs(assets))
         self.placed: dict[int, Placement] = {}
@@ -111,7 +119,13 @@ class Placer:
             # A parent that was moved takes along what stands on it; its turn is left to gravity.
             start[:3, 3] += parent.pose[:3, 3] - parent.asset.world_from_object[:3, 3]
         on_base = edge.parent in self.base
-        fresh = Placement(asset, edge, start, asset.collision, True, 0.0, (), True)
+        children = [self._samples[i] for i in sorted(self._carried.get(asset.id, []))]
+        parts, depth = level_tops(
+            asset.collision, self._samples[asset.id], asset.world_from_object, children
+        )
+        fresh = Placement(asset, edge, start, parts, parts, True, 0.0, (), True)
+        if depth > 0:
+            fresh = fresh.noted(f"its collision shape was cut by up to {depth * 1000:.0f} mm to its visible top")
         if edge.relation == "attached_to":
             placement = self._hang(fresh)
         elif on_base and is_furniture(asset, on_base, self.config):
@@ -290,7 +304,7 @@ class Placer:
 
 def _flattened(item: Placement, band_mm: float) -> Placement:
     up = item.pose[:3, :3].T @ np.array([0, 0, 1.0])
-    parts = flatten_foot(item.asset.collision, up, band_mm * 1e-3)
+    parts = flatten_foot(item.unflattened, up, band_mm * 1e-3)
     kept = tuple(n for n in item.notes if not n.startswith("foot flattened"))
     return replace(item, parts=parts, band_mm=band_mm, notes=(*kept, f"foot flattened by {band_mm:g} mm"))
 

@@ -1,0 +1,115 @@
+"""Bring the collision shape of what carries things down to its visible surface.
+
+Convex pieces span the bumps, the raised edge and the tilt of a reconstructed table top, so that things would float
+above it by as much. Under each child the pieces that stick out are cut off at the plane of the visible surface.
+"""
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from reconstruction.assembly.collision import cut
+from reconstruction.scene_graph.surfaces import SampledObject
+from reconstruction.types import ConvexPart
+
+_REACH_M = 0.04  # how far a child's underside may be from the surface that carries it
+_MIN_OVERSHOOT_M = 0.002
+_MAX_CUT_M = 0.04
+_MAX_SHARE_LOST = 0.15  # of the visible surface; more means that the piece is a wall, not a bump
+_FIT_BAND_M = 0.015
+_MAX_SLOPE = 0.1
+
+
+def level_tops(
+    parts: tuple[ConvexPart, ...],
+    surface: SampledObject,
+    world_from_object: np.ndarray,
+    children: list[SampledObject],
+) -> tuple[tuple[ConvexPart, ...], float]:
+    """Cut off what the pieces have above the visible surface under the children.
+
+    Args:
+        parts: the parent's convex pieces, object space.
+        surface: the parent's visible surface, sampled at `world_from_object`.
+        world_from_object: (4, 4) the parent's reconstructed pose.
+        children: what it carries, sampled at their reconstructed poses.
+
+    Returns:
+        The pieces, and the deepest cut in metres (0: nothing was cut).
+    """
+    if len(surface.up) == 0:
+        return parts, 0.0
+    rotation, origin = world_from_object[:3, :3], world_from_object[:3, 3]
+    tree = cKDTree(surface.up[:, :2])
+    resting = [under for child in children if len(under := _surface_under(child, surface, tree)) >= 5]
+    pieces, deepest = list(parts), 0.0
+    for number in range(len(pieces)):
+        for under in resting:
+            world = np.asarray(pieces[number].vertices, np.float64) @ rotation.T + origin
+            if _overshoot(world, under) < _MIN_OVERSHOOT_M:
+                continue
+            plane = _visible_plane(world, surface.up, float(np.median(under[:, 2])))
+            if plane is None:
+                continue
+            normal, offset = plane
+            depth = float((world @ normal + offset).max())
+            made = cut((pieces[number],), -normal @ rotation, -(normal @ origin + offset))
+            if 0 < depth <= _MAX_CUT_M and made:
+                pieces[number], deepest = made[0], max(deepest, depth)
+    return (tuple(pieces), deepest) if deepest > 0 else (parts, 0.0)
+
+
+def _surface_under(child: SampledObject, surface: SampledObject, tree: cKDTree) -> np.ndarray:
+    """Return the visible surface point (n, 3) under each cell of a child's underside, the highest within reach."""
+    radius = max(1.2 * surface.spacing_m, 0.008)
+    out = []
+    for cell, near in zip(child.underside, tree.query_ball_point(child.underside[:, :2], radius)):
+        height = surface.up[near, 2]
+        height = height[np.abs(height - cell[2]) < _REACH_M]
+        if len(height):
+            out.append((cell[0], cell[1], height.max()))
+    return np.array(out).reshape(-1, 3)
+
+
+def _overshoot(vertices: np.ndarray, under: np.ndarray) -> float:
+    """Return by how much (median, m) a convex piece rises above the points that it covers; 0 where it covers none."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if np.any(low[:2] > under[:, :2].max(axis=0)) or np.any(high[:2] < under[:, :2].min(axis=0)):
+        return 0.0
+    try:
+        equations = ConvexHull(vertices).equations  # normal . x + offset <= 0 inside
+    except QhullError:
+        return 0.0
+    normals, offsets = equations[:, :3], equations[:, 3]
+    up, down, side = normals[:, 2] > 1e-6, normals[:, 2] < -1e-6, np.abs(normals[:, 2]) <= 1e-6
+    level = under[:, :2] @ normals[:, :2].T + offsets
+    top = (-level[:, up] / normals[up, 2]).min(axis=1)
+    bottom = (-level[:, down] / normals[down, 2]).max(axis=1)
+    inside = (level[:, side] <= 1e-6).all(axis=1) & (top > bottom)
+    # A piece that only starts above the surface is something else: the next board of a shelf.
+    inside &= bottom < under[:, 2] + _MIN_OVERSHOOT_M
+    rise = (top - under[:, 2])[inside & (top < under[:, 2] + _MAX_CUT_M)]
+    return float(np.median(rise)) if len(rise) >= max(3, 0.05 * len(under)) else 0.0
+
+
+def _visible_plane(vertices: np.ndarray, up: np.ndarray, level: float) -> tuple[np.ndarray, float] | None:
+    """Fit the visible surface above a piece near a height: (normal (3,), offset), or None if it is no plane."""
+    low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
+    covered = up[np.all((up[:, :2] >= low) & (up[:, :2] <= high), axis=1)]
+    near = covered[np.abs(covered[:, 2] - level) < _MAX_CUT_M]
+    if len(near) < 10:
+        return None
+    center = near[:, :2].mean(axis=0)
+    design = np.column_stack([near[:, :2] - center, np.ones(len(near))])
+    keep = np.abs(near[:, 2] - level) < _FIT_BAND_M
+    fit = np.array([0.0, 0.0, level])
+    for _ in range(4):
+        if keep.sum() < 10:
+            return None
+        fit = np.linalg.lstsq(design[keep], near[keep, 2], rcond=None)[0]
+        keep = np.abs(design @ fit - near[:, 2]) < _FIT_BAND_M
+    above = design @ fit < near[:, 2] - 0.5 * _FIT_BAND_M
+    if np.hypot(fit[0], fit[1]) > _MAX_SLOPE or above.mean() > _MAX_SHARE_LOST:
+        return None
+    normal = np.array([-fit[0], -fit[1], 1.0])
+    scale = np.linalg.norm(normal)
+    return normal / scale, float(-(fit[2] - fit[:2] @ center) / scale)
