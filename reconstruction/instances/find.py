@@ -42,14 +42,17 @@ def find_instances(
     planes, owner = _fit_base(graph, config)
     progress.advance()
     base = _base_entities(graph, planes, progress)
-    things = _pictures(graph, planes, owner, config)
+    things = _pictures(graph, planes, owner, posed, depth, config)
     hung = np.zeros(len(graph.points), bool)
     for thing in things:
         hung[thing.vertices] = True
     behind = _behind_base(graph, planes)
     rest = np.flatnonzero((owner == 0) & ~hung & ~behind)
     progress.advance()
-    things += _mark_attached(graph, segment(graph, rest, config), planes)
+    segmented, crumbs = _without_base_crumbs(graph, segment(graph, rest, config), planes)
+    for vertices, number in crumbs:
+        owner[vertices] = number
+    things += _mark_attached(graph, segmented, planes)
     progress.advance()
     vertex_instance = np.where(hung, 0, owner).astype(np.int32)
     objects = describe(graph, things, base, vertex_instance)
@@ -90,7 +93,12 @@ def _base_entities(graph: MeshGraph, planes: list[FittedPlane], progress: Progre
 
 
 def _pictures(
-    graph: MeshGraph, planes: list[FittedPlane], owner: np.ndarray, config: InstancesConfig
+    graph: MeshGraph,
+    planes: list[FittedPlane],
+    owner: np.ndarray,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: InstancesConfig,
 ) -> list[Thing]:
     found: list[Thing] = []
     used = np.zeros(len(owner), bool)
@@ -98,7 +106,7 @@ def _pictures(
         if plane.label != "wall":
             continue
         taken = (owner > 0) & ~plane.members
-        for vertices in find_pictures(graph, plane, taken | used, owner == 0, config):
+        for vertices in find_pictures(graph, plane, taken | used, owner == 0, posed, depth, config):
             used[vertices] = True
             found.append(Thing(vertices, attached=True))
     return found
@@ -117,6 +125,29 @@ def _behind_base(graph: MeshGraph, planes: list[FittedPlane]) -> np.ndarray:
             beyond &= (along > low - 0.05) & (along < high + 0.05)
         out |= beyond
     return out
+
+
+def _without_base_crumbs(
+    graph: MeshGraph, things: list[Thing], planes: list[FittedPlane]
+) -> tuple[list[Thing], list[tuple[np.ndarray, int]]]:
+    """Give bumps of the floor and the walls back to them: small, thin, hugging the base all over."""
+    carriers = {id(t.rests_on) for t in things}
+    first = 1 if planes and planes[0].label == "floor" else 2
+    kept, crumbs = [], []
+    for thing in things:
+        points = graph.points[thing.vertices]
+        if id(thing) in carriers or thing.rests_on is not None or not planes:
+            kept.append(thing)
+            continue
+        distances = np.stack([np.abs(plane.distance(points)) for plane in planes])
+        nearest = distances.min(axis=0)
+        spread = np.sort(np.ptp(points, axis=0))
+        thin = np.percentile(nearest, 90) < 0.035 or (spread[2] < 0.12 and np.median(nearest) < 0.025)
+        if thin and spread[2] < 0.6:
+            crumbs.append((thing.vertices, first + int(np.argmin(np.median(distances, axis=1)))))
+        else:
+            kept.append(thing)
+    return kept, crumbs
 
 
 def _mark_attached(graph: MeshGraph, things: list[Thing], planes: list[FittedPlane]) -> list[Thing]:

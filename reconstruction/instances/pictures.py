@@ -3,7 +3,7 @@
 A picture is 1 to 3 cm thick, which is within the noise of the depth; its color is what tells it from the wall.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,7 +11,9 @@ from scipy import ndimage
 
 from reconstruction.instances.base_planes import FittedPlane, plane_axes
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph
+from reconstruction.instances.mesh_graph import MeshGraph, lab_from_rgb
+from reconstruction.types import DepthMaps, PosedFrames
+from registry.geometry import invert_rigid
 
 _DEPTH_M = 0.06  # how far in front of the wall a picture may reach
 
@@ -23,10 +25,17 @@ class _WallTexture:
     cells: np.ndarray  # int64 (n, 2) row, column of each vertex used
     used: np.ndarray  # int64 (n,) vertices
     cell_m: float
+    low: np.ndarray  # float64 (2,) of the first cells
 
 
 def find_pictures(
-    graph: MeshGraph, wall: FittedPlane, taken: np.ndarray, rest: np.ndarray, config: InstancesConfig
+    graph: MeshGraph,
+    wall: FittedPlane,
+    taken: np.ndarray,
+    rest: np.ndarray,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: InstancesConfig,
 ) -> list[np.ndarray]:
     """Return the vertex sets of flat things on a wall, the largest first.
 
@@ -35,9 +44,11 @@ def find_pictures(
         wall: the wall that is searched.
         taken: bool (v,) vertices of other base planes.
         rest: bool (v,) vertices that belong to no base plane.
+        posed: keyframes in world space, whose colors are projected onto the wall.
+        depth: their depth, which tells where they see the wall.
         config: thresholds.
     """
-    texture = _wall_texture(graph, wall, taken)
+    texture = _wall_texture(graph, wall, taken, posed, depth)
     if texture is None:
         return []
     contrast = _contrast(texture)
@@ -57,38 +68,66 @@ def find_pictures(
     return sorted((v for v in found if len(v) >= config.min_object_vertices), key=lambda v: (-len(v), v[0]))
 
 
-def _wall_texture(graph: MeshGraph, wall: FittedPlane, taken: np.ndarray) -> _WallTexture | None:
+def _wall_texture(
+    graph: MeshGraph, wall: FittedPlane, taken: np.ndarray, posed: PosedFrames, depth: DepthMaps
+) -> _WallTexture | None:
+    """Project the keyframes onto the wall: sharper than vertex colors, which are sparse where a wall is flat."""
     distance = wall.distance(graph.points)
     near = wall.members | (
         ~taken & (distance < _DEPTH_M) & (distance > -0.03) & (graph.normals @ wall.plane[:3] > 0.5)
     )
     used = np.flatnonzero(near)
-    if len(used) < 200:
+    if len(used) < 100:
         return None
     axis_u, axis_v = plane_axes(wall.plane)
     uv = np.column_stack([graph.points[used] @ axis_v, graph.points[used] @ axis_u])
-    cell = max(0.01, 1.05 * graph.spacing_m)
-    cells = np.floor((uv - uv.min(axis=0)) / cell).astype(np.int64) + 2
-    shape = cells.max(axis=0) + 3
-    if shape.prod() > 4_000_000:
-        return None
-    flat = cells[:, 0] * shape[1] + cells[:, 1]
-    count = np.bincount(flat, minlength=shape.prod()).reshape(shape)
-    total = np.stack(
-        [np.bincount(flat, graph.lab[used, c], shape.prod()).reshape(shape) for c in range(3)], axis=-1
-    )
-    # Cells between vertices take the color of their neighbors.
-    kernel = np.ones((3, 3))
-    wide = ndimage.convolve(count.astype(float), kernel, mode="constant")
-    spread = np.stack([ndimage.convolve(total[..., c], kernel, mode="constant") for c in range(3)], axis=-1)
-    seen = wide >= 2
-    lab = np.where(seen[..., None], spread / np.maximum(wide, 1)[..., None], 0).astype(np.float32)
-    return _WallTexture(lab, seen, cells, used, cell)
+    low = np.percentile(uv, 0.1, axis=0)
+    size = np.percentile(uv, 99.9, axis=0) - low
+    cell = max(0.01, float(np.sqrt(size.prod() / 400_000)))
+    cells = np.floor((uv - low) / cell).astype(np.int64) + 2
+    shape = tuple((np.ceil(size / cell) + 5).astype(int))
+    cells = np.clip(cells, 0, np.array(shape) - 1)
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    corner = (low[0] - 1.5 * cell) * axis_v + (low[1] - 1.5 * cell) * axis_u - wall.plane[3] * wall.plane[:3]
+    points = corner + cell * (row[..., None] * axis_v + column[..., None] * axis_u)
+    total = np.zeros((*shape, 3), np.float32)
+    count = np.zeros(shape, np.float32)
+    step = max(1, len(posed.images) // 30)
+    for i in range(0, len(posed.images), step):
+        _add_view(total, count, points.reshape(-1, 3), i, posed, depth)
+    seen = count >= 1
+    lab = lab_from_rgb(np.clip(total / np.maximum(count, 1)[..., None], 0, 255))
+    return _WallTexture(lab, seen, cells, used, cell, low)
+
+
+def _add_view(
+    total: np.ndarray, count: np.ndarray, points: np.ndarray, i: int, posed: PosedFrames, depth: DepthMaps
+) -> None:
+    """Add the colors that frame `i` saw at wall points (n, 3), where its depth says that it saw the wall."""
+    camera_from_world = invert_rigid(np.asarray(posed.world_from_camera[i]))
+    local = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    z = np.maximum(local[:, 2], 1e-6)
+    ratio = posed.camera.width / depth.camera.width
+    camera = posed.camera
+    u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
+    inside = (local[:, 2] > 0.2) & (u > 2) & (v > 2) & (u < camera.width - 2) & (v < camera.height - 2)
+    column = np.clip((u / ratio).astype(np.int32), 0, depth.camera.width - 1)
+    row = np.clip((v / ratio).astype(np.int32), 0, depth.camera.height - 1)
+    measured = np.asarray(depth.depth[i])[row, column]
+    visible = inside & (measured > 0) & (np.abs(measured - z) < np.maximum(0.04 * z, 0.08))
+    image = np.asarray(posed.images[i])
+    colors = image[v[visible].astype(np.int32), u[visible].astype(np.int32)]
+    total.reshape(-1, 3)[visible] += colors
+    count.reshape(-1)[visible] += 1
 
 
 def _contrast(texture: _WallTexture) -> np.ndarray:
     """Return the color distance to the wall around, whose light changes slowly, without what stands out."""
-    plain = texture.seen.copy()
+    weight = cv2.GaussianBlur(texture.seen.astype(np.float32), (0, 0), 1.0)[..., None]
+    lab = cv2.GaussianBlur(texture.lab * texture.seen[..., None].astype(np.float32), (0, 0), 1.0) / (
+        weight + 1e-6
+    )
+    texture = replace(texture, lab=lab)
     sigma = 0.35 / texture.cell_m
     wall_color = np.median(texture.lab[texture.seen], axis=0)
     contrast = np.linalg.norm((texture.lab - wall_color) * [0.6, 1, 1], axis=-1)
@@ -105,13 +144,11 @@ def _contrast(texture: _WallTexture) -> np.ndarray:
 def _hidden_by_furniture(graph, wall: FittedPlane, rest: np.ndarray, texture: _WallTexture) -> np.ndarray:
     """Mark cells right behind furniture, whose shadows on the wall are not pictures."""
     axis_u, axis_v = plane_axes(wall.plane)
-    origin_points = graph.points[texture.used]
-    low = np.array([(origin_points @ axis_v).min(), (origin_points @ axis_u).min()])
     distance = wall.distance(graph.points)
     close = np.flatnonzero(rest & (distance > _DEPTH_M) & (distance < 0.5))
     grid = np.zeros(texture.seen.shape, bool)
     uv = np.column_stack([graph.points[close] @ axis_v, graph.points[close] @ axis_u])
-    cells = np.floor((uv - low) / texture.cell_m).astype(np.int64) + 2
+    cells = np.floor((uv - texture.low) / texture.cell_m).astype(np.int64) + 2
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
     grid[cells[inside, 0], cells[inside, 1]] = True
     return ndimage.binary_dilation(grid, iterations=max(1, round(0.05 / texture.cell_m)))
@@ -128,6 +165,8 @@ def _picture_region(
     (_, (height, width), _) = cv2.minAreaRect(cells)
     height, width = height + 1, width + 1
     if min(height, width) * texture.cell_m < config.min_picture_m:
+        return None
+    if max(height, width) * texture.cell_m < 1.5 * config.min_picture_m:
         return None
     hull = cv2.convexHull(cells.astype(np.int32))
     rectangular = (cv2.contourArea(hull) + 0.5 * cv2.arcLength(hull, True) + 1) / (height * width)

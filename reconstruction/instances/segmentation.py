@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.mesh_graph import MeshGraph, pieces
 from reconstruction.instances.splitting import split_touching
-from reconstruction.instances.supports import contact_height, find_supports, stands_on
+from reconstruction.instances.supports import SupportRegion, candidates_on, find_supports
 
 _MAX_DEPTH = 4
 
@@ -46,18 +46,10 @@ def _decompose(
     for support in find_supports(graph, body, config):
         if not np.isin(support.vertices, remaining, assume_unique=True).mean() > 0.5:
             continue  # it lies on something that was taken off already, whose own turn comes
-        level = support.height_m + contact_height(support, config)
-        above = remaining[graph.points[remaining, 2] > level]
-        above = np.setdiff1d(above, support.vertices, assume_unique=True)
-        for candidate in pieces(graph, above):
-            if len(candidate) < config.min_object_vertices:
-                break_area = graph.areas[candidate].sum()
-                if break_area < 1e-4:
-                    break
-                continue
-            if stands_on(graph, remaining, support, candidate, config):
-                carried.append(candidate)
-                remaining = np.setdiff1d(remaining, candidate, assume_unique=True)
+        for candidate in candidates_on(graph, remaining, support, config):
+            candidate = _flood_same_color(graph, candidate, remaining, support)
+            carried.append(candidate)
+            remaining = np.setdiff1d(remaining, candidate, assume_unique=True)
     own.vertices = remaining
     out: list[Thing] = []
     parts = split_touching(graph, remaining, config) if depth > 0 or not carried else [remaining]
@@ -69,6 +61,35 @@ def _decompose(
         parent = _nearest_below(graph, candidate, carriers)
         out.extend(_decompose(graph, candidate, parent, depth + 1, config))
     return out
+
+
+def _flood_same_color(
+    graph: MeshGraph, candidate: np.ndarray, remaining: np.ndarray, support: SupportRegion
+) -> np.ndarray:
+    """Add the low rim of a thing that lies within the contact height (a plate's, say): its color, not the support's."""
+    ground = np.linalg.norm(graph.lab - support.lab, axis=1)
+    open_ = np.zeros(len(graph.points), bool)
+    open_[remaining] = True
+    open_ &= (ground > 12.0) & (np.abs(graph.points[:, 2] - support.height_m) < 0.03)
+    inside = np.zeros(len(graph.points), bool)
+    inside[candidate] = True
+    open_ &= ~inside
+    edges = np.concatenate([graph.edges, graph.edges[:, ::-1]])
+    edges = edges[open_[edges[:, 1]] & (inside[edges[:, 0]] | open_[edges[:, 0]])]
+    step = np.linalg.norm(graph.lab[edges[:, 0]] - graph.lab[edges[:, 1]], axis=1)
+    edges = edges[step < np.maximum(4.0, 0.5 * ground[edges[:, 1]])]
+    grown = inside.copy()
+    for _ in range(12):
+        reached = edges[grown[edges[:, 0]] & ~grown[edges[:, 1]], 1]
+        if len(reached) == 0:
+            break
+        grown[reached] = True
+    added = grown & ~inside
+    low, high = graph.points[candidate, :2].min(0), graph.points[candidate, :2].max(0)
+    limit = 0.6 * float(np.prod(high - low)) + 1e-3
+    if graph.areas[added].sum() > limit:
+        return candidate  # a pattern of the support, not a rim
+    return np.flatnonzero(grown)
 
 
 def _carrier(graph: MeshGraph, part: np.ndarray, main: Thing, rests_on: Thing | None) -> Thing | None:
@@ -106,6 +127,7 @@ def _join_parts(graph: MeshGraph, found: list[np.ndarray], config: InstancesConf
                     break
             if changed:
                 break
+    bodies = _carry_floating(graph, bodies)
     if not bodies or not crumbs:
         return bodies
     owner = np.concatenate([np.full(len(body), i) for i, body in enumerate(bodies)])
@@ -116,6 +138,30 @@ def _join_parts(graph: MeshGraph, found: list[np.ndarray], config: InstancesConf
         if distance.min() < 0.04:
             extra.setdefault(int(owner[index[np.argmin(distance)]]), []).append(crumb)
     return [np.sort(np.concatenate([body, *extra.get(i, [])])) for i, body in enumerate(bodies)]
+
+
+def _carry_floating(graph: MeshGraph, bodies: list[np.ndarray]) -> list[np.ndarray]:
+    """Join large things in mid-air to what must carry them: the pieces under them that reach up highest."""
+    bodies = list(bodies)
+    for i in sorted(range(len(bodies)), key=lambda k: -graph.areas[bodies[k]].sum()):
+        if len(bodies[i]) == 0:
+            continue
+        upper = graph.points[bodies[i]]
+        low, high = np.percentile(upper, [2, 98], axis=0)
+        flat = np.sort(high[:2] - low[:2])[0] > 0.25
+        if low[2] < 0.1 or not flat or graph.normals[bodies[i], 2].mean() < 0.2:
+            continue
+        for j, lower in enumerate(bodies):
+            if j == i or len(lower) == 0:
+                continue
+            points = graph.points[lower]
+            under = ((points[:, :2] > low[:2] - 0.03) & (points[:, :2] < high[:2] + 0.03)).all(
+                axis=1
+            ).mean() > 0.8
+            if under and low[2] > points[:, 2].max() - 0.05 and points[:, 2].max() > 0.4 * low[2]:
+                bodies[i] = np.sort(np.concatenate([bodies[i], lower]))
+                bodies[j] = lower[:0]
+    return [body for body in bodies if len(body)]
 
 
 def _is_leg_of(graph: MeshGraph, lower: np.ndarray, upper: np.ndarray) -> bool:
@@ -135,7 +181,7 @@ def _is_leg_of(graph: MeshGraph, lower: np.ndarray, upper: np.ndarray) -> bool:
         return False
     slim = bool(np.sort(np.ptp(low, axis=0))[0] < 0.12 and np.ptp(low[:, 2]) > 0.05)
     gap = top - top_of_lower
-    return gap < 0.15 * top or (slim and gap < 0.7 * top)
+    return gap < 0.15 * top or (slim and gap < 0.85 * top)
 
 
 def _absorb_fragments(graph: MeshGraph, things: list[Thing], config: InstancesConfig) -> list[Thing]:

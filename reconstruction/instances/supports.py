@@ -69,9 +69,9 @@ def find_supports(graph: MeshGraph, chosen: np.ndarray, config: InstancesConfig)
     flat = chosen[graph.normals[chosen, 2] > 0.85]
     levels: list[np.ndarray] = []
     for piece in pieces(graph, flat):
-        if graph.areas[piece].sum() >= 0.25 * config.min_support_area_m2:
+        if graph.areas[piece].sum() >= 0.1 * config.min_support_area_m2:
             levels.extend(_split_by_height(graph, piece))
-    levels = [piece for piece in levels if graph.areas[piece].sum() >= 0.25 * config.min_support_area_m2]
+    levels = [piece for piece in levels if graph.areas[piece].sum() >= 0.1 * config.min_support_area_m2]
     merged = _merge_levels(graph, levels)
     regions = []
     for piece in merged:
@@ -128,7 +128,8 @@ def _merge_levels(graph: MeshGraph, levels: list[np.ndarray]) -> list[np.ndarray
         for j in range(i + 1, len(levels)):
             apart = np.maximum(boxes[i][0] - boxes[j][1], boxes[j][0] - boxes[i][1]).max()
             alike = np.abs(np.median(graph.lab[levels[i]], 0) - np.median(graph.lab[levels[j]], 0)).max() < 25
-            if abs(boxes[i][2] - boxes[j][2]) < 0.012 and apart < 0.06 and alike:
+            rise = abs(boxes[i][2] - boxes[j][2])
+            if alike and ((rise < 0.012 and apart < 0.06) or (rise < 0.008 and apart < 0.25)):
                 parent[max(root(i), root(j))] = min(root(i), root(j))
     groups: dict[int, list[np.ndarray]] = {}
     for i, piece in enumerate(levels):
@@ -136,11 +137,67 @@ def _merge_levels(graph: MeshGraph, levels: list[np.ndarray]) -> list[np.ndarray
     return [np.sort(np.concatenate(group)) for group in groups.values()]
 
 
+def candidates_on(
+    graph: MeshGraph, body: np.ndarray, support: SupportRegion, config: InstancesConfig
+) -> list[np.ndarray]:
+    """Return the separate things that stand on a support plane of `body`, each cut off at the contact.
+
+    Noise of the support and the feet of neighbors join things just above the plane, so pieces that are refused at one
+    level are looked at again a little higher; what is found there gets back the foot that lies right below it.
+    """
+    out: list[np.ndarray] = []
+    base = contact_height(support, config)
+    above = body[graph.points[body, 2] > support.height_m + base]
+    above = np.setdiff1d(above, support.vertices, assume_unique=True)
+    pool = [above]
+    for level in (base, 1.8 * base, 3.0 * base, 4.5 * base):
+        refused = []
+        for part in pool:
+            high = part[graph.points[part, 2] > support.height_m + level]
+            for candidate in pieces(graph, high):
+                if len(candidate) < config.min_object_vertices:
+                    continue
+                if stands_on(graph, body, support, candidate, level, config):
+                    out.append(
+                        _with_foot(graph, candidate, above, level + support.height_m)
+                        if level > base
+                        else candidate
+                    )
+                else:
+                    refused.append(candidate)
+        pool = refused
+    return _disjoint(out)
+
+
+def _with_foot(graph: MeshGraph, candidate: np.ndarray, above: np.ndarray, level: float) -> np.ndarray:
+    """Add what lies below the level at which a candidate came free, right under it."""
+    low = above[graph.points[above, 2] <= level]
+    foot = candidate[graph.points[candidate, 2] < level + 0.015]
+    if len(low) == 0 or len(foot) == 0:
+        return candidate
+    distance, _ = cKDTree(graph.points[foot, :2]).query(graph.points[low, :2])
+    return np.union1d(candidate, low[distance < max(0.01, 1.2 * graph.spacing_m)])
+
+
+def _disjoint(parts: list[np.ndarray]) -> list[np.ndarray]:
+    out: list[np.ndarray] = []
+    for part in parts:
+        for other in out:
+            part = np.setdiff1d(part, other, assume_unique=True)
+        out.append(part)
+    return out
+
+
 def stands_on(
-    graph: MeshGraph, body: np.ndarray, support: SupportRegion, candidate: np.ndarray, config: InstancesConfig
+    graph: MeshGraph,
+    body: np.ndarray,
+    support: SupportRegion,
+    candidate: np.ndarray,
+    level_m: float,
+    config: InstancesConfig,
 ) -> bool:
     """Decide whether `candidate`, a piece of `body` above a support plane, is a separate thing standing on it."""
-    level = support.height_m + contact_height(support, config)
+    level = support.height_m + level_m
     points = graph.points[candidate]
     step = max(0.012, 1.5 * graph.spacing_m)
     foot = points[points[:, 2] < max(level, points[:, 2].min()) + step]
