@@ -1,0 +1,97 @@
+"""`simrecon doctor` finds what is there, and says what is missing when it is taken away."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from reconstruction import doctor
+from reconstruction.doctor import Check, format_checks, run_checks
+
+
+@pytest.fixture(scope="module")
+def checks() -> dict[str, Check]:
+    """Return the checks of this machine by name."""
+    return {check.name: check for check in run_checks()}
+
+
+def test_required_checks_pass_where_the_tests_run(checks: dict[str, Check]) -> None:
+    broken = [check for check in checks.values() if check.required and not check.ok]
+    assert broken == []
+
+
+def test_physics_and_decoding_were_really_tried(checks: dict[str, Check]) -> None:
+    assert "lies still" in checks["physics"].detail
+    assert "h264" in checks["video decoding"].detail
+    assert "10 frames" in checks["video decoding"].detail
+
+
+def test_every_check_that_fails_says_what_to_do(checks: dict[str, Check]) -> None:
+    assert all(check.fix for check in checks.values() if not check.ok)
+    assert all(check.detail for check in checks.values())
+
+
+def test_checks_are_json(checks: dict[str, Check]) -> None:
+    text = json.dumps([asdict(check) for check in checks.values()])
+    assert {"name", "ok", "detail", "fix", "required"} == set(json.loads(text)[0])
+
+
+def test_rendering_is_absent_without_a_vulkan_driver(tmp_path: Path) -> None:
+    hidden = dict.fromkeys(("VK_ICD_FILENAMES", "VK_DRIVER_FILES"), str(tmp_path / "none.json"))
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", doctor._RENDER_CODE],
+        env={**os.environ, **hidden},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert run.returncode != 0
+    assert "render" in run.stderr
+
+
+def test_unwritable_registry_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("a file where a folder should be")
+    monkeypatch.setenv("SIMRECON_HOME", str(blocked))
+    check = doctor._registry()
+    assert not check.ok
+    assert check.required
+    assert str(blocked) in check.fix
+
+
+def test_damaged_index_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "registry").mkdir()
+    (tmp_path / "registry" / "index.sqlite").write_bytes(b"not a database at all" * 100)
+    monkeypatch.setenv("SIMRECON_HOME", str(tmp_path))
+    check = doctor._registry()
+    assert not check.ok
+    assert "damaged" in check.detail
+
+
+def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_TIME_LIMIT_S", 0.5)
+    check = doctor._finish("slow", doctor._start("import time; time.sleep(30)"), "wait", True)
+    assert not check.ok
+    assert "no answer" in check.detail
+
+
+def test_a_process_that_crashes_is_reported() -> None:
+    check = doctor._finish("crash", doctor._start("import os; os.kill(os.getpid(), 11)"), "repair", False)
+    assert not check.ok
+    assert "signal 11" in check.detail
+
+
+def test_versions_compare_as_numbers() -> None:
+    assert doctor._numbers("2.13.0+cpu") > doctor._numbers("2.3")
+    assert doctor._numbers("0.61") < doctor._numbers("0.100.1")
+
+
+def test_table_names_what_is_missing_and_what_to_do() -> None:
+    text = format_checks([Check("a", True, "fine", "", True), Check("bb", False, "gone", "get it", True)])
+    assert "MISSING  bb  gone" in text
+    assert "-> get it" in text
+    assert "cannot work here yet: bb" in text
