@@ -1,6 +1,6 @@
 """Bodies in, a bare PhysX scene and the report card of CONTRACT section 4 out. No rendering, no ManiSkill.
 
-Used by assembly, by `simrecon verify --physics` and by tests, so that all of them measure the same thing. SAPIEN is
+Used by assembly, by `simrecon verify --physics` and by tests, so that all measure the same thing. SAPIEN is
 imported inside functions: listing a registry must not pay for it. Nothing here needs a Vulkan driver.
 """
 
@@ -16,7 +16,7 @@ from registry.geometry import matrix_from_quat, quat_from_matrix, rigid
 TIMESTEP_S = 1 / 240
 VERIFY_DURATION_S = 10.0
 BASE_FRICTION, BASE_RESTITUTION = 0.5, 0.0  # of floors and walls; PhysX averages them with the object's own
-# PhysX cooks at most 255 vertices per convex; a flat point set cannot be cooked at all and is thickened to this.
+# PhysX cooks at most 255 vertices per convex; flat point sets cannot be cooked and are thickened to this.
 _MAX_PART_VERTICES = 255
 _MIN_PART_THICKNESS_M = 1e-3
 _FLOAT_WINDOW_S, _FLOAT_DROP_M = 0.5, 0.005
@@ -63,7 +63,7 @@ class Physics:
         self._sleep_threshold = sleep_threshold
         previous = physx.get_scene_config()
         config = physx.PhysxSceneConfig()
-        # Results must not depend on what else lies in the scene, nor on a configuration that others left behind.
+        # Results must not depend on what else lies in the scene, nor on what others configured.
         config.enable_enhanced_determinism = True
         physx.set_scene_config(config)
         try:
@@ -231,7 +231,7 @@ def physics_report(
 ) -> dict[str, Any]:
     """Measure the report card of CONTRACT section 4: all dynamic objects together, undamped, never asleep.
 
-    Rates are shares of the dynamic objects (1.0 where there is none; `dynamic_objects` says so). Values are JSON.
+    Rates are shares of the dynamic objects (1.0 where there is none; `dynamic_objects` says so). JSON.
     """
     specs = list(specs)
     names = {spec.id: spec.name for spec in specs}
@@ -296,7 +296,7 @@ def specs_from_bundle(bundle: Any) -> list[BodySpec]:
     for base in scene["base"]:
         if not base.get("collision"):
             raise BundleError(
-                f"{where}: base {base['id']} ({base['label']}) has no collision slab, so nothing can stand on it; "
+                f"{where}: base {base['id']} ({base['label']}) has no collision slab to stand on; "
                 "run `simrecon reconstruct` again to write one"
             )
         parts = tuple(read_obj_points(bundle.resolve(path)) for path in base["collision"])
@@ -422,7 +422,7 @@ def _set_inertial(sapien: Any, body: Any, spec: BodySpec) -> None:
         if np.linalg.det(axes) < 0:
             axes[:, 0] *= -1
         pose = _pose(sapien, rigid(axes, spec.center_of_mass))
-    # A tensor that no real body can have (from a noisy mesh) makes PhysX explode: keep it within a thin rod's.
+    # A tensor that no real body can have (from a noisy mesh) makes PhysX explode: keep it like a rod's.
     inertia = np.maximum(inertia, max(1e-3 * float(np.max(inertia)), 1e-9))
     body.mass = spec.mass_kg
     body.cmass_local_pose = pose

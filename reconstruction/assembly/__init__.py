@@ -1,8 +1,8 @@
 """Stage 9: assets and graph -> a scene at rest in SAPIEN, with its physics report card.
 
-Base static; breadth first from it each object is placed clear of everything, let go, and held where it settles; then
-all of them are let go together, settled and measured as CONTRACT section 4 says. Whatever does not stand is repaired in
-bounded ways, and what was done is written into `PlacedObject.repair`.
+Base static; breadth first from it each object is placed clear of everything, let go, and held where it
+settles; then all of them are let go together, settled and measured as CONTRACT section 4 says. Whatever does
+not stand is repaired in bounded ways, and what was done is written into `PlacedObject.repair`.
 """
 
 from dataclasses import replace
@@ -116,13 +116,14 @@ def _joint_settle(placer: Placer, base: list[BodySpec], limit_s: float) -> None:
     for i in moving:
         pose = physics.pose(i)
         moved, turned = pose_change(placer.placed[i].pose, pose)
-        # What flies off in this phase is left where it was placed: the report will say that it does not stand.
+        # What flies off in this phase is left where it was placed: the report will say that it does not
+        # stand.
         if np.isfinite(pose).all() and moved < 0.05 and turned < 15:
             placer.commit(replace(placer.placed[i], pose=pose))
 
 
 def _repair_movers(placer: Placer, report: dict) -> None:
-    """Give what moved a flatter foot, lowest first; what stands on a mover is given a chance without repair."""
+    """Give what moved a flatter foot; what stands on a mover is given a chance without repair."""
     moved = {entry["id"] for entry in report["objects"] if not entry["stable"] or entry["floating"]}
     for i in [i for i, p in placer.placed.items() if i in moved and p.edge.parent not in moved]:
         placer.again(i)

@@ -1,4 +1,4 @@
-"""Edits of collision shapes: cut by a plane, give a flat foot. Reconstructed undersides are bumpy; real ones are not."""
+"""Edits of collision shapes: cut by a plane, give a flat foot (reconstructed undersides are bumpy)."""
 
 import numpy as np
 from scipy.spatial import QhullError
@@ -33,15 +33,15 @@ def cut(parts: tuple[ConvexPart, ...], normal: np.ndarray, offset: float) -> tup
 
 
 def flatten_foot(parts: tuple[ConvexPart, ...], up: np.ndarray, band_m: float) -> tuple[ConvexPart, ...]:
-    """Give the shape a level foot: bumps within half a band of its lowest point go, the next band is filled in.
+    """Give the shape a level foot: bumps in the lowest half band go, the band above is filled in.
 
     Args:
         parts: convex pieces, object space.
         up: (3,) unit, the world's up in object space at the pose that the shape shall stand in.
         band_m: how uneven the underside is taken to be.
 
-    Cutting and filling meet in the middle, so that the shape sinks by at most half a band and its foot keeps its
-    outline. A sphere of radius r gets a flat patch of radius sqrt(2 r band).
+    Cutting and filling meet in the middle, so that the shape sinks by at most half a band and its foot keeps
+    its outline. A sphere of radius r gets a flat patch of radius sqrt(2 r band).
     """
     heights = [np.asarray(part.vertices, np.float64) @ up for part in parts]
     level = min(h.min() for h in heights) + 0.5 * band_m

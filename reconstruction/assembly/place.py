@@ -1,4 +1,4 @@
-"""Place one object: furniture on the floor, hanging things against their wall, everything else by letting it settle."""
+"""Place one object: furniture on the floor, hanging things at their wall, the rest by letting it settle."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -120,12 +120,10 @@ class Placer:
             start[:3, 3] += parent.pose[:3, 3] - parent.asset.world_from_object[:3, 3]
         on_base = edge.parent in self.base
         children = [self._samples[i] for i in sorted(self._carried.get(asset.id, []))]
-        parts, depth = level_tops(
-            asset.collision, self._samples[asset.id], asset.world_from_object, children
-        )
+        parts, depth = level_tops(asset.collision, self._samples[asset.id], asset.world_from_object, children)
         fresh = Placement(asset, edge, start, parts, parts, True, 0.0, (), True)
         if depth > 0:
-            fresh = fresh.noted(f"its collision shape was cut by up to {depth * 1000:.0f} mm to its visible top")
+            fresh = fresh.noted(f"collision shape cut by up to {depth * 1000:.0f} mm to its visible top")
         if edge.relation == "attached_to":
             placement = self._hang(fresh)
         elif on_base and is_furniture(asset, on_base, self.config):
@@ -248,8 +246,7 @@ class Placer:
                 yield moved.noted(f"shifted {radius * 1000:.0f} mm to where it stands")
 
     def _settle_flattened(self, item: Placement, band_mm: float) -> Placement:
-        cost, placement = self._try(_flattened(item, band_mm))
-        return placement
+        return self._try(_flattened(item, band_mm))[1]
 
     def _try(self, item: Placement) -> tuple[float, Placement]:
         """Clear, let go and judge: cost below 1 is good, below 10 acceptable."""
@@ -321,8 +318,8 @@ def _why(end: Settled, clear: bool) -> str:
     if not end.at_rest:
         return "does not stand: it does not come to rest"
     return (
-        f"does not stand: let go it turns by {end.turned_deg:.0f} degrees, slides {end.lateral_m * 100:.1f} cm "
-        f"and drops {end.drop_m * 100:.1f} cm"
+        f"does not stand: let go it turns by {end.turned_deg:.0f} degrees, "
+        f"slides {end.lateral_m * 100:.1f} cm and drops {end.drop_m * 100:.1f} cm"
     )
 
 

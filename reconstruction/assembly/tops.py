@@ -1,7 +1,8 @@
 """Bring the collision shape of what carries things down to its visible surface.
 
-Convex pieces span the bumps, the raised edge and the tilt of a reconstructed table top, so that things would float
-above it by as much. Under each child the pieces that stick out are cut off at the plane of the visible surface.
+Convex pieces span the bumps, the raised edge and the tilt of a reconstructed table top, so that things would
+float above it by as much. Under each child the pieces that stick out are cut off at the plane of the visible
+surface.
 """
 
 import numpy as np
@@ -59,7 +60,7 @@ def level_tops(
 
 
 def _surface_under(child: SampledObject, surface: SampledObject, tree: cKDTree) -> np.ndarray:
-    """Return the visible surface point (n, 3) under each cell of a child's underside, the highest within reach."""
+    """Return the highest visible point within reach under each cell of a child's underside, (n, 3)."""
     radius = max(1.2 * surface.spacing_m, 0.008)
     out = []
     for cell, near in zip(child.underside, tree.query_ball_point(child.underside[:, :2], radius)):
@@ -71,7 +72,7 @@ def _surface_under(child: SampledObject, surface: SampledObject, tree: cKDTree) 
 
 
 def _overshoot(vertices: np.ndarray, under: np.ndarray) -> float:
-    """Return by how much (median, m) a convex piece rises above the points that it covers; 0 where it covers none."""
+    """Return by how much (median, m) a piece rises above the points that it covers; 0: covers none."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if np.any(low[:2] > under[:, :2].max(axis=0)) or np.any(high[:2] < under[:, :2].min(axis=0)):
         return 0.0
@@ -92,7 +93,7 @@ def _overshoot(vertices: np.ndarray, under: np.ndarray) -> float:
 
 
 def _visible_plane(vertices: np.ndarray, up: np.ndarray, level: float) -> tuple[np.ndarray, float] | None:
-    """Fit the visible surface above a piece near a height: (normal (3,), offset), or None if it is no plane."""
+    """Fit the visible surface near a height: (normal (3,), offset), or None if it is no plane."""
     low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
     covered = up[np.all((up[:, :2] >= low) & (up[:, :2] <= high), axis=1)]
     near = covered[np.abs(covered[:, 2] - level) < _MAX_CUT_M]

@@ -1,4 +1,4 @@
-"""The scene while it is built: what is placed stands still, one object at a time is probed, moved and let go."""
+"""The scene while it is built: what is placed stands still, one object at a time is let go."""
 
 from dataclasses import dataclass
 
@@ -128,8 +128,8 @@ def make_clear(
 ) -> tuple[np.ndarray, bool]:
     """Move an object by as little as possible until nothing is inside it: (pose, whether that worked).
 
-    First along the contact normals, which is the shortest way out; where that runs in circles, over a bounded lattice
-    of lifts and sideways shifts, cheapest first.
+    First along the contact normals, which is the shortest way out; where that runs in circles, over a bounded
+    lattice of lifts and sideways shifts, cheapest first.
     """
     out = pose.copy()
     for _ in range(12):
@@ -161,7 +161,7 @@ def make_clear(
 
 
 def _lattice(max_lift_m: float, max_shift_m: float) -> list[np.ndarray]:
-    """Return shifts (3,) within the bounds, cheapest first; lifting costs half, because settling undoes it."""
+    """Return shifts (3,) within the bounds, cheapest first; lifting costs half, settling undoes it."""
     lifts = np.unique(np.clip([0, 0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.045, 0.06], 0, max_lift_m))
     rings = [r for r in (0.0, 0.004, 0.008, 0.015, 0.03) if r <= max_shift_m]
     shifts = []

@@ -1,7 +1,7 @@
-"""Stage 8: assets -> scene graph. Every object gets exactly one parent; the graph is rooted in floor and walls.
+"""Stage 8: assets -> scene graph. Every object gets exactly one parent; floor and walls are the roots.
 
-Regions by clustering, relations per region from a backend (geometry by default), merged into one graph with conflict
-resolution, as the paper's Scene Graph Synthesizer does.
+Regions by clustering, relations per region from a backend (geometry by default), merged into one graph with
+conflict resolution, as the paper's Scene Graph Synthesizer does.
 """
 
 from dataclasses import dataclass, field
@@ -55,7 +55,7 @@ def infer_scene_graph(
     base_ids = [b.id for b in assets.base]
     if not any(b.label == "floor" for b in assets.base):
         raise InputError(
-            f"scene graph: none of the {len(base_ids)} base surfaces is a floor, so nothing can stand on anything; "
+            f"scene graph: none of the {len(base_ids)} base surfaces is a floor, so nothing can stand; "
             "the instance stage must find or assume one"
         )
     backend = backend or GeometryRelations(assets, config.relations)

@@ -1,4 +1,4 @@
-"""Merge the regions' graphs into one (the paper, section 3.3): add, drop as redundant, or settle a conflict."""
+"""Merge the regions' graphs into one (the paper, section 3.3): add, drop the implied, settle conflicts."""
 
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -8,7 +8,7 @@ from reconstruction.types import Edge
 
 
 class GraphMerge:
-    """The global graph while it grows: one parent edge per known object, rooted in the base, never a cycle."""
+    """The global graph while it grows: one parent per object, rooted in the base, never a cycle."""
 
     def __init__(self, base_ids: Iterable[int], backend: RelationBackend | None) -> None:
         """Start from the base; without a backend a conflict keeps what came first (the `naive` baseline)."""
@@ -61,14 +61,19 @@ class GraphMerge:
         return False
 
     def _path(self, edge: Edge) -> set[int]:
-        """Return the objects between child and parent in the graph, through their nearest common ancestor."""
+        """Return the objects between child and parent in the graph, and what each of them rests on.
+
+        Without their carriers in view, the answer could only be worse than what is known.
+        """
         up = [edge.child, *self.ancestors(edge.child)]
         down = [edge.parent, *self.ancestors(edge.parent)]
         common = next((node for node in up if node in down), None)
-        nodes = (
-            up[: up.index(common) + 1] + down[: down.index(common) + 1] if common is not None else up + down
-        )
-        return {node for node in nodes if node not in self.base_ids}
+        if common is None:
+            nodes = {*up, *down}
+        else:
+            nodes = {*up[: up.index(common) + 1], *down[: down.index(common) + 1]}
+        nodes |= {self.parent_edge[node].parent for node in nodes if node in self.parent_edge}
+        return nodes - self.base_ids
 
     def _replace(self, edge: Edge) -> None:
         """Put a settled edge in place of the old one unless that would close a cycle."""

@@ -11,8 +11,8 @@ from reconstruction.types import ObjectAsset
 def dbscan(points: np.ndarray, radius: float, min_points: int) -> np.ndarray:
     """Cluster points (n, d); return labels (n,) from 0 on, -1 for noise.
 
-    Border points go to the cluster of their nearest core point, so that labels do not depend on the order of points
-    except for their numbering.
+    Border points go to the cluster of their nearest core point, so that labels do not depend on the order of
+    points except for their numbering.
     """
     n = len(points)
     labels = np.full(n, -1)
@@ -42,10 +42,10 @@ def dbscan(points: np.ndarray, radius: float, min_points: int) -> np.ndarray:
 def find_regions(
     objects: Sequence[ObjectAsset], radius_m: float, min_points: int, view_margin_m: float
 ) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Return (members, visible) ids per region: visible are the members and whatever a view of them also shows.
+    """Return (members, visible) ids per region: visible is what a view of the members shows.
 
-    Regions partition the objects; views overlap, which is what lets the merge find and settle disagreements. The
-    result does not depend on the order of `objects`.
+    Regions partition the objects; views overlap, which is what lets the merge find and settle disagreements.
+    The result does not depend on the order of `objects`.
     """
     objects = sorted(objects, key=lambda o: o.id)
     if not objects:

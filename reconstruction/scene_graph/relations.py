@@ -1,9 +1,10 @@
 """Which thing rests on or hangs from which: the relation backend and its embedded, geometric default.
 
-For each cell of a child's underside, the carrier is the highest surface that faces up at or just beneath it. The parent
-is the thing that carries most of the underside, weighted by closeness, with the instance stage's hint as a prior. What
-nothing carries hangs on a wall or the ceiling if it lies flat against one. Reconstructed surfaces are off by a
-centimetre or so, hence the tolerances, and hence the vote on which of two overlapping things is the upper one.
+For each cell of a child's underside, the carrier is the highest surface that faces up at or just beneath it.
+The parent is the thing that carries most of the underside, weighted by closeness, with the instance stage's
+hint as a prior. What nothing carries hangs on a wall or the ceiling if it lies flat against one.
+Reconstructed surfaces are off by a centimetre or so, hence the tolerances, and hence the vote on which of two
+overlapping things is the upper one.
 """
 
 from collections.abc import Iterable
@@ -115,8 +116,9 @@ class GeometryRelations:
         if not gaps:
             return []
         table = np.stack(gaps)  # (candidates, cells), NaN where nothing is near
-        # The highest surface wins a cell: a plate between a bowl and a table carries the bowl. What itself rests on
-        # another candidate hides that one, even where noise has pushed the lower surface through the upper one.
+        # The highest surface wins a cell: a plate between a bowl and a table carries the bowl. What itself
+        # rests on another candidate hides that one, even where noise has pushed the lower surface through the
+        # upper one.
         filled = np.where(np.isnan(table), np.inf, table)
         for upper, carrier in enumerate(carriers):
             hidden = [
@@ -152,7 +154,7 @@ class GeometryRelations:
         return float(np.sum(_closeness(gap, self.config, False))) / len(gap) > 0.3
 
     def _gap(self, child: SampledObject, parent: SampledObject, deep: bool) -> np.ndarray:
-        """Return per cell of the child's underside its height above the parent's highest surface there; NaN: none."""
+        """Return the height of each underside cell above the parent's highest surface there; NaN: none."""
         key = (child.id, parent.id, deep)
         if key not in self._gaps:
             self._gaps[key] = self._measure_gap(child, parent, deep)
@@ -218,12 +220,15 @@ class GeometryRelations:
             if abs(near) > bound or far < -0.01 or not beside or not (thin or child.attached_hint):
                 continue
             score = 0.9 - 0.4 * abs(near) / bound
-            evidence = f"nothing below it; {near * 100:.1f} cm off {base.label} {base.id} and {thick * 100:.0f} cm thick"
+            evidence = (
+                f"nothing below it; {near * 100:.1f} cm off {base.label} {base.id} "
+                f"and {thick * 100:.0f} cm thick"
+            )
             out.append(_Candidate("attached_to", base.id, score, evidence))
         return sorted(out, key=lambda c: (-c.score, c.parent))
 
     def _floating(self, child: SampledObject, others: list[SampledObject]) -> list[_Candidate]:
-        """Rank what remains for a thing that nothing carries: the next surface below, a neighbor, the floor."""
+        """Rank what is left where nothing carries: the next surface below, a neighbor, the floor."""
         below = []
         for other in others:
             over = np.all(other.high[:2] > child.low[:2]) and np.all(other.low[:2] < child.high[:2])
@@ -271,7 +276,7 @@ def _gap_words(gap_m: float) -> str:
 
 
 def _without_cycles(ranked: dict[int, list[_Candidate]]) -> list[Edge]:
-    """Give each child its best parent; a cycle is broken at its weakest edge, which takes its next candidate."""
+    """Give each child its best parent; the weakest edge of a cycle takes its next candidate."""
     choice = dict.fromkeys(ranked, 0)
     while True:
         cycle = _find_cycle({i: ranked[i][choice[i]].parent for i in ranked})
@@ -285,7 +290,7 @@ def _without_cycles(ranked: dict[int, list[_Candidate]]) -> list[Edge]:
     for i in sorted(ranked):
         chosen = ranked[i][choice[i]]
         rest = max((c.score for n, c in enumerate(ranked[i]) if n != choice[i]), default=0.0)
-        confidence = chosen.score / (chosen.score + 0.5 * rest) * min(1.0, 0.4 + chosen.score)
+        confidence = chosen.score / (chosen.score + 0.5 * rest) * min(1.0, 0.1 + 1.2 * chosen.score)
         out.append(
             Edge(i, chosen.relation, chosen.parent, round(float(min(confidence, 0.99)), 3), chosen.evidence)
         )

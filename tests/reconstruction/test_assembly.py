@@ -1,0 +1,181 @@
+"""Assembly of analytic scenes: upright, inside, at rest, and nothing inside anything."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from boxes import ball_part, box, box_part, floor, room, thing, tilt, tray, wall
+
+from reconstruction.assembly import AssemblyConfig, assemble, base_slabs
+from reconstruction.assembly.base import convex_part
+from reconstruction.assembly.collision import cut, flatten_foot
+from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
+from reconstruction.types import AssembledScene, AssetSet, Edge, SceneGraph
+from registry.errors import SimReconError
+from registry.geometry import rigid, transform_points
+
+
+def build(assets: AssetSet, **options) -> tuple[AssembledScene, dict]:
+    graph = infer_scene_graph(assets, SceneGraphConfig())
+    scene = assemble(assets, graph, AssemblyConfig(**options))
+    return scene, {p.id: p for p in scene.placed}
+
+
+def assert_at_rest(scene: AssembledScene) -> None:
+    report = scene.physics_report
+    assert report["stable_rate"] == 1.0, report
+    assert report["floating_rate"] == 0.0
+    assert report["spawn_penetration_mm"] <= 1.0
+
+
+def test_stack_of_three_that_overlaps_and_floats():
+    assets = room(
+        box(10, (0.2, 0.2, 0.1), (0, 0, -0.008)),
+        box(11, (0.15, 0.15, 0.1), (0.01, 0, 0.085)),
+        box(12, (0.1, 0.1, 0.1), (0, 0.01, 0.205)),
+    )
+    scene, placed = build(assets)
+    assert_at_rest(scene)
+    for height, i in zip((0.0, 0.1, 0.2), (10, 11, 12)):
+        assert placed[i].world_from_object[2, 3] == pytest.approx(height, abs=1e-3)
+        assert placed[i].moved_m < 0.02
+        assert placed[i].dynamic
+        assert placed[i].stable
+
+
+def test_box_in_an_open_tray_ends_inside():
+    assets = room(
+        box(10, (1.0, 0.7, 0.4), (0, 0, 0), label="table"),
+        tray(11, (0, 0, 0.395)),
+        box(12, (0.07, 0.07, 0.12), (0.15, 0.1, 0.402)),  # overlaps a wall of the tray by 3 mm
+    )
+    scene, placed = build(assets)
+    assert_at_rest(scene)
+    assert not placed[10].dynamic
+    inside = np.linalg.inv(placed[11].world_from_object) @ placed[12].world_from_object
+    assert inside[2, 3] == pytest.approx(0.012, abs=2e-3)
+    assert abs(inside[0, 3]) < 0.2 - 0.012 - 0.03
+    assert {e.child: e.parent for e in scene.graph.edges}[12] == 11
+
+
+@pytest.mark.parametrize("offset", [-0.02, 0.03])
+def test_picture_touches_the_wall_without_being_inside(offset):
+    picture = box(10, (0.5, 0.02, 0.4), (0, 0.99 - offset, 1.2), label="picture")
+    scene, placed = build(room(picture))
+    assert placed[10].world_from_object[1, 3] == pytest.approx(0.99, abs=1e-3)
+    assert placed[10].world_from_object[2, 3] == pytest.approx(1.2, abs=1e-6)
+    assert not placed[10].dynamic
+    assert_at_rest(scene)
+
+
+def test_ball_on_a_table_stays_where_it_was_seen():
+    assets = room(
+        box(10, (1.0, 0.7, 0.4), (0, 0, 0), label="table"), thing(11, [ball_part(0.04)], (0.1, 0, 0.404))
+    )
+    scene, placed = build(assets)
+    assert_at_rest(scene)
+    assert placed[11].moved_m < 0.01
+
+
+def test_tilted_and_sunk_box_is_set_upright_on_the_floor():
+    scene, placed = build(room(box(10, (0.3, 0.2, 0.25), (0.3, 0, -0.012), turn=tilt(3.0))))
+    assert_at_rest(scene)
+    assert placed[10].world_from_object[2, 2] > np.cos(np.radians(0.2))
+    assert placed[10].world_from_object[2, 3] == pytest.approx(0, abs=1e-3)
+
+
+def test_bumpy_underside_is_flattened_and_recorded():
+    corners = box_part((0.12, 0.12, 0.2), (0, 0, 0.104)).vertices
+    pyramid = np.concatenate([corners, [[0.01, 0.0, 0.0]]])
+    scene, placed = build(room(thing(10, [convex_part(pyramid)], (0, 0, 0))))
+    assert_at_rest(scene)
+    assert placed[10].turned_deg < 1.0
+    assert "flattened" in placed[10].repair
+    assert len(placed[10].collision) == 1
+
+
+def test_neighbors_that_overlap_are_moved_apart():
+    assets = room(box(10, (0.1, 0.1, 0.15), (0, 0, 0)), box(11, (0.1, 0.1, 0.15), (0.09, 0, 0)))
+    scene, placed = build(assets)
+    assert_at_rest(scene)
+    assert placed[11].world_from_object[0, 3] - placed[10].world_from_object[0, 3] >= 0.0995
+    assert max(p.moved_m for p in scene.placed) < 0.02
+
+
+def test_uneven_table_top_carries_at_its_visible_height():
+    # The convex hull of a table with a raised edge lies 2 cm above the visible top.
+    top, edge = box_part((1.0, 0.7, 0.4), (0, 0, 0.2)), box_part((1.0, 0.02, 0.42), (0, 0.34, 0.21))
+    low_edge = box_part((1.0, 0.02, 0.42), (0, -0.34, 0.21))
+    table = thing(10, [top, edge, low_edge], (0, 0, 0), label="table")
+    table = replace(table, collision=(box_part((1.0, 0.7, 0.42), (0, 0, 0.21)),))
+    scene, placed = build(room(table, box(11, (0.1, 0.1, 0.1), (0.1, 0, 0.4))))
+    assert_at_rest(scene)
+    assert placed[11].world_from_object[2, 3] == pytest.approx(0.4, abs=2e-3)
+    assert "cut" in placed[10].repair
+    assert placed[10].collision
+
+
+def test_furniture_that_reaches_into_the_floor_keeps_its_height():
+    scene, placed = build(room(box(10, (1.0, 0.7, 0.4), (0, 0, -0.03), label="table")))
+    assert placed[10].moved_m < 1e-6
+    parts, pose = placed[10].collision, placed[10].world_from_object
+    bottom = min(transform_points(pose, p.vertices)[:, 2].min() for p in parts)
+    assert bottom >= 0.0
+    assert_at_rest(scene)
+
+
+def test_what_cannot_stand_is_said_not_to():
+    pole = box(10, (0.01, 0.01, 0.5), (0, 0, 0), turn=tilt(30.0))
+    _, placed = build(room(pole))
+    assert not placed[10].stable
+    assert "does not stand" in placed[10].repair
+    frozen, placed = build(room(pole), freeze_unstable=True)
+    assert not placed[10].dynamic
+    assert "immovable" in placed[10].repair
+    assert frozen.physics_report["dynamic_objects"] == 0
+
+
+def test_assembly_is_deterministic():
+    assets = room(
+        box(10, (1.0, 0.7, 0.4), (0, 0, 0), label="table"),
+        tray(11, (0, 0, 0.395)),
+        thing(12, [ball_part(0.03)], (0, 0, 0.42)),
+    )
+    (first, _), (second, _) = build(assets), build(assets)
+    assert first.physics_report == second.physics_report
+    for a, b in zip(first.placed, second.placed):
+        assert np.array_equal(a.world_from_object, b.world_from_object)
+
+
+def test_unconnected_objects_are_refused():
+    assets = room(box(10, (0.1, 0.1, 0.1), (0, 0, 0)), box(11, (0.1, 0.1, 0.1), (1, 0, 0)))
+    edges = (Edge(10, "supported_by", 11, 1.0, ""), Edge(11, "supported_by", 10, 1.0, ""))
+    with pytest.raises(SimReconError, match=r"\[10, 11\]"):
+        assemble(assets, SceneGraph(edges), AssemblyConfig())
+
+
+def test_base_slabs_have_their_face_on_the_plane_and_lie_behind_it():
+    for base in (floor(), wall()):
+        (slab,) = base_slabs(base)
+        distance = slab.vertices @ base.plane[:3] + base.plane[3]
+        assert distance.max() == pytest.approx(0, abs=1e-6)
+        assert distance.min() <= -0.1
+    (slab,) = base_slabs(floor())
+    assert slab.vertices[:, 0].max() > 5
+
+
+def test_cut_keeps_the_volume_on_one_side():
+    (half,) = cut((box_part((0.2, 0.2, 0.2)),), np.array([0, 0, 1.0]), 0.05)
+    assert half.vertices[:, 2].min() == pytest.approx(-0.05, abs=1e-6)
+    assert half.vertices[:, 2].max() == pytest.approx(0.1, abs=1e-6)
+    assert cut((box_part((0.2, 0.2, 0.2)),), np.array([0, 0, 1.0]), -0.2) == ()
+
+
+def test_flat_patch_of_a_sphere_has_the_expected_radius():
+    radius, band = 0.05, 0.002
+    (foot,) = flatten_foot((ball_part(radius),), np.array([0, 0, 1.0]), band)
+    low = foot.vertices[foot.vertices[:, 2] < foot.vertices[:, 2].min() + 1e-6]
+    assert len(low) >= 3
+    assert np.linalg.norm(low[:, :2], axis=1).max() == pytest.approx(np.sqrt(2 * radius * band), rel=0.6)
+    turned = rigid(tilt(40))[:3, :3]
+    assert np.ptp(foot.vertices @ turned.T, axis=0).max() < 2 * radius + 1e-3
