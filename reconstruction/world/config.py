@@ -12,7 +12,7 @@ class WorldConfig:
     """How gravity, the floor and metres are found."""
 
     scale: str = ""
-    """What the user knows: `camera-height=1.5`, `distance:40,100,200,300,210=1.2` or `object:3.height=0.74`."""
+    """What the user knows, as `--scale` takes it; see `parse_scale`."""
     object_measured_height_m: float = 0.0
     """Height of the object that `scale` names, in the provisional scale; 0 until the instances are known."""
     marker_size_m: float = 0.0
@@ -28,9 +28,9 @@ class WorldConfig:
     """Learned metric depth as a source of metres; needs `pip install 'simrecon[metric-depth]'`."""
     metric_depth_model: str = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
     """Model of the metric depth backend, as on the Hugging Face hub, or a local folder."""
-    camera_height_prior_m: float = 1.45
-    """How high people hold a camera above the floor, the median over a video."""
-    camera_height_sigma: float = 0.12
+    camera_height_prior_m: float = 1.4
+    """How high people hold a camera above the floor: between chest (1.2 m) and eyes (1.6 m)."""
+    camera_height_sigma: float = 0.15
     """Relative 1-sigma of that."""
     table_height_prior_m: float = 0.74
     """Height of a table, for videos that see a table top but no floor."""

@@ -1,7 +1,8 @@
 """Where the floor is: the lowest large level surface that faces up, unless things are seen below it.
 
-A table top is told from a floor by what lies below: rays that pass its edge and end lower. Wrong depth and mirror
-images in a glossy floor lie below, too, but their rays pass *through* the seen floor, so they do not count.
+A table top is told from a floor by what lies below: rays that pass its edge and end lower. Wrong depth and
+mirror images in a glossy floor lie below, too, but their rays pass *through* the seen floor, so they do not
+count.
 """
 
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ _BELOW_MARGIN = 0.10  # of the camera's height over the candidate: nearer is its
 class Floor:
     """The floor in upright, unscaled space."""
 
-    height: float  # z of the floor where observed; of the lowest level surface where there is only that; else of the lowest point
+    height: float  # z of the floor; else of the level surface that is `table`; else of the lowest point
     observed: bool
     table: bool  # a level surface was found, but it stands above something else
 
@@ -50,7 +51,11 @@ def find_floor(samples: SurfaceSamples) -> Floor:
         if cells >= max(_MIN_SHARE * largest, _MIN_CELLS):
             height = _settle(samples, level, height, band)
             below = _cells_below_edge(samples, height, _BELOW_MARGIN * (eye - height) + band, cell, band)
-            return Floor(height, True, False) if below < _BELOW_SHARE * cells else Floor(height, False, True)
+            if below < _BELOW_SHARE * cells:
+                return Floor(height, True, False)
+            # Things stand on something lower that is not seen. The largest surface is most likely a table.
+            table = max(candidates, key=lambda item: item[1])[0]
+            return Floor(_settle(samples, level, table, band), False, True)
     return Floor(lowest, False, False)
 
 

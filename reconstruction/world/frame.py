@@ -41,7 +41,8 @@ def find_world(
     progress.advance()
     rotation = level_rotation(gravity.up)
     upright = rotate_samples(samples, rotation)
-    yaw_rad, snapped = find_yaw(upright, posed.world_from_camera[:, :3, 2] @ rotation.T)
+    walls = tuple(replace(p, normal=rotation @ p.normal) for p in gravity.planes if not p.level)
+    yaw_rad, snapped = find_yaw(upright, posed.world_from_camera[:, :3, 2] @ rotation.T, walls)
     turn = turn_about_z(yaw_rad)
     upright, rotation = rotate_samples(upright, turn), turn @ rotation
     floor = find_floor(upright)
@@ -75,7 +76,7 @@ def find_world(
 
 
 def floor_height(upright: SurfaceSamples, floor: Floor, metres: Metres, config: WorldConfig) -> float:
-    """Return the floor's height in upright sfm units: where it is seen, or a likely place below everything seen."""
+    """Return the floor's height in upright sfm units: as seen, or a likely place below everything seen."""
     if floor.observed:
         return floor.height
     clearance = _CLEARANCE_M / metres.per_unit
@@ -128,7 +129,8 @@ def _apply_object_request(world: WorldFrame, config: WorldConfig, progress: Prog
         return world
     if config.object_measured_height_m <= 0:
         progress.note(
-            f"world: the scale is provisional ({world.scale.method}) until object {request.object_id} is found"
+            f"world: the scale is provisional ({world.scale.method}) until object {request.object_id} "
+            "is found"
         )
         return world
     return rescale_for_object(world, config.object_measured_height_m, request.value_m)

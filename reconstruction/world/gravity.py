@@ -1,9 +1,10 @@
 """Which way is up: horizontal planes and walls vote, the cameras' own up says where to look.
 
 People hold a camera without roll, more or less, and pitch it as they like. So each camera's x axis is nearly
-orthogonal to up (a few degrees), while its -y axis is only roughly up. Directions near that are scored by the share of
-the surface that would be horizontal or vertical, the best is refined by iteratively reweighted least squares on the
-sphere, and at last by planes fitted through whole floors, tables and walls, which average over more than any window.
+orthogonal to up (a few degrees), while its -y axis is only roughly up. Directions near that are scored by the
+share of the surface that would be horizontal or vertical, the best is refined by iteratively reweighted least
+squares on the sphere, and at last by planes fitted through whole floors, tables and walls, which average over
+more than any window.
 """
 
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ class Gravity:
     up: np.ndarray  # float64 (3,) unit, sfm space
     method: str  # "planes+walls+cameras" | "planes+cameras" | "walls+cameras" | "cameras"
     sigma_deg: float
+    planes: tuple[FittedPlane, ...]  # level and plumb planes that it rests on
 
 
 def find_gravity(posed: PosedFrames, samples: SurfaceSamples) -> Gravity:
@@ -52,11 +54,11 @@ def find_gravity(posed: PosedFrames, samples: SurfaceSamples) -> Gravity:
         # One wall leaves the turn about its normal to the cameras; two cross.
         sigma = max(sigma, _camera_sigma(up, right) if _walls_are_parallel(planes) else sigma)
     parts = ["planes"] * has_level + ["walls"] * has_plumb + ["cameras"]
-    return Gravity(up, "+".join(parts), float(sigma))
+    return Gravity(up, "+".join(parts), float(sigma), planes)
 
 
 def camera_up(right: np.ndarray, rough_up: np.ndarray) -> np.ndarray:
-    """Return up as the cameras alone tell it: no roll, pitch unknown but moderate, robust to some turned frames.
+    """Return up as the cameras alone tell it: no roll, moderate pitch, robust to some turned frames.
 
     Args:
         right: The cameras' x axes (n, 3).
@@ -78,15 +80,8 @@ def _best_vote(
     prior: np.ndarray, right: np.ndarray, rough_up: np.ndarray, samples: SurfaceSamples
 ) -> np.ndarray:
     """Return the direction near the cameras' up that makes most of the surface level or plumb."""
-    directions = _fibonacci_sphere(4000)
-    bins = np.zeros(len(directions))
-    nearest = np.concatenate(
-        [(chunk @ directions.T).argmax(axis=1) for chunk in np.array_split(samples.normals, 64)]
-    )
-    np.add.at(bins, nearest, samples.weights)
-    used = bins > 0
-    normals, mass = directions[used], bins[used] / bins.sum()
-    candidates = _fibonacci_sphere(20000)
+    normals, mass = _binned(samples)
+    candidates = _fibonacci_sphere(6000)
     candidates = candidates[candidates @ prior > np.cos(np.radians(_SEARCH_DEG))]
     cosine = candidates @ normals.T
     width = np.radians(_VOTE_WIDTH_DEG)
@@ -100,6 +95,16 @@ def _best_vote(
         _PITCH_SIGMA_DEG
     )
     return candidates[np.argmax(np.log(votes + 0.02) - roll_cost - 0.5 * pitch**2)]
+
+
+def _binned(samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
+    """Return a few thousand directions (k, 3) and the share of the surface that faces each."""
+    keys = np.round(samples.normals * 14).astype(np.int64) + 20
+    _, bins = np.unique(keys @ [1600, 40, 1], return_inverse=True)
+    total = [np.bincount(bins, weights=samples.weights * samples.normals[:, k]) for k in range(3)]
+    mass = np.bincount(bins, weights=samples.weights)
+    directions = np.stack(total, axis=1)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True), mass / mass.sum()
 
 
 def _refine_on_normals(up: np.ndarray, right: np.ndarray, samples: SurfaceSamples) -> np.ndarray:
@@ -155,7 +160,7 @@ def _walls_are_parallel(planes: tuple[FittedPlane, ...]) -> bool:
 
 
 def _camera_sigma(up: np.ndarray, right: np.ndarray) -> float:
-    """Return how sure the cameras alone are: the spread of their roll, which one holder does not average away."""
+    """Return how sure the cameras alone are: the spread of their roll, which has a habit, too."""
     roll_deg = np.degrees(np.arcsin(np.clip(right @ up, -1, 1)))
     return float(max(1.5, 1.4826 * np.median(np.abs(roll_deg))))
 

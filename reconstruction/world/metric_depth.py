@@ -1,4 +1,4 @@
-"""Metres from a learned metric depth model: a seam, and one backend through `transformers`. Never the default."""
+"""Metres from a learned metric depth model: a seam, and a backend through `transformers`; not the default."""
 
 from typing import Protocol
 
@@ -31,20 +31,18 @@ class TransformersBackend:
 
     def __init__(self, model: str) -> None:
         try:
-            import torch
             from transformers import pipeline
         except ImportError as error:
             raise EnvironmentMissing(
-                f"world: metric depth needs {error.name}; `pip install 'simrecon[metric-depth]'`, or leave out "
-                "--set world.metric_depth=transformers"
+                f"world: metric depth needs {error.name}; `pip install 'simrecon[metric-depth]'`, "
+                "or leave out --set world.metric_depth=transformers"
             ) from error
-        device = 0 if torch.cuda.is_available() else -1
         try:
-            self._pipeline = pipeline("depth-estimation", model=model, device=device)
-        except (OSError, ValueError, RuntimeError) as error:
+            self._pipeline = pipeline("depth-estimation", model=model, device_map="auto")
+        except (ImportError, OSError, ValueError, RuntimeError) as error:
             raise EnvironmentMissing(
-                f"world: the metric depth model {model!r} cannot be loaded ({error}); download it first, or name "
-                "its folder with --set world.metric_depth_model=DIR"
+                f"world: the metric depth model {model!r} cannot be loaded ({error}); download it first, "
+                "or name its folder with --set world.metric_depth_model=DIR"
             ) from error
 
     def predict(self, image: np.ndarray, camera: Camera) -> np.ndarray:
@@ -62,7 +60,7 @@ def load_backend(config: WorldConfig) -> MetricDepthBackend | None:
 
 
 def metres_per_unit(backend: MetricDepthBackend, posed: PosedFrames, depth: DepthMaps) -> tuple[float, float]:
-    """Return metres per sfm unit and its relative 1-sigma: the median ratio of predicted to measured depth."""
+    """Return metres per sfm unit (the median ratio of predicted to measured depth), and its 1-sigma."""
     ratios = []
     for row in choose_frames(len(posed.images), _FRAMES):
         measured = np.where(np.asarray(depth.confidence[row]) >= 2, np.asarray(depth.depth[row]), 0)
@@ -74,8 +72,8 @@ def metres_per_unit(backend: MetricDepthBackend, posed: PosedFrames, depth: Dept
             ratios.append(np.median(predicted[good] / measured[good]))
     if not ratios:
         raise InputError(
-            f"world: the metric depth backend {backend.name} and the measured depth have next to no pixel in common; "
-            "leave out --set world.metric_depth, or use --scale"
+            f"world: the metric depth backend {backend.name} and the measured depth have next to no pixel "
+            "in common; leave out --set world.metric_depth, or use --scale"
         )
     centre = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(np.array(ratios) / centre - 1)))

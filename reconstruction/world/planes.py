@@ -1,7 +1,7 @@
 """Planes through the sampled surface: level ones (floor, tables) by height, plumb ones (walls) by direction.
 
-Fits run over all frames at once. A plane's area is counted in cells of a grid, so that what many frames see does not
-count more than what few see.
+Fits run over all frames at once. A plane's area is counted in cells of a grid, so that what many frames see
+does not count more than what few see.
 """
 
 from dataclasses import dataclass
@@ -84,7 +84,8 @@ def _fit(
     for factor in (3.0, 2.0, 1.5, 1.0, 1.0, 1.0):
         off = samples.points[rows] @ normal - offset
         weight = samples.weights[rows] * np.maximum(1 - (off / (factor * band)) ** 2, 0.0) ** 2
-        # Depth noise grows with depth, so far points count less, or they would tilt the plane by their leverage.
+        # Depth noise grows with depth, so far points count less, or they would tilt the plane by their
+        # leverage.
         weight = weight / (samples.depths[rows] / depth) ** 2
         if (weight > 0).sum() < 100:
             return None

@@ -1,8 +1,9 @@
 """Oriented surface points from depth maps: what gravity, walls and the floor are voted by.
 
-On a plane the inverse depth is an affine function of the pixel, so a least-squares fit of 1/z over a window (all
-windows at once, by box sums) gives the normal. Its residual tells planes from edges, corners and bad depth. The pixel
-coordinates carry no noise, hence noise of the depth spreads the normals but does not bias them.
+On a plane the inverse depth is an affine function of the pixel, so a least-squares fit of 1/z over a window
+(all windows at once, by box sums) gives the normal. Its residual tells planes from edges, corners and bad
+depth. The pixel coordinates carry no noise, hence noise of the depth spreads the normals but does not bias
+them.
 """
 
 from dataclasses import dataclass
@@ -53,8 +54,8 @@ def sample_surface(posed: PosedFrames, depth: DepthMaps, config: WorldConfig) ->
     merged = [np.concatenate([part[i] for part in parts]) for i in range(7)] if parts else []
     if not parts or len(merged[0]) < _MIN_SAMPLES:
         raise InputError(
-            "world: the depth maps are almost empty, so neither the floor nor gravity can be found. Film textured "
-            "things from several sides, slowly, in good light."
+            "world: the depth maps are almost empty, so neither the floor nor gravity can be found. Film "
+            "textured things from several sides, slowly, in good light."
         )
     return SurfaceSamples(*merged)
 
@@ -107,8 +108,8 @@ def window_normals(z: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[np
         camera: The camera of the depth map.
 
     Returns:
-        Unit normals towards the camera (h, w, 3) in camera space, and the relative residual (h, w), infinite where
-        the window is too empty.
+        Unit normals towards the camera (h, w, 3) in camera space, and the relative residual (h, w), infinite
+        where the window is too empty.
     """
     half = max(2, round(_WINDOW_SHARE * camera.width))
     x, y = normalised(camera)
@@ -125,7 +126,8 @@ def window_normals(z: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[np
     enough = n >= _MIN_WINDOW_FILL * (2 * half + 1) ** 2
     n = np.where(enough, n, 1.0)
     mean_x, mean_y, mean_w = total(m * x) / n, total(m * y) / n, total(w) / n
-    # Second moments about the window's own means; coordinates are of order one, so float64 leaves nothing out.
+    # Second moments about the window's own means; coordinates are of order one, so float64 leaves nothing
+    # out.
     xx, yy = total(m * x * x) / n - mean_x**2, total(m * y * y) / n - mean_y**2
     xy, ww = total(m * x * y) / n - mean_x * mean_y, total(w * w) / n - mean_w**2
     xw, yw = total(w * x) / n - mean_x * mean_w, total(w * y) / n - mean_y * mean_w

@@ -71,8 +71,8 @@ def _by_marker(posed: PosedFrames, config: WorldConfig, progress: Progress) -> M
         sure = sorted(marker_id for (_, marker_id), views in seen.items() if len(views) >= 2)
         if sure:
             progress.note(
-                f"world: AprilTag {', '.join(map(str, sure[:5]))} is in view, but its size is not known, so it gives "
-                "no scale; say the side of its black square with --marker-size METRES"
+                f"world: AprilTag {', '.join(map(str, sure[:5]))} is in view, but its size is not known, "
+                "so it gives no scale; say the side of its black square with --marker-size METRES"
             )
         return None
     sides = measure_markers(posed, config.marker_dictionaries)
@@ -157,8 +157,8 @@ def distance_between_pixels(
     if len(hit) == 0:
         near = sorted(indices[np.argsort(np.abs(indices - request.frame), kind="stable")[:4]].tolist())
         raise UsageError(
-            f"--scale distance: frame {request.frame} has no camera (not every frame is used); the nearest ones that "
-            f"have are {', '.join(map(str, near))}: read the pixels off one of these"
+            f"--scale distance: frame {request.frame} has no camera (not every frame is used); the nearest "
+            f"ones that have are {', '.join(map(str, near))}: read the pixels off one of these"
         )
     width, height = posed.source.width, posed.source.height
     if (width > height) != (posed.camera.width > posed.camera.height):
@@ -187,7 +187,7 @@ def _depth_at(
     posed: PosedFrames,
     depth: DepthMaps,
 ) -> tuple[float, float]:
-    """Return the z-depth at a pixel and its standard error, from the depth maps of the keyframes around it."""
+    """Return the z-depth at a pixel and its standard error, from the keyframes around it."""
     view_from_world = invert_rigid(world_from_view)
     rows = np.argsort(np.abs(posed.indices - frame), kind="stable")[:_NEIGHBOURS]
     radius = _SEARCH_PX * max(view.width / depth.camera.width, 1.0)
@@ -212,7 +212,8 @@ def _depth_at(
     near = np.concatenate(found)
     if len(near) == 0:
         raise InputError(
-            f"--scale distance: there is no depth at pixel ({x:g}, {y:g}) of frame {frame}; choose a textured point"
+            f"--scale distance: there is no depth at pixel ({x:g}, {y:g}) of frame {frame}; "
+            "choose a textured point"
         )
     # The nearest surface hides what is behind it.
     front = near[near < 1.05 * np.quantile(near, 0.1)]

@@ -2,10 +2,13 @@
 
 import numpy as np
 
+from reconstruction.world.planes import FittedPlane
 from reconstruction.world.samples import SurfaceSamples
 
 _UPRIGHT_DEG = 12.0
 _MIN_SHARE = 0.02  # of all samples: fewer upright ones say nothing
+_WALL_AGREES_DEG = 3.0
+_WALL_SIGMA_DEG = 0.5
 _MIN_CONTRAST = 1.8  # how much the votes near the found direction exceed an even spread
 
 
@@ -24,15 +27,18 @@ def turn_about_z(angle_rad: float) -> np.ndarray:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
-def find_yaw(samples: SurfaceSamples, forward: np.ndarray) -> tuple[float, bool]:
+def find_yaw(
+    samples: SurfaceSamples, forward: np.ndarray, walls: tuple[FittedPlane, ...] = ()
+) -> tuple[float, bool]:
     """Return the turn about +z that makes walls parallel to x and y, and whether there were any.
 
-    Of the four quarter turns the one is taken after which the cameras look along +y on the whole; without walls they
-    look exactly along +y.
+    Of the four quarter turns the one is taken after which the cameras look along +y on the whole; without
+    walls they look exactly along +y.
 
     Args:
         samples: Upright samples (+z is up).
         forward: The cameras' viewing directions (n, 3), upright.
+        walls: Plumb planes, upright: where they agree with the votes of the normals, they are more exact.
     """
     heading = _heading(forward)
     angles, weights = _wall_angles(samples)
@@ -46,12 +52,28 @@ def find_yaw(samples: SurfaceSamples, forward: np.ndarray) -> tuple[float, bool]
     if smooth.max() < _MIN_CONTRAST * smooth.mean():
         return np.pi / 2 - heading, False
     for width_deg in (8.0, 6.0, 4.0, 3.0, 3.0, 3.0):
-        off = (angles - best + np.pi / 4) % (np.pi / 2) - np.pi / 4
+        off = _folded(angles - best)
         vote = weights * np.maximum(1 - (off / np.radians(width_deg)) ** 2, 0.0) ** 2
         if vote.sum() > 0:
             best += float((vote * off).sum() / vote.sum())
+    best = _refine_on_walls(best, walls)
     quarter = np.round((np.pi / 2 - (heading - best)) / (np.pi / 2))
     return float(quarter * np.pi / 2 - best), True
+
+
+def _refine_on_walls(best: float, walls: tuple[FittedPlane, ...]) -> float:
+    """Return the angle improved by whole walls: a fit through a wall averages over more than any window."""
+    near = [(_folded(np.arctan2(p.normal[1], p.normal[0]) - best), p) for p in walls]
+    near = [(off, p) for off, p in near if abs(off) < np.radians(_WALL_AGREES_DEG)]
+    if not near:
+        return best
+    weight = np.array([p.area / (p.sigma_deg**2 + _WALL_SIGMA_DEG**2) for _, p in near])
+    return best + float(weight @ [off for off, _ in near] / weight.sum())
+
+
+def _folded(angle: np.ndarray | float) -> np.ndarray | float:
+    """Fold an angle to within an eighth of a turn."""
+    return (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
 
 
 def _wall_angles(samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
@@ -63,12 +85,9 @@ def _wall_angles(samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _heading(forward: np.ndarray) -> float:
-    """Return the direction (radians from +x) in which the cameras look; of the first one where they look all around."""
+    """Return the direction (radians from +x) in which the cameras look on the whole."""
     mean = forward[:, :2].mean(axis=0)
     if np.linalg.norm(mean) < 0.2:
-        mean = (
-            forward[np.linalg.norm(forward[:, :2], axis=1).argmax(), :2]
-            if len(forward)
-            else np.array([0, 1.0])
-        )
+        # They look all around, or straight down: then the levelest one decides.
+        mean = forward[np.linalg.norm(forward[:, :2], axis=1).argmax(), :2]
     return float(np.arctan2(mean[1], mean[0]))
