@@ -257,7 +257,7 @@ def iterate_film(
     *,
     seed: int = 0,
     supersample: int = 2,
-):  # noqa: ANN201 - generator of uint8 (h, w, 3)
+):
     """Yield one frame after the other, so that long films need little memory."""
     sensor = sensor or Sensor()
     rng = np.random.default_rng(seed)

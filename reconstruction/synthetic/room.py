@@ -36,7 +36,7 @@ class Entity:
     solids: tuple[Solid, ...]  # coarse closed parts in world space
     patches: tuple[Patch, ...]  # fine textured surface in world space, for drawing
 
-    def mesh(self):  # noqa: ANN201 - trimesh is imported on use
+    def mesh(self):
         """Return the closed outer surface in world space as a `trimesh.Trimesh` (union of the parts)."""
         import trimesh
 
