@@ -182,7 +182,12 @@ class Placer:
         parent = self.base.get(item.edge.parent)
         if parent is None:
             carrier = self.placed[item.edge.parent]
-            return self._keep_clear(replace(item, dynamic=carrier.dynamic), lift=self.config.max_shift_m)
+            hung = self._keep_clear(replace(item, dynamic=carrier.dynamic), lift=self.config.max_shift_m)
+            if hung.stands:
+                return hung
+            # It cannot hang there without being inside something: let gravity find what carries it.
+            standing = replace(item.edge, relation="supported_by")
+            return self._let_settle(replace(item, edge=standing).noted("stands: no place to hang was free"))
         item = replace(item, dynamic=False)
         gap = float(_distance(parent, world_points(item.parts, item.pose)).min())
         if abs(gap) <= self.config.max_wall_snap_m:
@@ -219,37 +224,36 @@ class Placer:
             item = item.noted(f"shifted {moved * 1000:.0f} mm out of its neighbors")
         if not clear:
             item = item.noted("still overlaps a neighbor")
-        return replace(item, pose=pose)
+        return replace(item, pose=pose, stands=clear)
 
     # Everything else: cleared, let go, repaired where it does not stand.
 
     def _let_settle(self, item: Placement) -> Placement:
-        best: tuple[float, Placement] | None = None
-        for attempt in self._attempts(item):
-            cost, placement = self._try(attempt)
-            if best is None or cost < best[0] - 1e-9:
-                best = cost, placement
-            if cost < 1.0:
+        best = self._try(item, item.pose)
+        for band in self.config.foot_bands_mm:
+            if best[0] < 1.0:
+                return best[1]
+            best = min(best, self._try(_flattened(item, band), item.pose), key=lambda found: found[0])
+        for moved in self._shifted(item):
+            # Moving an object away from where it was seen is worth it only where it would fall otherwise.
+            if best[0] < 5.0:
                 break
-        assert best is not None  # `_attempts` always yields the object itself first
+            best = min(best, self._try(moved, item.pose), key=lambda found: found[0])
         return best[1]
 
-    def _attempts(self, item: Placement) -> Iterator[Placement]:
-        """Yield ever stronger repairs: none, a flatter foot, a small search around the pose."""
-        yield item
-        for band in self.config.foot_bands_mm:
-            yield _flattened(item, band)
-        flat = _flattened(item, self.config.foot_bands_mm[1])
+    def _shifted(self, item: Placement) -> Iterator[Placement]:
+        """Yield a small search around the pose."""
+        flat = _flattened(item, self.config.foot_bands_mm[len(self.config.foot_bands_mm) // 2])
         for radius in self.config.search_shifts_m:
             for angle in np.arange(8) * np.pi / 4:
                 moved = _moved(flat, radius * np.array([np.cos(angle), np.sin(angle), 0]))
                 yield moved.noted(f"shifted {radius * 1000:.0f} mm to where it stands")
 
     def _settle_flattened(self, item: Placement, band_mm: float) -> Placement:
-        return self._try(_flattened(item, band_mm))[1]
+        return self._try(_flattened(item, band_mm), item.pose)[1]
 
-    def _try(self, item: Placement) -> tuple[float, Placement]:
-        """Clear, let go and judge: cost below 1 is good, below 10 acceptable."""
+    def _try(self, item: Placement, seen: np.ndarray) -> tuple[float, Placement]:
+        """Clear, let go and judge against the pose `seen`: cost below 1 is good, below 10 acceptable."""
         config, body = self.config, item.asset.id
         self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
         pose, clear = make_clear(
@@ -263,7 +267,8 @@ class Placer:
         lift = pose[2, 3] - item.pose[2, 3]
         shift = float(np.hypot(*(pose[:2, 3] - item.pose[:2, 3])))
         end = self.bench.settle(body, pose, config.settle_s)
-        cost = self._cost(end, clear, shift)
+        away = float(np.hypot(*(pose[:2, 3] - seen[:2, 3])))
+        cost = self._cost(end, clear, away)
         notes = item.notes
         if lift > 0.005:
             notes = (*notes, f"lifted {lift * 1000:.0f} mm out of what it was in")
@@ -277,7 +282,7 @@ class Placer:
             return cost, replace(item, pose=pose, notes=(*notes, _why(end, clear)), stands=False)
         return cost, replace(item, pose=end.pose, edge=edge, notes=notes, stands=True)
 
-    def _cost(self, end: Settled, clear: bool, shift: float) -> float:
+    def _cost(self, end: Settled, clear: bool, away_m: float) -> float:
         config = self.config
         failed = (
             not clear
@@ -287,7 +292,7 @@ class Placer:
             or end.drop_m > config.max_drop_m + config.max_lift_m
         )
         slip = end.lateral_m / (0.3 * config.max_slide_m)
-        return max(end.turned_deg / config.good_turn_deg, slip) + shift / 0.05 + 10 * failed
+        return max(end.turned_deg / config.good_turn_deg, slip) + away_m / 0.005 * 0.5 + 10 * failed
 
     def _seen_parent(self, edge: Edge, end: Settled) -> Edge:
         """Keep the parent unless the object touches it nowhere and rests wholly on something else."""

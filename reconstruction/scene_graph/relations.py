@@ -184,7 +184,7 @@ class GeometryRelations:
     def _sink(self, child: SampledObject, deep: bool) -> float:
         height = child.high[2] - child.low[2]
         if deep:
-            return max(min(self.config.deep_sink_m, 0.5 * height), 1.5 * self.config.contact_sink_m)
+            return max(min(self.config.deep_sink_m, 0.9 * height), 1.5 * self.config.contact_sink_m)
         return self.config.contact_sink_m
 
     def _is_above(self, child: SampledObject, parent: SampledObject) -> bool:
