@@ -1,0 +1,43 @@
+"""The docs name only files, links and commands that exist."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from reconstruction.cli import build_parser
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_relative_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_paths_of_the_project_exist(page):
+    for path in re.findall(r"`((?:reconstruction|registry|simrecon_envs|tests|tools|examples|docs)/[\w./*-]+)`", page.read_text()):
+        assert list(ROOT.glob(path.rstrip("/"))), f"{page.name} names {path}"
+
+
+def _verbs() -> dict:
+    return next(a for a in build_parser()._actions if a.dest == "verb").choices
+
+
+def test_every_verb_is_documented_and_has_help():
+    text = (ROOT / "README.md").read_text()
+    for name, parser in _verbs().items():
+        assert name in text, f"README does not mention simrecon {name}"
+        assert len(parser.format_help()) > 100
+        assert parser.description
+
+
+def test_make_targets_of_the_docs_exist():
+    targets = set(re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for page in PAGES:
+        named = set(re.findall(r"^(?:    |)(?:make) ([\w-]+)", page.read_text(), re.MULTILINE))
+        assert named <= targets, f"{page.name} names {named - targets}"
