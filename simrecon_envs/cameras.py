@@ -54,15 +54,30 @@ def from_capture(world_from_camera: np.ndarray, params: np.ndarray, width: int, 
     )
 
 
-def workspace_view(solids: list[ConvexSolid], placement: Placement, middle: np.ndarray) -> Viewpoint:
-    """Return the observation camera's view: onto the target, from beside or opposite the robot, unhidden."""
-    focus = placement.target.center if placement.target is not None else middle
+def workspace_view(
+    solids: list[ConvexSolid], placement: Placement, middle: np.ndarray, robot_points: np.ndarray
+) -> Viewpoint:
+    """Return the observation camera's view: onto the target, from beside or opposite the robot, unhidden.
+
+    The robot at rest (points (n, 3) in its root space) counts as something that hides.
+    """
+    target = placement.target
+    focus = target.center if target is not None else middle
+    reach = 0.5 * (target.top_m - target.bottom_m) if target is not None else 0.1
     grid = _grid_around(solids, focus, 2.0)
-    offsets = np.array([[0, 0, 0], [0.08, 0, 0], [-0.08, 0, 0], [0, 0.08, 0], [0, -0.08, 0], [0, 0, 0.15]])
-    points = focus + offsets
+    if len(robot_points):
+        grid.add_points(placement.to_world(robot_points))
+    points = focus + reach * np.array([[0, 0, 0.9], [0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0]])
     ranked = []
     for turn_deg in (150, -150, 120, -120, 180, 90, -90, 60, -60, 30, -30):
-        for distance, lift in ((0.80, 0.55), (0.65, 0.60), (1.0, 0.50), (0.45, 0.75), (0.35, 0.50)):
+        for distance, lift in (
+            (0.80, 0.50),
+            (0.75, 0.35),
+            (0.70, 0.25),
+            (1.0, 0.5),
+            (0.45, 0.6),
+            (0.35, 0.3),
+        ):
             angle = placement.yaw_rad + np.pi + np.deg2rad(turn_deg)
             eye = focus + np.array([distance * np.cos(angle), distance * np.sin(angle), lift])
             view = look_at(eye, focus + np.array([0, 0, 0.05]), _WORKSPACE_FOV_RAD)
@@ -126,7 +141,7 @@ def _room_candidates(
     ):
         captured = from_capture(cameras.world_from_camera[row], cameras.params, cameras.width, cameras.height)
         # Where the person stood is in the room and sees it; turning towards the focus keeps that.
-        views.append((captured, 0.3))
+        views.append((captured, 0.1))
         views.append((_framing(captured.eye, focus, points), 0.3))
     for radius in (1.4, 1.8, 2.3):
         for step in range(16):

@@ -156,6 +156,12 @@ class OccupancyGrid:
                 inside &= level + (nz * centers[2] + d)[None, None, :] <= grow
             self.filled[low[0] : high[0], low[1] : high[1], low[2] : high[2]] |= inside
 
+    def add_points(self, points: np.ndarray) -> None:
+        """Fill the cells that hold any of the world points (n, 3)."""
+        cell = np.floor((np.asarray(points) - self.lower) / self.cell_m).astype(int)
+        cell = cell[((cell >= 0) & (cell < self.filled.shape)).all(axis=1)]
+        self.filled[cell[:, 0], cell[:, 1], cell[:, 2]] = True
+
     def occupied(self, points: np.ndarray) -> np.ndarray:
         """Return (...,) whether world points (..., 3) lie in filled cells; outside the box nothing is
         filled.

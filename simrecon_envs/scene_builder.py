@@ -2,7 +2,7 @@
 
 | in the bundle                            | actor                                                    |
 |------------------------------------------|----------------------------------------------------------|
-| floor, wall, ceiling                     | static, convex slabs (where there are none: a box behind its plane) |
+| floor, wall, ceiling                     | static: convex slabs, or a box behind its plane          |
 | object, `dynamic: false`                 | static                                                   |
 | object attached to what is static        | static                                                   |
 | object attached to a dynamic one         | welded: its shapes, mass and inertia join the parent's actor |
@@ -37,7 +37,7 @@ from simrecon_envs.occupancy import ConvexSolid, base_slab, glb_vertices, read_o
 BASE_FRICTION = 0.5
 BASE_RESTITUTION = 0.0
 _GROUND_BELOW_FLOOR_M = 0.002
-_GROUND_MARGIN_M = 6.0
+_GROUND_MARGIN_M = 25.0
 # Fetch's wheels and base do not collide with what it drives on (bits as in mani_skill.agents.robots.fetch).
 _WHEEL_BIT, _BASE_BIT = 30, 31
 

@@ -60,7 +60,7 @@ class SceneEnv(BaseEnv):
     vector. "rgb", "rgbd" and the other visual modes of ManiSkill leave out the rows marked "state" and add
 
     | sensor_data/CAMERA/rgb       | (b, h, w, 3) | uint8   | image | -    | rgb in the mode      |
-    | sensor_data/CAMERA/depth     | (b, h, w, 1) | int16   | image | mm   | depth in the mode; z-depth, 0 = nothing |
+    | sensor_data/CAMERA/depth     | (b, h, w, 1) | int16   | image | mm   | z-depth, 0 = nothing  |
     | sensor_param/CAMERA/intrinsic_cv  | (b, 3, 3) | float32 | image | px  |                     |
     | sensor_param/CAMERA/extrinsic_cv  | (b, 3, 4) | float32 | camera_from_world, OpenCV axes | m | |
     | sensor_param/CAMERA/cam2world_gl  | (b, 4, 4) | float32 | world_from_camera, OpenGL axes | m | |
@@ -217,7 +217,8 @@ class SceneEnv(BaseEnv):
     def _default_sensor_configs(self) -> list[CameraConfig]:
         middle = (self.builder.extent[0] + self.builder.extent[1]) / 2
         placement = self.placement or Placement(middle, 0.0, 0.0, None, "")
-        return [_camera("base_camera", workspace_view(self._solids, placement, middle), 128)]
+        view = workspace_view(self._solids, placement, middle, self._shape.points)
+        return [_camera("base_camera", view, 128)]
 
     @property
     def _default_human_render_camera_configs(self) -> list[CameraConfig]:

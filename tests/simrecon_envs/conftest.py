@@ -54,9 +54,13 @@ class BundleWriter:
         self.folder = folder
         self.base, self.objects, self.edges = [], [], []
 
-    def add_base(self, key: int, label: str, mesh: trimesh.Trimesh, plane: list, *, collision: bool = True) -> None:
+    def add_base(
+        self, key: int, label: str, mesh: trimesh.Trimesh, plane: list, *, collision: bool = True
+    ) -> None:
         """Add a floor or wall: a slab in world space whose front lies on the plane."""
-        _glb(mesh, self.folder / f"base/{key:03d}.glb", (200, 196, 188) if label == "wall" else (150, 120, 90))
+        _glb(
+            mesh, self.folder / f"base/{key:03d}.glb", (200, 196, 188) if label == "wall" else (150, 120, 90)
+        )
         entry = {"id": key, "label": label, "mesh": f"base/{key:03d}.glb", "plane": plane, "observed": True}
         if collision:
             _obj(mesh, self.folder / f"base/{key:03d}_collision.obj")
@@ -157,7 +161,13 @@ class BundleWriter:
                 "base": self.base,
                 "objects": self.objects,
                 "graph": {"edges": self.edges},
-                "report": {"physics": {}, "timings_s": {}, "peak_memory_mb": 1.0, "backends": {}, "config": {}},
+                "report": {
+                    "physics": {},
+                    "timings_s": {},
+                    "peak_memory_mb": 1.0,
+                    "backends": {},
+                    "config": {},
+                },
             },
         )
 
@@ -185,7 +195,13 @@ def add_furniture(writer: BundleWriter) -> None:
         CYLINDER, "cup", [cylinder], _translation(0.0, 0.9, top), TABLE, mass=0.15, color=(50, 90, 170)
     )
     writer.add_object(
-        BOOK, "book", [box((0.22, 0.15, 0.03))], _translation(-0.65, 1.05, top), TABLE, mass=0.4, color=(60, 140, 70)
+        BOOK,
+        "book",
+        [box((0.22, 0.15, 0.03))],
+        _translation(-0.65, 1.05, top),
+        TABLE,
+        mass=0.4,
+        color=(60, 140, 70),
     )
     writer.add_object(
         KNOB,
