@@ -1,7 +1,7 @@
 """Turn files into upright RGB images: videos through PyAV as a stream, folders of photographs through Pillow.
 
-A video is never held in memory: `VideoReader.frames` yields decoded frames one by one, and a frame is scaled down
-while it is converted, so that a minute of 4K needs no more memory than its chosen small images.
+A video is never held in memory: `VideoReader.frames` yields decoded frames one by one, and a frame is
+scaled down while it is converted, so that a minute of 4K needs no more memory than its chosen small images.
 """
 
 import hashlib
@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from registry.errors import InputError
+from registry.errors import EnvironmentMissing, InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _FOCAL_35MM_KEYS = ("com.apple.quicktime.camera.focal_length.35mm_equivalent", "focal_length_35mm")
@@ -75,12 +75,14 @@ class VideoReader:
             # A crafted playlist must not make us read from the network.
             return av.open(str(self.path), options={"protocol_whitelist": "file,crypto,data"})
         except av.error.PermissionError as error:
-            raise InputError(f"frames: {self.path} cannot be read: permission denied.") from error
+            raise EnvironmentMissing(
+                f"frames: permission denied to read {self.path}. Make it readable (chmod u+r) and run again."
+            ) from error
         except (av.error.FFmpegError, ValueError, OSError) as error:
             raise InputError(
-                f"frames: {self.path} is not a video that ffmpeg can open ({_reason(error)}). If it should be one, it "
-                "was cut off or damaged while it was copied: copy it again; otherwise give a video file "
-                "(mp4, mov, mkv, webm …) or a folder of jpg or png images."
+                f"frames: {self.path} is not a video that ffmpeg can open ({_reason(error)}). "
+                "If it should be one, it was cut off or damaged while it was copied: copy it again; "
+                "otherwise give a video file (mp4, mov, mkv, webm …) or a folder of jpg or png images."
             ) from error
 
     def _stream(self, container):
@@ -99,8 +101,8 @@ class VideoReader:
     def frames(self) -> Iterator[tuple[int, float, bool, object]]:
         """Yield (frame number from 0, seconds from the first frame, intact, av.VideoFrame).
 
-        Damaged packets are skipped and counted; what follows them is smeared, so it is not intact until the next
-        independently coded frame. The file's end, early or not, ends the iteration.
+        Damaged packets are skipped and counted; what follows them is smeared, so it is not intact until the
+        next independently coded frame. The file's end, early or not, ends the iteration.
         """
         import av
 
@@ -229,7 +231,8 @@ class ImageFolder:
                 self.files.append(path)
             else:
                 self.notes.append(
-                    f"{path.name} is {size[0]}x{size[1]}, most are {self.width}x{self.height}: left out (another shape)"
+                    f"{path.name} is {size[0]}x{size[1]}, most are {self.width}x{self.height}: "
+                    "left out (another shape)"
                 )
         resized = sum(sizes[p] != (self.width, self.height) for p in self.files)
         if resized:

@@ -1,8 +1,8 @@
-"""Stage 1: a video or a folder of images -> keyframes, upright, of one size, and held-out frames for evaluation.
+"""Stage 1: a video or a folder of images -> upright keyframes and held-out frames for evaluation.
 
-Two passes over a video: the first measures every frame at low resolution (sharpness, motion, blankness), the second
-decodes the chosen ones at working resolution. What cannot become a scene is refused here with one clear sentence:
-no video, blank, still, too short. Lack of parallax shows only once poses are estimated.
+Two passes over a video: the first measures every frame at low resolution (sharpness, motion, blankness),
+the second decodes the chosen ones at working resolution. What cannot become a scene is refused here with
+one clear sentence: no video, blank, still, too short. Lack of parallax shows only once poses are estimated.
 """
 
 from dataclasses import dataclass
@@ -45,9 +45,9 @@ class FramesConfig:
     blurred_below: float = 0.4
     """A frame is blurred where its sharpness is below this share of that of its neighbours in time."""
     widest_gap: float = 0.22
-    """Blurred frames are still taken where views would otherwise be further apart than this, share of the side."""
+    """Blurred frames are still taken where a wider gap than this share of the side would open."""
     still_below: float = 0.012
-    """A whole video that moves less than this, as a share of the longer side, was filmed by a camera at rest."""
+    """A video that moves less than this share of the longer side was filmed by a camera at rest."""
     min_usable_frames: int = 8
     """Fewer different frames than this cannot become a scene."""
     hold_out_images_from: int = 60
@@ -86,7 +86,7 @@ def load_frames(video: Path, config: FramesConfig, *, progress: Progress = NO_PR
     return _from_folder(video, config, progress) if video.is_dir() else _from_video(video, config, progress)
 
 
-# --- Videos -------------------------------------------------------------------------------------------------------
+# --- Videos -----------------------------------------------------------------------------------------------
 
 
 def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSet:
@@ -135,7 +135,7 @@ def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSe
 def _measure_video(
     reader: VideoReader, config: FramesConfig, progress: Progress
 ) -> tuple[FrameStats, list[float], set[int]]:
-    """Pass 1: return statistics of analysed frames, the times of all frames, numbers of those smeared by damage."""
+    """Pass 1: return statistics of analysed frames, times of all frames, numbers of smeared ones."""
     progress.start(reader.announced_frames, "measuring frames")
     meter, times, smeared = MotionMeter(), [], set()
     stride = max(1, round(reader.nominal_fps / config.max_analysis_fps))
@@ -173,7 +173,7 @@ def _without_smeared(
 def _without_held_out(
     stats: FrameStats, usable: np.ndarray, config: FramesConfig, progress: Progress
 ) -> np.ndarray:
-    """Take held-out frames, and repeats of them in a video with duplicated frames, from the usable ones (n,) bool."""
+    """Take held-out frames, and repeats of them in a video with duplicates, from the usable (n,) bool."""
     held_out = np.array(stats.indices) % HELD_OUT_EVERY == 0
     repeats = repeats_of(stats, held_out) & usable
     without = usable & ~held_out & ~repeats
@@ -205,13 +205,14 @@ def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> Non
     """Tell what the decoder had to work around; refuse files with nothing in them."""
     if decoded == 0:
         raise InputError(
-            f"frames: no frame of {reader.path} can be decoded. It was cut off or damaged, or its codec is not "
-            "supported: copy it again, or convert it to H.264 mp4."
+            f"frames: no frame of {reader.path} can be decoded. It was cut off or damaged, or its codec "
+            "is not supported: copy it again, or convert it to H.264 mp4."
         )
     if reader.damaged_packets or decoded < 0.98 * reader.announced_frames:
         announced = f" of {reader.announced_frames} announced" if reader.announced_frames else ""
         progress.note(
-            f"the file is damaged or cut off: {decoded} frames{announced} could be decoded; going on with them"
+            f"the file is damaged or cut off: {decoded} frames{announced} could be decoded; "
+            "going on with them"
         )
     if reader.interlaced:
         progress.note("interlaced video: one field of every frame is used")
@@ -223,7 +224,7 @@ def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> Non
         )
 
 
-# --- Folders of images --------------------------------------------------------------------------------------------
+# --- Folders of images ------------------------------------------------------------------------------------
 
 
 def _from_folder(path: Path, config: FramesConfig, progress: Progress) -> FrameSet:
@@ -293,7 +294,7 @@ def _looks_ordered(stats: FrameStats) -> bool:
     return bool(len(similarity) > 0 and np.mean(similarity > 0.4) > 0.7)
 
 
-# --- Shared -------------------------------------------------------------------------------------------------------
+# --- Shared -----------------------------------------------------------------------------------------------
 
 
 def _spacing(config: FramesConfig) -> Spacing:
@@ -318,15 +319,15 @@ def _usable_frames(
     *,
     moving: bool = True,
 ) -> np.ndarray:
-    """Return which analysed frames show something (n,) bool; refuse inputs that show nothing or never move."""
+    """Return which analysed frames show something (n,) bool; refuse what shows nothing or never moves."""
     if decoded == 1:
         raise InputError(
             f"frames: {name} is a single image. Give a video of 5 to 60 s, or at least 20 images."
         )
     if decoded < config.min_usable_frames:
         raise InputError(
-            f"frames: {name} has only {decoded} frames, too few for a scene. Film for 5 to 60 s while walking "
-            "around the things, or give at least 20 images."
+            f"frames: {name} has only {decoded} frames, too few for a scene. Film for 5 to 60 s while "
+            "walking around the things, or give at least 20 images."
         )
     texture, brightness = np.array(stats.texture), np.array(stats.brightness)
     usable = texture >= 0.02
@@ -334,7 +335,8 @@ def _usable_frames(
         what = (
             "is black: nothing can be seen. Take off the lens cover or turn on the light"
             if np.median(brightness) < 16
-            else "shows nothing but blank surfaces (no texture to follow). Film things and their surroundings from 1 to 3 m"
+            else "shows nothing but blank surfaces (no texture to follow). "
+            "Film things and their surroundings from 1 to 3 m"
         )
         raise InputError(f"frames: {name} {what}, and film again.")
     if not usable.all():

@@ -1,7 +1,7 @@
-"""Choose keyframes: measure sharpness, texture and motion of small gray frames, then thin them along the motion.
+"""Choose keyframes: measure sharpness, texture and motion of small gray frames, thin them along the motion.
 
-Motion is measured against a reference frame that is replaced once the view has moved on, so that sensor noise of a
-camera that stands still does not add up to a path, and repeated frames do not advance it.
+Motion is measured against a reference frame that is replaced once the view has moved on, so that sensor
+noise of a camera that stands still does not add up to a path, and repeated frames do not advance it.
 """
 
 from dataclasses import dataclass, field
@@ -85,7 +85,7 @@ class MotionMeter:
         self._points = cv2.goodFeaturesToTrack(small, 160, 0.01, 6)
 
     def _displacement(self, small: np.ndarray) -> tuple[float, float]:
-        """Return (median displacement from the reference in shares of the longer side, share of points tracked)."""
+        """Return (median displacement from the reference by the longer side, share of points tracked)."""
         if self._points is None or len(self._points) < 8:
             self._points = cv2.goodFeaturesToTrack(self._reference, 160, 0.01, 6)
             if self._points is None or len(self._points) < 8:
@@ -112,13 +112,13 @@ def _textured_share(small: np.ndarray) -> float:
 
 
 def repeats_of(stats: FrameStats, originals: np.ndarray, same_below: float = 0.25) -> np.ndarray:
-    """Return which frames (n,) bool are the same picture as one of `originals` (n,) bool, through runs of repeats."""
+    """Return which frames (n,) bool are the same picture as one of `originals` (n,) bool."""
     run = np.cumsum(np.array(stats.change) >= same_below)
     return np.isin(run, run[originals]) & ~originals
 
 
 def relative_sharpness(stats: FrameStats, window_s: float = 0.75) -> np.ndarray:
-    """Return sharpness against the sharp frames (80th percentile) around each: about 1 for a sharp one, (n,)."""
+    """Return sharpness (n,) relative to the sharp frames (80th percentile) around each; about 1 is sharp."""
     sharpness, times = np.array(stats.sharpness), np.array(stats.times_s)
     out = np.ones(len(sharpness))
     low = np.searchsorted(times, times - window_s)
@@ -144,8 +144,8 @@ class Spacing:
 def choose_keyframes(stats: FrameStats, usable: np.ndarray, spacing: Spacing) -> np.ndarray:
     """Return rows of `stats`, ascending, chosen among those where `usable` (n,) bool holds.
 
-    The path is cut into equal cells; each gives its sharpest frame. Frames that repeat a chosen one have its place on
-    the path and are never chosen beside it.
+    The path is cut into equal cells; each gives its sharpest frame. Frames that repeat a chosen one have
+    its place on the path and are never chosen beside it.
     """
     rows = np.flatnonzero(usable)
     position = np.array(stats.position)[rows]

@@ -11,7 +11,7 @@ DEMO_VIDEO = Path(__file__).parents[1] / "examples" / "data" / "demo_room.mp4"
 
 @pytest.fixture(scope="session")
 def small_capture() -> SyntheticCapture:
-    """Twelve frames of 320x240 of the whole generated room, world space, true cameras, depth, ids and entities."""
+    """Twelve 320x240 frames of the generated room, world space, true cameras, depth, ids and entities."""
     return make_test_capture()
 
 

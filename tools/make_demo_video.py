@@ -1,4 +1,4 @@
-"""Film the demo room: writes examples/data/demo_room.mp4 and demo_room_truth.json. Deterministic, under two minutes.
+"""Film the demo room: writes examples/data/demo_room.mp4 and demo_room_truth.json; deterministic.
 
 Usage: python tools/make_demo_video.py [--out DIR] [--seed 0] [--ground-truth DIR]
 

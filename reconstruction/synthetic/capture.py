@@ -1,7 +1,7 @@
 """A filmed generated room as pipeline artefacts with the whole truth: what tests measure against.
 
-Everything is in world space, in metres, as after the world-frame stage; `SyntheticCapture.in_sfm_space` gives what
-the poses and depth stages would hand over before it.
+Everything is in world space, in metres, as after the world-frame stage; `SyntheticCapture.in_sfm_space`
+gives what the poses and depth stages would hand over before it.
 """
 
 import hashlib
@@ -173,7 +173,7 @@ def _sparse_points(
 
 
 def truth_as_json(room: Room, camera: Camera, world_from_camera: np.ndarray, fps: float) -> dict:
-    """Describe the truth as `ground_truth/scene.json` does, with sizes and poses instead of visible pixels."""
+    """Describe the truth as `ground_truth/scene.json` does, with sizes and poses, without visible pixels."""
     names = {e.id: e.name for e in room.entities}
     return {
         "units": "metres",
@@ -208,7 +208,7 @@ def truth_as_json(room: Room, camera: Camera, world_from_camera: np.ndarray, fps
 def write_ground_truth(
     folder: Path, room: Room, film_set: FilmSet, camera: Camera, world_from_camera: np.ndarray, fps: float
 ) -> None:
-    """Write a `ground_truth` folder as `simrecon evaluate --ground-truth` reads it (docs: contract, section 3)."""
+    """Write a folder that `simrecon evaluate --ground-truth` reads (contract, section 3)."""
     import cv2
 
     for name in ("meshes", "depth", "instances"):

@@ -1,7 +1,7 @@
 """Film a generated room: baked light, textured frames with sensor noise, true depth and instance ids.
 
-Light is computed once per vertex from many shadow maps (lamps spread over the ceiling give soft shadows and darken
-corners), so a frame costs one pass of the rasterizer and one texture lookup per sample.
+Light is computed once per vertex from many shadow maps (lamps spread over the ceiling give soft shadows and
+darken corners), so a frame costs one pass of the rasterizer and one texture lookup per sample.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ def _pack_textures(looks: list[Texture]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _lamps() -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Return (position, colour, weight): a soft warm lamp above the table, cool sky light spread over the ceiling."""
+    """Return (position, color, weight): a soft warm lamp, and cool light spread over the ceiling."""
     lamps = []
     for dx, dy in [(0, 0), (0.16, 0.05), (-0.12, 0.14), (-0.06, -0.17), (0.12, -0.13)]:
         position = np.array([-1.0 + dx, 0.3 + dy, _LAMP_HEIGHT_M - 0.2])
@@ -304,7 +304,8 @@ def look_at(position: np.ndarray, target: np.ndarray, roll_rad: float = 0.0) -> 
 
 
 def handheld_path(
-    n_frames: int, *, seed: int = 0, arc_deg: float = 136.0, middle_deg: float = -88.0, radius_m: float = 1.42, height_m: float = 1.38,
+    n_frames: int, *, seed: int = 0, arc_deg: float = 136.0, middle_deg: float = -88.0,
+    radius_m: float = 1.42, height_m: float = 1.38,
     target: tuple[float, float, float] = (0.02, 0.08, 0.56), shake: float = 1.0,
 ) -> np.ndarray:  # fmt: skip
     """Walk an arc around the table as a person does: (n, 4, 4) world_from_camera.
@@ -345,7 +346,7 @@ def pan_path(
     """Turn on the spot, without any parallax: (n, 4, 4)."""
     angles = np.radians(90 + arc_deg * np.linspace(-0.5, 0.5, n_frames))
     at = np.array(position)
-    return np.stack([look_at(at, at + (np.cos(a), np.sin(a), -0.4)) for a in angles])
+    return np.stack([look_at(at, at + np.array([np.cos(a), np.sin(a), -0.4])) for a in angles])
 
 
 def phone_camera(width: int, height: int, fov_deg: float = 62.0) -> Camera:

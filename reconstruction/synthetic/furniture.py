@@ -1,4 +1,4 @@
-"""The things of generated rooms. Each maker returns closed parts in object space; parts overlap where they join.
+"""The things of generated rooms. Makers return closed parts in object space; parts overlap where they join.
 
 Everything stands on the plane z = 0 of its own space, which is where contact with its support is exact.
 """
@@ -274,7 +274,7 @@ def make_bowl(shop: Workshop, name: str) -> Model:
 
 
 def make_picture(shop: Workshop, name: str) -> Model:
-    """A framed picture: 0.62 x 0.46 m, 25 mm deep; hangs with its back at y = 0, faces -y, bottom at z = 0."""
+    """A framed picture: 0.62 x 0.46 m, 25 mm deep; its back is at y = 0, it faces -y, bottom at z = 0."""
     width, height, depth, bar = 0.62, 0.46, 0.025, 0.035
     look = {
         "*": textures.wood(shop.rng, 0.8, 0.4, 1000 * shop.density, shop.color((84, 54, 34))),

@@ -1,7 +1,7 @@
-"""Furnish a room: floor, three walls and things that stand exactly on each other; the true entities and relations.
+"""Furnish a room: floor, three walls, things that stand exactly on each other; true entities and relations.
 
-World space: metres, +z up, floor at z = 0. The table stands near the origin, walls are to the north (+y), west (-x)
-and east (+x); the south is open, where the camera walks.
+World space: metres, +z up, floor at z = 0. The table stands near the origin, walls are to the north (+y),
+west (-x) and east (+x); the south is open, where the camera walks.
 """
 
 from collections.abc import Sequence
@@ -122,7 +122,7 @@ def _plan_of(objects: Sequence[str] | None) -> tuple[Spot, ...]:
 
 
 def _base_solids(step_m: float) -> list[tuple[str, str, Solid]]:
-    """Return (name, label, solid) of floor and walls: slabs whose inner faces are the floor and wall planes."""
+    """Return (name, label, solid) of floor and walls: slabs whose inner faces are the planes."""
     wall_step_m = (
         max(step_m, min(3 * step_m, 0.12)) if step_m < COARSE else COARSE
     )  # shadows on walls are broad

@@ -1,11 +1,13 @@
 """Closed procedural solids made of textured grid patches: boxes, turned bodies (lathe), bent tubes.
 
-Solids are built twice: finely for drawing (light is stored per vertex, so the grid must follow shadows) and coarsely
-for the true mesh. Local space: +z up, metres, origin at the bottom centre. Texture coordinates are metres.
+Solids are built twice: finely for drawing (light is stored per vertex, so the grid must follow shadows) and
+coarsely for the true mesh. Local space: +z up, metres, origin at the bottom centre. Texture coordinates are
+metres.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -27,7 +29,7 @@ Solid = tuple[Patch, ...]  # patches that close a volume
 
 
 def grid_patch(points: np.ndarray, uvs_m: np.ndarray, texture: str) -> Patch:
-    """Make a patch from a grid of points (r, c, 3); rows x columns turns counter-clockwise seen from outside."""
+    """Make a patch from a grid of points (r, c, 3); rows x columns points outwards."""
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
@@ -105,17 +107,17 @@ def box(
 def _resample(points: np.ndarray, step: float) -> np.ndarray:
     """Divide a polyline (k, 2) into pieces no longer than `step`."""
     out = [points[:1]]
-    for a, b in zip(points[:-1], points[1:]):
+    for a, b in pairwise(points):
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / step)))
         out.append(a + np.linspace(0, 1, count + 1)[1:, None] * (b - a))
     return np.concatenate(out)
 
 
 def lathe(profile: list[tuple[np.ndarray, str]], step: float, segments: int = 48) -> Solid:
-    """Turn a profile around z. Pieces (k, 2) of (radius, height) join at sharp edges and each has its texture.
+    """Turn a profile around z. Pieces (k, 2) of (radius, height) join at sharp edges, each has its texture.
 
-    The profile runs counter-clockwise seen in the (radius, height) plane: along the bottom outwards, up the outside,
-    back inwards to the axis.
+    The profile runs counter-clockwise seen in the (radius, height) plane: along the bottom outwards, up the
+    outside, back inwards to the axis.
     """
     turn = np.linspace(2 * np.pi, 0, segments + 1)  # backwards, so that patches face outwards
     angles = turn.copy()
@@ -135,7 +137,7 @@ def lathe(profile: list[tuple[np.ndarray, str]], step: float, segments: int = 48
 
 
 def tube(path: np.ndarray, radius: tuple[float, float], texture: str, sides: int = 12) -> Solid:
-    """Sweep an ellipse (radius across y, radius in the xz plane) along a path (k, 3) in the xz plane, capped."""
+    """Sweep an ellipse (radius along y, in the xz plane) along a path (k, 3) in the xz plane; cap it."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.array([0.0, 1.0, 0.0])

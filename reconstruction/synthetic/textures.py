@@ -1,10 +1,11 @@
 """Procedural textures at real-world scale: noise, wood, tiles, plaster, wallpaper, printed labels, pictures.
 
-Every maker takes a random generator and a size in metres and returns a `Texture`. They carry detail at several
-octaves because structure from motion needs corners at every viewing distance.
+Every maker takes a random generator and a size in metres and returns a `Texture`. They carry detail at
+several octaves because structure from motion needs corners at every viewing distance.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -35,7 +36,7 @@ def octave_noise(
     octaves: int,
     gain: float = 0.6,
 ) -> np.ndarray:
-    """Sum smooth noise whose cells start at `coarsest_px` (x, y) and halve per octave; float32 (h, w), unit variance."""
+    """Sum smooth noise; cells start at `coarsest_px` (x, y), halve per octave; float32 (h, w), variance 1."""
     height, width = shape
     total = np.zeros(shape, np.float32)
     for octave in range(octaves):
@@ -118,7 +119,7 @@ def _cut_into_boards(rng: np.random.Generator, image: np.ndarray, board_px: floa
     height, width = image.shape[:2]
     rows = max(1, round(height / board_px))
     edges = np.linspace(0, height, rows + 1).astype(int)
-    for top, bottom in zip(edges[:-1], edges[1:]):
+    for top, bottom in pairwise(edges):
         x = int(rng.uniform(0, 6 * board_px))
         start = 0
         while start < width:
@@ -156,7 +157,7 @@ def tiles(
 def wallpaper(
     rng: np.random.Generator, width_m: float, height_m: float, density: float, rgb: tuple[float, float, float]
 ) -> Texture:
-    """Leaves and dots scattered at random (not on a lattice: repeats would mislead matching) over faint stripes."""
+    """Leaves and dots scattered at random (a lattice would mislead matching) over faint stripes."""
     shape = _shape(width_m, height_m, density)
     image = _color_image(shape, rgb)
     stripes = np.sin(np.arange(shape[1]) * 2 * np.pi / (0.12 * density)) > 0
@@ -216,10 +217,10 @@ def _print_lines(
 
 
 def label(
-    rng: np.random.Generator, width_m: float, height_m: float, density: float, rgb: tuple[float, float, float],
-    lines: tuple[str, ...], repeats: int = 1,
+    rng: np.random.Generator, width_m: float, height_m: float, density: float,
+    rgb: tuple[float, float, float], lines: tuple[str, ...], repeats: int = 1,
 ) -> Texture:  # fmt: skip
-    """A printed package: bands, a title in large letters, small print, dots and a bar code, `repeats` times around."""
+    """A printed package: bands, a title, small print, dots and a bar code, `repeats` times around."""
     shape = _shape(width_m, height_m, density)
     image = _color_image(shape, rgb)
     base = np.array(rgb, np.float32)

@@ -339,7 +339,8 @@ def test_4k_at_60_frames_per_second_needs_little_memory(tmp_path):
     write_4k60(tmp_path / "v.mp4", 4.0)
     code = (
         "import resource, sys; from pathlib import Path; from reconstruction.frames import *;"
-        "found = load_frames(Path(sys.argv[1]), FramesConfig()); assert found.images.shape[1:3] == (540, 960);"
+        "found = load_frames(Path(sys.argv[1]), FramesConfig());"
+        "assert found.images.shape[1:3] == (540, 960);"
         "assert found.source.frame_count == 240; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
     done = subprocess.run(
