@@ -1,0 +1,134 @@
+"""Why an input cannot be reconstructed, in words for the person who filmed it."""
+
+import cv2
+import numpy as np
+
+from reconstruction.poses.features import Features
+from reconstruction.poses.pairs import VerifiedPair
+from registry.errors import InputError
+
+MIN_FRAMES = 8
+_MIN_FEATURES = 60  # fewer in the median frame: nothing to match
+_STILL_SHARE = 0.01  # of the image's diagonal; a camera that moves less over the whole video is still
+_HOMOGRAPHY_ERROR_PX = 3.0
+_ROTATION_EXPLAINED = 0.95  # share of matches that one homography explains when the camera only turns
+_MIN_TRIANGULATION_DEG = 2.0
+
+_HOW_TO_FILM = (
+    "Film again: walk sideways around the things for 10-60 s, slowly, in good light, so that every spot is "
+    "seen from several places."
+)
+
+
+def check_features(features: list[Features], indices: np.ndarray) -> None:
+    """Raise `InputError` where there is nothing to match."""
+    if len(features) < MIN_FRAMES:
+        raise InputError(
+            f"poses: {len(features)} usable frames, at least {MIN_FRAMES} are needed. {_HOW_TO_FILM}"
+        )
+    counts = np.array([len(f.keypoints) for f in features])
+    if np.median(counts) < _MIN_FEATURES:
+        raise InputError(
+            f"poses: the frames show almost no texture (median {int(np.median(counts))} features per frame, "
+            f"{_MIN_FEATURES} are needed; frames {_ranges(indices[counts < _MIN_FEATURES])}). A blank wall, "
+            "darkness or heavy blur cannot be reconstructed. Film something with texture, with more light, "
+            "moving more slowly."
+        )
+
+
+def check_motion(features: list[Features], pairs: list[VerifiedPair], image_size: tuple[int, int]) -> None:
+    """Raise `InputError` where the frames do not overlap, the camera stood still or only turned."""
+    if not pairs:
+        raise InputError(
+            f"poses: no two of the {len(features)} frames could be matched: they show different things, "
+            f"are blurred, or repeat one pattern. {_HOW_TO_FILM}"
+        )
+    moved, explained, modulus = zip(*(_pair_motion(features, pair) for pair in pairs))
+    diagonal = float(np.hypot(*image_size))
+    if np.quantile(moved, 0.95) < _STILL_SHARE * diagonal:
+        raise InputError(
+            f"poses: the camera stood still (the picture moves by {np.quantile(moved, 0.95):.1f} px over the "
+            f"whole video). Depth needs a camera that moves. {_HOW_TO_FILM}"
+        )
+    explained, modulus = np.array(explained), np.array(modulus)
+    # A camera that turns on the spot maps every frame to every other by K R K^-1, whose eigenvalues have
+    # modulus 1 whatever K is; a camera that moves past a plane also gives homographies, but not such ones.
+    far = np.array(moved) > np.median(moved)
+    if not far.any():
+        far[:] = True
+    if np.quantile(explained[far], 0.1) > _ROTATION_EXPLAINED and np.median(modulus[far]) < 0.02:
+        raise InputError(
+            "poses: the camera only turned on the spot: one rotation explains "
+            f"{100 * np.median(explained[far]):.0f} % of the matches, so there is no parallax and no depth. "
+            f"{_HOW_TO_FILM}"
+        )
+
+
+def check_model(model: object | None, chosen: int, indices: np.ndarray, min_share: float) -> None:
+    """Raise `InputError` where too few frames were registered or the model has no depth."""
+    registered = [] if model is None else sorted(i - 1 for i in model.reg_image_ids())
+    least = max(MIN_FRAMES, int(np.ceil(min_share * chosen)))
+    if len(registered) < least:
+        missing = np.delete(np.asarray(indices), registered)
+        found = (
+            "no pair of frames with enough parallax to start from was found"
+            if not registered
+            else (
+                f"{len(registered)} of {chosen} frames could be registered "
+                f"({100 * len(registered) / chosen:.0f} %), {least} are needed"
+            )
+        )
+        raise InputError(
+            f"poses: {found}; not registered: frames {_ranges(missing)}. They are blurred, show too little "
+            f"texture, or share too little with the others. {_HOW_TO_FILM}"
+        )
+    angle = _median_triangulation_deg(model)
+    if angle < _MIN_TRIANGULATION_DEG:
+        raise InputError(
+            f"poses: the camera hardly moved: points are seen under {angle:.1f} degrees of parallax, "
+            f"{_MIN_TRIANGULATION_DEG:.0f} are needed. {_HOW_TO_FILM}"
+        )
+
+
+def _pair_motion(features: list[Features], pair: VerifiedPair) -> tuple[float, float, float]:
+    """Return the median motion in px, the share one homography explains, and its | |eigenvalue| - 1 |."""
+    i, j = pair.rows
+    a, b = features[i].keypoints[pair.matches[:, 0]], features[j].keypoints[pair.matches[:, 1]]
+    moved = float(np.median(np.linalg.norm(a - b, axis=1)))
+    # Centered and scaled coordinates change neither the fit nor the eigenvalues, but condition both.
+    matrix, inliers = cv2.findHomography(a, b, cv2.USAC_DEFAULT, _HOMOGRAPHY_ERROR_PX)
+    if matrix is None:
+        return moved, 0.0, np.inf
+    matrix = matrix / np.cbrt(np.linalg.det(matrix))
+    return moved, float(inliers.mean()), float(np.abs(np.abs(np.linalg.eigvals(matrix)) - 1).max())
+
+
+def _median_triangulation_deg(model: object) -> float:
+    """Return the median over points of the widest angle between two of the rays that see a point."""
+    centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
+    angles = []
+    for point_id in sorted(model.point3D_ids())[:: max(1, model.num_points3D() // 2000)]:
+        point = model.point3D(point_id)
+        rays = np.stack([centers[e.image_id] for e in point.track.elements]) - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
+    return float(np.degrees(np.median(angles))) if angles else 0.0
+
+
+def _ranges(numbers: np.ndarray, most: int = 6) -> str:
+    """Write sorted frame numbers briefly: neighbors in the list that are near each other become a range."""
+    numbers = [int(x) for x in numbers]
+    if not numbers:
+        return "none"
+    step = max(2, int(np.median(np.diff(numbers))) * 2) if len(numbers) > 1 else 2
+    runs = [[numbers[0], numbers[0]]]
+    for x in numbers[1:]:
+        if x - runs[-1][1] <= step:
+            runs[-1][1] = x
+        else:
+            runs.append([x, x])
+    text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs[:most])
+    return text + (f" and {len(runs) - most} more ranges" if len(runs) > most else "")
+
+
+describe_frames = _ranges

@@ -1,0 +1,250 @@
+"""Stage 2: one camera per frame, in `sfm` space.
+
+SIFT, matching of likely pairs, COLMAP's incremental mapper (the global one as the second try), a robust
+bundle adjustment. Held-out frames are located against the finished model and never enter it.
+"""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.poses import diagnose, importers, mapping
+from reconstruction.poses.config import PosesConfig
+from reconstruction.poses.features import Features, extract_features, match, overlap_scores
+from reconstruction.poses.held_out import candidates_in_time, locate_frames
+from reconstruction.poses.pairs import choose_pairs, verify_pairs
+from reconstruction.poses.refine import refine_model
+from reconstruction.poses.undistort import undistort
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.types import FrameSet, PosedFrames
+
+_DEFAULT_FOCAL_SHARE = 1.0  # of the longer side, where the metadata says nothing
+
+
+def estimate_poses(
+    frames: FrameSet, config: PosesConfig, *, work_dir: Path, progress: Progress = NO_PROGRESS
+) -> PosedFrames:
+    """Estimate one camera per frame.
+
+    Args:
+        frames: keyframes and held-out frames.
+        config: settings; equal settings and frames give equal bits on one machine.
+        work_dir: folder for COLMAP's database, models and logs; created, may be deleted afterwards.
+        progress: told about features, matching, mapping and held-out frames.
+
+    Returns:
+        Undistorted frames that could be registered, with cameras and sparse points in `sfm` space.
+
+    Raises:
+        InputError: the frames cannot be reconstructed; the message says why and what to do.
+        UsageError: `config.import_path` cannot be read or does not fit the frames.
+    """
+    work_dir.mkdir(parents=True, exist_ok=True)
+    with mapping.colmap_log(work_dir):
+        progress.start(len(frames.images), "features")
+        features = extract_features(frames.images, config.max_features, config.contrast_threshold, progress)
+        diagnose.check_features(features, frames.indices)
+        known: dict[int, np.ndarray] = {}
+        if config.import_path:
+            imported = importers.read_poses(Path(config.import_path), frames)
+            known = imported.world_from_camera
+            model = _triangulate(imported, frames, features, config, work_dir, progress)
+        else:
+            model = _reconstruct(frames, features, config, work_dir, progress)
+        registered = sorted(i - 1 for i in model.reg_image_ids())
+        _note_missing(frames, registered, progress)
+        held_out = _locate_held_out(frames, features, model, registered, known, config, progress)
+    return _package(frames, model, registered, held_out)
+
+
+def initial_camera(frames: FrameSet, config: PosesConfig) -> object:
+    """Return the shared camera that the mapper starts from."""
+    import pycolmap
+
+    height, width = frames.images.shape[1:3]
+    focal = frames.focal_prior_px or _DEFAULT_FOCAL_SHARE * max(width, height)
+    name = "SIMPLE_RADIAL" if config.camera_model == "auto" else config.camera_model
+    camera = pycolmap.Camera.create_from_model_name(1, name, focal, width, height)
+    camera.has_prior_focal_length = frames.focal_prior_px > 0
+    return camera
+
+
+def _matched_database(
+    frames: FrameSet,
+    features: list[Features],
+    camera: object,
+    config: PosesConfig,
+    path: Path,
+    progress: Progress,
+) -> list:
+    """Match likely pairs and write the database; return the verified pairs."""
+    progress.start(len(features) - 1, "overlap")
+    scores = overlap_scores(features, progress)
+    pairs = choose_pairs(scores, frames.ordered, config)
+    progress.start(len(pairs), "matching")
+    verified = verify_pairs(pairs, features, camera, config, progress)
+    path.unlink(missing_ok=True)
+    mapping.write_database(path, camera, features, verified)
+    return verified
+
+
+def _reconstruct(
+    frames: FrameSet, features: list[Features], config: PosesConfig, work_dir: Path, progress: Progress
+) -> object:
+    """Run structure from motion; return the refined model of the largest consistent component."""
+    camera = initial_camera(frames, config)
+    database = work_dir / "database.db"
+    pairs = _matched_database(frames, features, camera, config, database, progress)
+    diagnose.check_motion(features, pairs, (camera.width, camera.height))
+    chosen = len(frames.images)
+    progress.start(chosen, "mapping")
+    models = mapping.incremental_models(database, work_dir, config, chosen, progress)
+    first = models[0].num_reg_images() if models else 0
+    if first < config.second_try_below_share * chosen:
+        other = mapping.global_models(database, work_dir, config)
+        second = other[0].num_reg_images() if other else 0
+        progress.note(
+            f"poses: the incremental mapper registered {first} of {chosen} frames, the global mapper "
+            f"{second}; the {'global' if second > first else 'incremental'} model is kept"
+        )
+        models = other if second > first else models
+    if models:
+        refine_model(models[0], config)
+    diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
+    return models[0]
+
+
+def _triangulate(
+    imported: "importers.ImportedPoses",
+    frames: FrameSet,
+    features: list[Features],
+    config: PosesConfig,
+    work_dir: Path,
+    progress: Progress,
+) -> object:
+    """Return a model with the imported cameras, fixed, and points triangulated from our own matches."""
+    import pycolmap
+
+    database = work_dir / "database.db"
+    _matched_database(frames, features, imported.camera, config, database, progress)
+    model = importers.model_from_poses(imported, frames, features, database)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = config.threads
+    options.random_seed = config.seed
+    options.extract_colors = False
+    options.min_num_matches = config.min_inliers
+    output = work_dir / "triangulated"
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    model = pycolmap.triangulate_points(model, database, work_dir, output, True, options)
+    importers.check_consistency(model, config)
+    return model
+
+
+def _note_missing(frames: FrameSet, registered: list[int], progress: Progress) -> None:
+    missing = np.delete(frames.indices, registered)
+    if len(missing):
+        progress.note(
+            f"poses: {len(missing)} of {len(frames.indices)} keyframes were not registered and are dropped: "
+            f"frames {diagnose.describe_frames(missing)}"
+        )
+
+
+def _locate_held_out(
+    frames: FrameSet,
+    features: list[Features],
+    model: object,
+    registered: list[int],
+    known: dict[int, np.ndarray],
+    config: PosesConfig,
+    progress: Progress,
+) -> list[tuple[int, np.ndarray]]:
+    """Return (held-out row, world_from_camera) of those that could be located."""
+    total = len(frames.held_out_images)
+    rows = [row for row in range(total) if int(frames.held_out_indices[row]) not in known]
+    progress.start(len(rows), "held-out frames")
+    queries = extract_features(
+        frames.held_out_images[rows], config.max_features, config.contrast_threshold, NO_PROGRESS
+    )
+    if frames.ordered:
+        candidates = [
+            candidates_in_time(frames.times_s, registered, frames.held_out_times_s[row]) for row in rows
+        ]
+    else:
+        candidates = [_most_alike(query, features, registered) for query in queries]
+    located = dict(zip(rows, locate_frames(queries, candidates, features, model, config, progress)))
+    for row in range(total):
+        if row not in located:
+            located[row] = known[int(frames.held_out_indices[row])]
+    failed = [row for row in range(total) if located[row] is None]
+    if failed:
+        progress.note(
+            f"poses: {len(failed)} of {total} held-out frames could not be located and are not evaluated: "
+            f"frames {diagnose.describe_frames(frames.held_out_indices[failed])}"
+        )
+    return [(row, located[row]) for row in range(total) if located[row] is not None]
+
+
+def _most_alike(query: Features, features: list[Features], registered: list[int]) -> list[int]:
+    strong = query.descriptors[:512]
+    counts = np.array([len(match(strong, features[row].descriptors[:512])) for row in registered])
+    return [registered[i] for i in np.argsort(-counts, kind="stable")]
+
+
+def _package(
+    frames: FrameSet, model: object, registered: list[int], held_out: list[tuple[int, np.ndarray]]
+) -> PosedFrames:
+    """Undistort and put everything into the artifact."""
+    poses = mapping.poses_of(model)
+    point_ids = sorted(model.point3D_ids())
+    frame_row = {row + 1: new for new, row in enumerate(registered)}
+    observations = [
+        (frame_row[element.image_id], point_row)
+        for point_row, point_id in enumerate(point_ids)
+        for element in model.point3D(point_id).track.elements
+        if element.image_id in frame_row
+    ]
+    observations = np.array(sorted(set(observations)), np.int32).reshape(-1, 2)
+    points = np.array([model.point3D(i).xyz for i in point_ids], np.float64).reshape(-1, 3)
+    errors = np.array([model.point3D(i).error for i in point_ids], np.float32)
+    colors = _point_colors(model, point_ids, frames.images)
+    camera, (images, held_out_images) = undistort(
+        model.cameras[min(model.cameras)],
+        [frames.images[registered], frames.held_out_images[[row for row, _ in held_out]]],
+    )
+    held_rows = [row for row, _ in held_out]
+    return PosedFrames(
+        source=frames.source,
+        camera=camera,
+        images=images,
+        indices=frames.indices[registered],
+        times_s=frames.times_s[registered],
+        world_from_camera=np.stack([poses[row] for row in registered]),
+        sharpness=frames.sharpness[registered],
+        held_out_images=held_out_images,
+        held_out_indices=frames.held_out_indices[held_rows],
+        held_out_times_s=frames.held_out_times_s[held_rows],
+        held_out_world_from_camera=np.array([pose for _, pose in held_out], np.float64).reshape(-1, 4, 4),
+        points=points,
+        point_colors=colors,
+        point_errors_px=errors,
+        observations=observations,
+        chosen_frames=len(frames.images),
+        ordered=frames.ordered,
+        reprojection_error_px=float(model.compute_mean_reprojection_error()),
+    )
+
+
+def _point_colors(model: object, point_ids: list[int], images: np.ndarray) -> np.ndarray:
+    """Return the mean color (p, 3) of each point over the frames that see it."""
+    height, width = images.shape[1:3]
+    out = np.zeros((len(point_ids), 3), np.uint8)
+    keypoints = {i: np.array([p.xy for p in model.image(i).points2D]) for i in model.reg_image_ids()}
+    for row, point_id in enumerate(point_ids):
+        colors = []
+        for element in model.point3D(point_id).track.elements:
+            x, y = keypoints[element.image_id][element.point2D_idx]
+            colors.append(images[element.image_id - 1, min(int(y), height - 1), min(int(x), width - 1)])
+        out[row] = np.mean(colors, axis=0).round()
+    return out

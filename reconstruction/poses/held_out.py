@@ -1,0 +1,87 @@
+"""Cameras of frames that took no part in the reconstruction, against the finished model."""
+
+import numpy as np
+
+from reconstruction.poses.config import PosesConfig
+from reconstruction.poses.features import Features, match
+from reconstruction.progress import Progress
+
+_NEIGHBORS = 8
+_MAX_ERROR_PX = 3.0
+
+
+def locate_frames(
+    queries: list[Features],
+    candidates: list[list[int]],
+    features: list[Features],
+    model: object,
+    config: PosesConfig,
+    progress: Progress,
+) -> list[np.ndarray | None]:
+    """Locate each query frame: world_from_camera (4, 4), or None where too few 2D-3D matches agree.
+
+    Args:
+        queries: features of the frames to locate.
+        candidates: for each query, registered frame rows that probably show the same, best first.
+        features: features of all keyframes, in the order of the model's 2D points.
+        model: pycolmap.Reconstruction; neither it nor its camera is changed.
+        config: seed and thresholds.
+        progress: advanced by one per query.
+    """
+    tracked = {row: _tracked_features(model, row) for row in sorted({r for rows in candidates for r in rows})}
+    positions = {i: model.point3D(i).xyz for i in sorted(model.point3D_ids())}
+    camera = model.cameras[min(model.cameras)]
+    out = []
+    for query, rows in zip(queries, candidates):
+        votes: dict[tuple[int, int], int] = {}
+        for row in rows[:_NEIGHBORS]:
+            feature_rows, point_ids = tracked[row]
+            for a, b in match(query.descriptors, features[row].descriptors[feature_rows]):
+                key = (int(a), int(point_ids[b]))
+                votes[key] = votes.get(key, 0) + 1
+        out.append(_solve(query, votes, positions, camera, config))
+        progress.advance()
+    return out
+
+
+def candidates_in_time(times_s: np.ndarray, registered: list[int], query_time_s: float) -> list[int]:
+    """Return registered rows, nearest in time first."""
+    gaps = np.abs(np.asarray(times_s)[registered] - query_time_s)
+    return [registered[i] for i in np.argsort(gaps, kind="stable")[:_NEIGHBORS]]
+
+
+def _tracked_features(model: object, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of a frame's features that have a 3D point, and the ids of those points."""
+    found = [(i, p.point3D_id) for i, p in enumerate(model.image(row + 1).points2D) if p.has_point3D()]
+    return np.array([f[0] for f in found], np.int64), np.array([f[1] for f in found], np.int64)
+
+
+def _solve(
+    query: Features,
+    votes: dict[tuple[int, int], int],
+    positions: dict[int, np.ndarray],
+    camera: object,
+    config: PosesConfig,
+) -> np.ndarray | None:
+    """Absolute pose from one 3D point for each 2D feature: the one that most neighbors agree on."""
+    import pycolmap
+
+    best: dict[int, tuple[int, int]] = {}
+    for (feature, point), count in sorted(votes.items()):
+        if feature not in best or count > best[feature][0]:
+            best[feature] = (count, point)
+    if len(best) < config.min_held_out_inliers:
+        return None
+    points_2d = query.keypoints[list(best)].astype(np.float64)
+    points_3d = np.stack([positions[point] for _, point in best.values()])
+    estimation = pycolmap.AbsolutePoseEstimationOptions()
+    estimation.ransac.max_error = _MAX_ERROR_PX
+    estimation.ransac.random_seed = config.seed
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    refinement.loss_function_scale = 0.5
+    answer = pycolmap.estimate_and_refine_absolute_pose(points_2d, points_3d, camera, estimation, refinement)
+    if answer is None or answer["num_inliers"] < config.min_held_out_inliers:
+        return None
+    camera_from_world = np.eye(4)
+    camera_from_world[:3] = answer["cam_from_world"].matrix()
+    return np.linalg.inv(camera_from_world)

@@ -1,0 +1,127 @@
+"""Structure from motion by COLMAP: a database of verified pairs in, the largest consistent model out."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.poses.config import PosesConfig
+from reconstruction.poses.features import Features
+from reconstruction.poses.pairs import VerifiedPair
+from reconstruction.progress import Progress
+
+
+@contextlib.contextmanager
+def colmap_log(folder: Path) -> Iterator[None]:
+    """Send what COLMAP logs to files in `folder` instead of the terminal while the block runs."""
+    import pycolmap
+
+    log = pycolmap.logging
+    names = ("alsologtostderr", "logtostderr", "logtostdout", "stderrthreshold")
+    before = {name: getattr(log, name) for name in names}
+    log.alsologtostderr = log.logtostderr = log.logtostdout = False
+    log.stderrthreshold = int(log.Level.FATAL)
+    for level in (log.Level.INFO, log.Level.WARNING, log.Level.ERROR):
+        log.set_log_destination(level, folder / f"colmap_{level.name.lower()}_")
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(log, name, value)
+
+
+def frame_name(row: int) -> str:
+    """Name of a keyframe inside COLMAP; sorts by row."""
+    return f"{row:05d}.png"
+
+
+def write_database(path: Path, camera: object, features: list[Features], pairs: list[VerifiedPair]) -> None:
+    """Write what the mapper reads. Image ids are row + 1, so that every run numbers them alike."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        camera.camera_id = database.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(camera.sensor_id)
+        rig.rig_id = database.write_rig(rig)
+        for row, feature in enumerate(features):
+            image = pycolmap.Image(name=frame_name(row), camera_id=camera.camera_id, image_id=row + 1)
+            image.image_id = database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame()
+            frame.frame_id = row + 1
+            frame.rig_id = rig.rig_id
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(row + 1, feature.keypoints)
+        for pair in pairs:
+            i, j = pair.rows
+            database.write_matches(i + 1, j + 1, pair.matches)
+            database.write_two_view_geometry(i + 1, j + 1, pair.geometry)
+
+
+def incremental_models(
+    database: Path, work_dir: Path, config: PosesConfig, total: int, progress: Progress
+) -> list[object]:
+    """Run the incremental mapper; return its models, largest first."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = config.threads
+    options.random_seed = config.seed
+    options.min_num_matches = config.min_inliers
+    options.extract_colors = False
+    options.max_num_models = 6
+    options.max_model_overlap = 20
+    options.min_model_size = 5
+    options.ba_global_frames_ratio = 1.4
+    options.ba_global_points_ratio = 1.4
+    options.ba_global_max_num_iterations = 20
+    options.ba_global_max_refinements = 2
+    options.ba_local_max_num_iterations = 15
+    options.mapper.abs_pose_max_error = 8.0
+    output = work_dir / "incremental"
+    output.mkdir(parents=True, exist_ok=True)
+    done = [0]
+
+    def one_more() -> None:
+        if done[0] < total:  # a second model may register a frame again
+            done[0] += 1
+            progress.advance()
+
+    models = pycolmap.incremental_mapping(
+        database,
+        work_dir,
+        output,
+        options,
+        initial_image_pair_callback=one_more,
+        next_image_callback=one_more,
+    )
+    return _by_size(models)
+
+
+def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[object]:
+    """Run the global mapper; return its models, largest first."""
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = config.threads
+    options.random_seed = config.seed
+    options.min_num_matches = config.min_inliers
+    output = work_dir / "global"
+    output.mkdir(parents=True, exist_ok=True)
+    return _by_size(pycolmap.global_mapping(database, work_dir, output, options))
+
+
+def _by_size(models: dict[int, object]) -> list[object]:
+    return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+
+
+def poses_of(model: object) -> dict[int, np.ndarray]:
+    """Return world_from_camera (4, 4) by frame row."""
+    out = {}
+    for image_id in sorted(model.reg_image_ids()):
+        camera_from_world = np.eye(4)
+        camera_from_world[:3] = model.image(image_id).cam_from_world().matrix()
+        out[image_id - 1] = np.linalg.inv(camera_from_world)
+    return out

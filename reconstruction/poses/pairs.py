@@ -1,0 +1,109 @@
+"""Which frames to match with which, and what geometry each pair agrees on."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from reconstruction.poses.config import PosesConfig
+from reconstruction.poses.features import Features, match
+from reconstruction.progress import Progress
+
+_MIN_OVERLAP_SCORE = (
+    6  # mutual matches among the largest features; below it full matching finds next to nothing
+)
+_EXHAUSTIVE_BELOW = 40  # frames: all pairs are then cheaper than being clever
+_MAX_EPIPOLAR_ERROR_PX = 3.0
+
+
+@dataclass(frozen=True)
+class VerifiedPair:
+    """Two frames that see the same things from two places."""
+
+    rows: tuple[int, int]
+    matches: np.ndarray  # uint32 (k, 2) rows of both frames' features, all agree with `geometry`
+    geometry: object  # pycolmap.TwoViewGeometry
+
+
+def choose_pairs(scores: np.ndarray, ordered: bool, config: PosesConfig) -> list[tuple[int, int, bool]]:
+    """Choose pairs (row, later row, near): neighbors in time, and each frame's partners that look most alike.
+
+    Args:
+        scores: int (n, n) symmetric, from `overlap_scores`.
+        ordered: rows follow each other in time.
+        config: overlap and number of partners.
+    """
+    n = len(scores)
+    gap = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    likely = (scores >= _MIN_OVERLAP_SCORE) & (gap > 0)
+    if n <= _EXHAUSTIVE_BELOW:
+        likely |= scores > 1
+    rank = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1, kind="stable")
+    partner = likely & (rank < config.max_pairs_per_frame)
+    wanted = partner | partner.T
+    near = np.zeros_like(wanted)
+    if ordered:
+        near = (gap > 0) & (gap <= max(1, config.sequential_overlap // 2))
+        wanted |= (gap > 0) & (gap <= config.sequential_overlap)
+        # Powers of two further on tie the chain together at every time scale (as COLMAP's quadratic overlap).
+        power = 2 * config.sequential_overlap
+        while power < n:
+            wanted |= (gap == power) & likely
+            power *= 2
+    rows, columns = np.nonzero(np.triu(wanted))
+    return [(int(i), int(j), bool(near[i, j])) for i, j in zip(rows, columns)]
+
+
+def verify_pairs(
+    pairs: list[tuple[int, int, bool]],
+    features: list[Features],
+    camera: object,
+    config: PosesConfig,
+    progress: Progress,
+) -> list[VerifiedPair]:
+    """Match the features of each pair and keep the pairs whose matches agree with one two-view geometry.
+
+    Pairs far apart in time are matched by the stronger half of the features only: a quarter of the cost, and
+    weak features rarely survive a large change of view.
+    """
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = config.min_inliers
+    options.detect_watermark = False
+    options.ransac.random_seed = config.seed
+    options.ransac.max_error = _MAX_EPIPOLAR_ERROR_PX
+    options.ransac.max_num_trials = 2000  # the matches given are inliers already
+    out = []
+    for i, j, near in pairs:
+        progress.advance()
+        a, b = features[i], features[j]
+        limit = config.max_features if near else max(512, config.max_features // 2)
+        matches = match(a.descriptors[:limit], b.descriptors[:limit])
+        matches = _epipolar_inliers(a.keypoints, b.keypoints, matches, config.min_inliers)
+        if len(matches) < config.min_inliers:
+            continue
+        geometry = pycolmap.estimate_two_view_geometry(
+            camera,
+            a.keypoints.astype(np.float64),
+            camera,
+            b.keypoints.astype(np.float64),
+            matches.astype(np.uint32),
+            options,
+        )
+        if len(geometry.inlier_matches) >= config.min_inliers:
+            out.append(VerifiedPair((i, j), np.asarray(geometry.inlier_matches), geometry))
+    return out
+
+
+def _epipolar_inliers(a: np.ndarray, b: np.ndarray, matches: np.ndarray, least: int) -> np.ndarray:
+    """Keep the matches that agree with one fundamental matrix (OpenCV's sampler rejects quickly)."""
+    if len(matches) < least:
+        return matches[:0]
+    try:
+        matrix, inliers = cv2.findFundamentalMat(
+            a[matches[:, 0]], b[matches[:, 1]], cv2.USAC_ACCURATE, _MAX_EPIPOLAR_ERROR_PX, 0.999, 5000
+        )
+    except cv2.error:  # degenerate samples only, e.g. all points on one line
+        return matches[:0]
+    return matches[:0] if matrix is None else matches[inliers.ravel() > 0]
