@@ -9,6 +9,7 @@ from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.views import ViewPlan, plan_views
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import Camera, DepthMaps, PosedFrames
+from registry.errors import InputError
 from registry.geometry import invert_rigid
 
 
@@ -18,14 +19,22 @@ def _sized(camera: Camera, side: int) -> Camera:
 
 
 def _gray(images: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return float32 gray frames (n, h, w) at the camera's resolution."""
+    """Return float32 gray levels minus 128 (n, h, w) at the camera's resolution."""
     import cv2
 
     out = np.empty((len(images), camera.height, camera.width), np.float32)
     for i, image in enumerate(images):
         gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float32)
         out[i] = cv2.resize(gray, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    out -= 128.0
     return out
+
+
+def _small_color(image: np.ndarray, camera: Camera) -> np.ndarray:
+    import cv2
+
+    size = (camera.width, camera.height)
+    return cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def _warps(posed: PosedFrames, camera: Camera, i: int, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,6 +67,7 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
     """Sweep, aggregate and refine every frame; return inverse depth and correlation (n, h, w)."""
     import cv2
 
+    from reconstruction.depth.edges import sharpen_edges
     from reconstruction.depth.refine import fit_slopes, refine
     from reconstruction.depth.sgm import aggregate, winner
     from reconstruction.depth.sweep import sweep_costs
@@ -76,10 +86,11 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
             return
         rhos = np.linspace(1.0 / plan.far[i], 1.0 / plan.near[i], config.planes)
         h_inf, shift = _warps(posed, small, i, sources)
-        cost = np.empty((small.height, small.width, config.planes), np.uint8)
+        cost = np.empty((config.planes, small.height, small.width), np.uint8)
         sweep_costs(small_gray[i], small_gray[sources], h_inf, shift, rhos, config.noise_gray, cost)
+        cost = np.ascontiguousarray(np.moveaxis(cost, 0, 2))
         total = np.zeros(cost.shape, np.uint16)
-        aggregate(cost, small_gray[i], p1, p2, 8.0, total)
+        aggregate(cost, small_gray[i], p1, p2, p1 + np.int32(1), 8.0, total)
         coarse = np.empty((small.height, small.width), np.float32)
         winner(total, rhos, coarse)
         rho = cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
@@ -101,7 +112,9 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
                 rho,
                 score,
             )
-        rho_all[i], score_all[i] = rho, score
+        fit_slopes(rho, 0.012, fitted, gx, gy)
+        sharpen_edges(rho, gx, gy, score, _small_color(posed.images[i], camera), rho_all[i])
+        score_all[i] = score
 
     workers.each(len(fine_gray), work, "measuring depth", progress)
     return rho_all, score_all
@@ -121,8 +134,9 @@ def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthCon
         check_view(
             i, rows, depth, weight, relative, k, config.agree_depth, config.agree_px, count[i], fused[i]
         )
-        good = (count[i] >= config.min_agreeing) & (score[i] >= config.min_correlation)
         # A window without contrast correlates with anything a little: such depth needs more witnesses.
+        good = (count[i] >= config.min_agreeing) & (score[i] >= config.min_correlation)
+        good |= (count[i] >= 2 * config.min_agreeing) & (score[i] >= 0.2 * config.min_correlation)
         fused[i] *= good
         fused[i] *= remove_speckles(fused[i], config.min_speckle_px, 0.02)
 
@@ -146,5 +160,16 @@ def estimate_depth(posed: PosedFrames, config: DepthConfig, *, progress: Progres
     depth, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
     confidence = np.where(depth > 0, 2, 0).astype(np.uint8)
     share = float((confidence == 2).mean())
-    progress.note(f"depth: {100 * share:.0f} % of the pixels measured")
+    if share < 0.02:
+        raise InputError(
+            f"depth: only {100 * share:.1f} % of the pixels could be measured. The frames are blurred, blank or do "
+            "not move sideways: film textured things with steady sideways motion and enough light."
+        )
+    if config.complete:
+        from reconstruction.depth.complete import complete_depth
+
+        depth, confidence = complete_depth(posed, camera, plan, depth, raw, config, workers.each, progress)
+    progress.note(
+        f"depth: {100 * share:.0f} % of the pixels measured, {100 * float((confidence == 1).mean()):.0f} % completed"
+    )
     return DepthMaps(camera, depth, confidence)

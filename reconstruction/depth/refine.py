@@ -46,57 +46,71 @@ def fit_slopes(rho, jump, out_rho, out_gx, out_gy):  # pragma: no cover - compil
 
 
 @numba.njit(cache=True, nogil=True)
-def _score(reference, sources, h_inf, shift, y, x, rho, gx, gy, zero, best):  # pragma: no cover - compiled
-    """Correlate the slanted window at (y, x) with all sources; return the mean of the better half."""
+def _window(reference, y, x, values, zero):  # pragma: no cover - compiled
+    """Copy the reference window around (y, x), border repeated; return its mean and floored variance."""
     h, w = reference.shape
+    s, q = np.float32(0.0), np.float32(0.0)
+    n = 0
+    for dy in range(-_RADIUS, _RADIUS + 1, _STRIDE):
+        j = min(max(y + dy, 0), h - 1)
+        for dx in range(-_RADIUS, _RADIUS + 1, _STRIDE):
+            a = reference[j, min(max(x + dx, 0), w - 1)]
+            values[n] = a
+            s += a
+            q += a * a
+            n += 1
+    mean = s / n
+    return mean, max(q / n - mean * mean, np.float32(0.0)) + zero
+
+
+@numba.njit(cache=True, nogil=True)
+def _score(values, mean, variance, sources, maps, rho, gx, gy, zero, best):  # pragma: no cover - compiled
+    """Correlate a slanted window with all sources; return the mean of the two best.
+
+    `maps` (s, 12) holds, for each source, the projection of the pixel and its change along x, y and inverse depth:
+    over the window the numerators and the denominator are affine, which makes a sample cheap.
+    """
     s = sources.shape[0]
     sh, sw = sources.shape[1:]
-    best[:] = -2.0
+    top_u, top_v = np.float32(sw - 1.01), np.float32(sh - 1.01)
+    one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    count = np.float32(((2 * _RADIUS) // _STRIDE + 1) ** 2)
     for k in range(s):
-        m = h_inf[k]
-        t = shift[k]
-        sa, sb, saa, sbb, sab, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0
-        good = True
-        for dy in range(-_RADIUS, _RADIUS + 1, _STRIDE):
-            j = y + dy
-            if j < 0 or j >= h:
-                continue
-            for dx in range(-_RADIUS, _RADIUS + 1, _STRIDE):
-                i = x + dx
-                if i < 0 or i >= w:
-                    continue
-                px, py = i + 0.5, j + 0.5
-                q = rho + gx * dx + gy * dy
-                z = m[2, 0] * px + m[2, 1] * py + m[2, 2] + q * t[2]
-                if z <= 1e-9:
-                    good = False
-                    break
-                u = (m[0, 0] * px + m[0, 1] * py + m[0, 2] + q * t[0]) / z - 0.5
-                v = (m[1, 0] * px + m[1, 1] * py + m[1, 2] + q * t[1]) / z - 0.5
-                if not (u >= 0.0 and v >= 0.0 and u < sw - 1.001 and v < sh - 1.001):
-                    if dx * dx + dy * dy <= 2:
-                        good = False
-                        break
-                    continue
-                ix, iy = int(u), int(v)
-                fx, fy = u - ix, v - iy
-                top = sources[k, iy, ix] * (1 - fx) + sources[k, iy, ix + 1] * fx
-                low = sources[k, iy + 1, ix] * (1 - fx) + sources[k, iy + 1, ix + 1] * fx
-                b = top * (1 - fy) + low * fy
-                a = reference[j, i]
-                sa += a
-                sb += b
-                saa += a * a
-                sbb += b * b
-                sab += a * b
-                n += 1
-            if not good:
-                break
-        if not good or n < 8:
+        m = maps[k]
+        best[k] = -2.0
+        tx, ty, tz = m[9], m[10], m[11]
+        u0, v0, z0 = m[0] + rho * tx, m[1] + rho * ty, m[2] + rho * tz
+        if z0 <= np.float32(1e-9):
             continue
-        va, vb = max(saa / n - (sa / n) ** 2, 0.0) + zero, max(sbb / n - (sb / n) ** 2, 0.0) + zero
-        best[k] = (sab / n - sa * sb / (n * n)) / math.sqrt(va * vb)
-    keep = max(1, (s + 1) // 2)
+        u, v = u0 / z0 - half, v0 / z0 - half
+        if not (u >= nil and v >= nil and u < top_u and v < top_v):
+            continue
+        ux, vx, zx = m[3] + gx * tx, m[4] + gx * ty, m[5] + gx * tz
+        uy, vy, zy = m[6] + gy * tx, m[7] + gy * ty, m[8] + gy * tz
+        sb, sbb, sab = nil, nil, nil
+        n = 0
+        for dy in range(-_RADIUS, _RADIUS + 1, _STRIDE):
+            for dx in range(-_RADIUS, _RADIUS + 1, _STRIDE):
+                fx, fy = np.float32(dx), np.float32(dy)
+                inv = one / (z0 + fx * zx + fy * zy)
+                u = (u0 + fx * ux + fy * uy) * inv - half
+                v = (v0 + fx * vx + fy * vy) * inv - half
+                # Comparisons in this order also catch what is not a number.
+                u = min(max(nil, u), top_u)
+                v = min(max(nil, v), top_v)
+                ix, iy = int(u), int(v)
+                fx, fy = u - np.float32(ix), v - np.float32(iy)
+                top = sources[k, iy, ix] + fx * (sources[k, iy, ix + 1] - sources[k, iy, ix])
+                low = sources[k, iy + 1, ix] + fx * (sources[k, iy + 1, ix + 1] - sources[k, iy + 1, ix])
+                b = top + fy * (low - top)
+                sb += b
+                sbb += b * b
+                sab += values[n] * b
+                n += 1
+        mb = sb / count
+        vb = max(sbb / count - mb * mb, nil) + zero
+        best[k] = (sab / count - mean * mb) / math.sqrt(variance * vb)
+    keep = min(2, s)
     total, used = 0.0, 0
     for _ in range(keep):
         at = int(np.argmax(best))
@@ -111,36 +125,47 @@ def _score(reference, sources, h_inf, shift, y, x, rho, gx, gy, zero, best):  # 
 
 
 @numba.njit(cache=True, nogil=True)
+def _maps(h_inf, shift, y, x, maps):  # pragma: no cover - compiled
+    for k in range(h_inf.shape[0]):
+        for a in range(3):
+            maps[k, a] = h_inf[k, a, 0] * (x + 0.5) + h_inf[k, a, 1] * (y + 0.5) + h_inf[k, a, 2]
+            maps[k, 3 + a] = h_inf[k, a, 0]
+            maps[k, 6 + a] = h_inf[k, a, 1]
+            maps[k, 9 + a] = shift[k, a]
+
+
+@numba.njit(cache=True, nogil=True)
 def refine(
     reference, sources, h_inf, shift, rho, gx, gy, px_step, noise, out_rho, out_score
 ):  # pragma: no cover
     """Try inverse depths around `rho` (h, w) in steps of `px_step` pixels of disparity; keep the best, by parabola."""
     h, w = reference.shape
     s = sources.shape[0]
-    zero = noise * noise
+    zero = np.float32(noise * noise)
     best = np.empty(s)
     line = np.empty(5)
+    maps = np.empty((s, 12), np.float32)
+    values = np.empty(((2 * _RADIUS) // _STRIDE + 1) ** 2, np.float32)
     for y in range(h):
         for x in range(w):
             r = rho[y, x]
+            _maps(h_inf, shift, y, x, maps)
             # Pixels of disparity per unit of inverse depth, in the source where it moves most.
             rate = 1e-12
             for k in range(s):
-                m, t = h_inf[k], shift[k]
-                px, py = x + 0.5, y + 0.5
-                z = m[2, 0] * px + m[2, 1] * py + m[2, 2] + r * t[2]
-                if z <= 1e-9:
-                    continue
-                u = (m[0, 0] * px + m[0, 1] * py + m[0, 2] + r * t[0]) / z
-                v = (m[1, 0] * px + m[1, 1] * py + m[1, 2] + r * t[1]) / z
-                rate = max(rate, math.hypot(t[0] - u * t[2], t[1] - v * t[2]) / z)
+                m = maps[k]
+                z = m[2] + r * m[11]
+                if z > 1e-9:
+                    u, v = (m[0] + r * m[9]) / z, (m[1] + r * m[10]) / z
+                    rate = max(rate, math.hypot(m[9] - u * m[11], m[10] - v * m[11]) / z)
             step = px_step / rate
+            mean, variance = _window(reference, y, x, values, zero)
             top, at = -9.0, 2
             for c in range(5):
-                q = r + (c - 2) * step
-                line[c] = _score(reference, sources, h_inf, shift, y, x, q, gx[y, x], gy[y, x], zero, best)
-                if q <= 0.0:
-                    line[c] = -1.0
+                q = np.float32(r + (c - 2) * step)
+                line[c] = -1.0
+                if q > 0.0:
+                    line[c] = _score(values, mean, variance, sources, maps, q, gx[y, x], gy[y, x], zero, best)
                 # Where the windows say nothing, the aggregated depth stands.
                 if line[c] - 0.004 * abs(c - 2) > top:
                     top, at = line[c] - 0.004 * abs(c - 2), c

@@ -24,10 +24,11 @@ def _step(cost, previous, lowest, p1, p2, out, total):  # pragma: no cover - com
 
 
 @numba.njit(cache=True, nogil=True)
-def aggregate(cost, image, p1, p2, edge, total):  # pragma: no cover - compiled
+def aggregate(cost, image, p1, p2, floor, edge, total):  # pragma: no cover - compiled
     """Add the eight path costs of `cost` (h, w, planes) uint8 into `total` uint16.
 
-    The penalty of a large change falls from p2 to p1 + 1 as the image step grows beyond `edge` gray levels.
+    The penalty of a large change falls from p2 to `floor` as the image step grows beyond `edge` gray levels. With p1
+    above p2 the planes are labels without order (a Potts model).
     """
     h, w, planes = cost.shape
     for direction in range(8):
@@ -42,7 +43,7 @@ def aggregate(cost, image, p1, p2, edge, total):  # pragma: no cover - compiled
                     penalty = p2
                     if i > 0:
                         step = abs(image[y, x] - image[y, x - dx])
-                        penalty = max(p1 + 1, np.int32(p2 / (1.0 + step / edge)))
+                        penalty = max(floor, np.int32(p2 / (1.0 + step / edge)))
                     lowest = _step(cost[y, x], before, lowest, p1, penalty, now, total[y, x])
                     now, before = before, now
                     x += dx
@@ -61,7 +62,7 @@ def aggregate(cost, image, p1, p2, edge, total):  # pragma: no cover - compiled
                     lows[a, x] = _step(cost[y, x], fresh, np.int32(0), p1, p2, rows[a, x], total[y, x])
                 else:
                     step = abs(image[y, x] - image[y - dy, q])
-                    penalty = max(p1 + 1, np.int32(p2 / (1.0 + step / edge)))
+                    penalty = max(floor, np.int32(p2 / (1.0 + step / edge)))
                     lows[a, x] = _step(
                         cost[y, x], rows[b, q], lows[b, q], p1, penalty, rows[a, x], total[y, x]
                     )

@@ -1,0 +1,90 @@
+"""Put depth edges where the image has its edges: windows that straddle an edge drag depth across it."""
+
+import math
+
+import numba
+import numpy as np
+
+_REACH = 7
+_STRIDE = 2
+_MAX_CANDIDATES = 5
+
+
+@numba.njit(cache=True, nogil=True)
+def _near_jump(rho, y, x, jump):  # pragma: no cover - compiled
+    h, w = rho.shape
+    r = rho[y, x]
+    for dy in (-_REACH, 0, _REACH):
+        for dx in (-_REACH, 0, _REACH):
+            j, i = min(max(y + dy, 0), h - 1), min(max(x + dx, 0), w - 1)
+            if abs(rho[j, i] - r) > jump * r:
+                return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compiled
+    """Let pixels near a depth jump choose among the surfaces around them: the one that pixels of their colour are on.
+
+    Args:
+        rho: (h, w) inverse depth.
+        gx: (h, w) its slope along x.
+        gy: (h, w) its slope along y.
+        score: (h, w) correlation; what correlates better has more say.
+        color: float32 (h, w, 3).
+        out: (h, w), written.
+    """
+    h, w = rho.shape
+    far = _REACH + 2
+    candidates = np.empty((_MAX_CANDIDATES, 3))
+    votes = np.empty(_MAX_CANDIDATES)
+    for y in range(h):
+        for x in range(w):
+            r = rho[y, x]
+            out[y, x] = r
+            if r <= 0.0 or not _near_jump(rho, y, x, 0.025):
+                continue
+            candidates[0, 0], candidates[0, 1], candidates[0, 2] = r, gx[y, x], gy[y, x]
+            count = 1
+            for reach in (far // 2, far):
+                for dy in (-reach, 0, reach):
+                    for dx in (-reach, 0, reach):
+                        j, i = y + dy, x + dx
+                        if j < 0 or i < 0 or j >= h or i >= w or count == _MAX_CANDIDATES:
+                            continue
+                        q = rho[j, i] - gx[j, i] * dx - gy[j, i] * dy
+                        fresh = q > 0.0
+                        for c in range(count):
+                            if abs(q - candidates[c, 0]) < 0.012 * candidates[c, 0]:
+                                fresh = False
+                        if fresh:
+                            candidates[count, 0], candidates[count, 1] = q, gx[j, i]
+                            candidates[count, 2] = gy[j, i]
+                            count += 1
+            if count == 1:
+                continue
+            votes[:] = 0.0
+            for dy in range(-_REACH, _REACH + 1, _STRIDE):
+                j = y + dy
+                if j < 0 or j >= h:
+                    continue
+                for dx in range(-_REACH, _REACH + 1, _STRIDE):
+                    i = x + dx
+                    if i < 0 or i >= w:
+                        continue
+                    d = 0.0
+                    for a in range(3):
+                        d = max(d, abs(color[j, i, a] - color[y, x, a]))
+                    if d > 30.0:
+                        continue
+                    q = math.exp(-0.5 * (d / 9.0) ** 2 - 0.5 * (dx * dx + dy * dy) / 25.0)
+                    q *= max(0.15, score[j, i])
+                    for c in range(count):
+                        expected = candidates[c, 0] + candidates[c, 1] * dx + candidates[c, 2] * dy
+                        if abs(rho[j, i] - expected) < 0.012 * expected:
+                            votes[c] += q
+            best = 0
+            for c in range(1, count):
+                if votes[c] > 1.1 * votes[0] and votes[c] > votes[best]:
+                    best = c
+            out[y, x] = candidates[best, 0]

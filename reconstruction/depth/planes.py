@@ -1,0 +1,90 @@
+"""Planes of the whole scene, found in the measured points of all views, so that every view fills with the same ones."""
+
+import numpy as np
+
+from reconstruction.types import Camera
+
+_STRIDE = 6
+
+
+def oriented_points(
+    depth: np.ndarray, gx: np.ndarray, gy: np.ndarray, camera: Camera, world_from_camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points (m, 3), normals (m, 3) towards the camera and depths (m,) of every sixth measured pixel.
+
+    `gx`, `gy` (h, w) are slopes of inverse depth per pixel: a plane n.X = d has inverse depth n.r / d along ray r.
+    """
+    y, x = np.mgrid[_STRIDE // 2 : depth.shape[0] : _STRIDE, _STRIDE // 2 : depth.shape[1] : _STRIDE]
+    y, x = y.ravel(), x.ravel()
+    good = (depth[y, x] > 0) & ((gx[y, x] != 0) | (gy[y, x] != 0))
+    y, x = y[good], x[good]
+    z = depth[y, x].astype(np.float64)
+    xn, yn = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
+    a, b = gx[y, x] * camera.fx, gy[y, x] * camera.fy
+    normal = -np.stack([a, b, 1.0 / z - a * xn - b * yn], 1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    local = np.stack([xn * z, yn * z, z], 1)
+    rotation, center = world_from_camera[:3, :3], world_from_camera[:3, 3]
+    return local @ rotation.T + center, normal @ rotation.T, z
+
+
+def find_planes(
+    points: np.ndarray,
+    normals: np.ndarray,
+    depths: np.ndarray,
+    *,
+    tolerance: float,
+    max_planes: int,
+    seed: int,
+) -> np.ndarray:
+    """Return planes (k, 4), n.x + d = 0 with n towards the cameras, by sequential sampling, largest first.
+
+    A point supports a plane within `tolerance` times the depth at which it was measured, if their normals agree.
+    """
+    rng = np.random.default_rng(seed)
+    if len(points) > 120_000:
+        pick = rng.choice(len(points), 120_000, replace=False)
+        points, normals, depths = points[pick], normals[pick], depths[pick]
+    least = max(60, len(points) // 600)
+    left = np.ones(len(points), bool)
+    planes: list[np.ndarray] = []
+    failures = 0
+    while len(planes) < max_planes and left.sum() >= least and failures < 4:
+        rows = np.flatnonzero(left)
+        trial = rng.choice(rows, min(len(rows), 160), replace=False)
+        test = rng.choice(rows, min(len(rows), 6000), replace=False)
+        n = normals[trial]
+        d = -np.einsum("ij,ij->i", n, points[trial])
+        near = np.abs(points[test] @ n.T + d) < tolerance * depths[test][:, None]
+        near &= normals[test] @ n.T > 0.9
+        best = int(np.argmax(near.sum(0)))
+        plane = np.append(n[best], d[best])
+        for _ in range(4):
+            inliers = _support(plane, points, normals, depths, tolerance) & left
+            if inliers.sum() < 12:
+                break
+            plane = _fit(points[inliers], depths[inliers], plane)
+        inliers = _support(plane, points, normals, depths, tolerance) & left
+        if inliers.sum() < least:
+            failures += 1
+            continue
+        planes.append(plane)
+        # What lies near the plane is spent, even if its own normal is noisy.
+        left &= ~(np.abs(points @ plane[:3] + plane[3]) < 1.5 * tolerance * depths) | (
+            normals @ plane[:3] < 0.5
+        )
+    return np.array(planes).reshape(-1, 4)
+
+
+def _support(plane, points, normals, depths, tolerance) -> np.ndarray:
+    return (np.abs(points @ plane[:3] + plane[3]) < tolerance * depths) & (normals @ plane[:3] > 0.9)
+
+
+def _fit(points: np.ndarray, depths: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """Least-squares plane, far points counting less, on the side of `like`."""
+    weight = 1.0 / depths**2
+    center = (points * weight[:, None]).sum(0) / weight.sum()
+    scaled = (points - center) * np.sqrt(weight)[:, None]
+    _, vectors = np.linalg.eigh(scaled.T @ scaled)
+    normal = vectors[:, 0] * np.sign(vectors[:, 0] @ like[:3] or 1.0)
+    return np.append(normal, -normal @ center)
