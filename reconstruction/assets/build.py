@@ -2,17 +2,117 @@
 
 import numpy as np
 
-from reconstruction.assets import completion, solid
+from reconstruction.assets import completion, solid, texture
+from reconstruction.assets.base import build_base
+from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.mass import physical_attributes
+from reconstruction.assets.materials import choose_material
 from reconstruction.assets.solid import Solid
-from reconstruction.assets.views import ScenePixels, lift_object
+from reconstruction.assets.views import ScenePixels, lift_object, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, frame_object, fuse_volume
-from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
-from registry.geometry import rigid
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.types import (
+    AssetProvenance,
+    AssetSet,
+    DepthMaps,
+    Instance,
+    InstanceSet,
+    ObjectAsset,
+    PosedFrames,
+    Surface,
+)
+from registry.geometry import rigid, transform_points
+
+
+def build_assets(
+    posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
+    progress: Progress = NO_PROGRESS,
+) -> AssetSet:  # fmt: skip
+    """Build a complete asset for every object, and textured surfaces for floor and walls.
+
+    One object that cannot be completed never stops the others: it becomes a box, which is noted and recorded in its
+    provenance.
+
+    Args:
+        posed: Frames in world space.
+        depth: Their depth maps in metres.
+        surface: The fused surface; objects are fused again, finer, from the depth maps.
+        instances: The things and which pixels show them.
+        config: Resolution, budgets and limits.
+        progress: Told of every object.
+
+    Returns:
+        All assets, in the order of `instances`.
+    """
+    progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
+    pixels = prepare_pixels(posed, depth, instances.id_maps)
+    progress.advance()
+    objects = []
+    for item in instances.objects:
+        objects.append(build_object(item, posed, depth, pixels, instances, config, progress))
+        progress.advance()
+    base = build_base(posed, depth, instances, tuple(objects), pixels, config)
+    progress.advance(len(instances.base))
+    return AssetSet(base, tuple(objects))
+
+
+def build_object(
+    item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet,
+    config: AssetsConfig, progress: Progress,
+) -> ObjectAsset:  # fmt: skip
+    """Build one asset: shape, looks, collision, physics."""
+    try:
+        body, frame, how = object_solid(item, posed, depth, pixels, found, config)
+    except (ValueError, IndexError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:
+        progress.note(f"object {item.id} ({item.label}): could not be completed ({type(error).__name__}: {error})")
+        body, frame = box_fallback(item, np.zeros((0, 3)))
+        how = "box-fallback"
+    if how == "box-fallback":
+        progress.note(f"object {item.id} ({item.label}): too little was seen of it, it became a box")
+    body, world_from_object = to_object_space(body, frame)
+    mapping, faces, uvs = texture.unwrap(body.vertices, body.faces)
+    vertices = body.vertices[mapping]
+    distance = np.linalg.norm(posed.world_from_camera[:, :3, 3] - world_from_object[:3, 3], axis=1).min()
+    tolerance = float(0.006 + 3 * pixels.noise_relative * distance + 0.01 * body.extents.max())
+    baked = texture.bake_object(
+        transform_points(world_from_object, vertices), faces, uvs, item.id, posed, depth.camera, pixels, config, tolerance
+    )
+    choice = choose_material(item.label, item.label_confidence, baked.mean_rgb, body.extents)
+    return ObjectAsset(
+        id=item.id,
+        label=item.label,
+        label_confidence=float(item.label_confidence),
+        world_from_object=world_from_object,
+        visual=texture.textured(vertices, faces, uvs, baked.texture),
+        collision=collision_parts(body, config),
+        physics=physical_attributes(body, choice),
+        provenance=AssetProvenance(
+            geometry=how,
+            appearance="baked from frames" if len(baked.frames) else "not seen",
+            physics=f"material table by {choice.reason}",
+            observed_fraction=baked.seen_share,
+        ),
+        views=posed.indices[baked.frames].astype(np.int32),
+        support_hint=int(item.support_hint),
+        attached_hint=bool(item.attached_hint),
+    )
+
+
+def to_object_space(body: Solid, frame: ObjectFrame) -> tuple[Solid, np.ndarray]:
+    """Shift a solid of the grid frame so that its origin is at the bottom centre; return world_from_object too."""
+    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    origin = np.array([*(low + high)[:2] / 2, low[2]])
+    return Solid(body.vertices - origin, body.faces), frame.world_from_grid @ rigid(translation=origin)
 
 
 def object_solid(
-    item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet, config: AssetsConfig
+    item: Instance,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    pixels: ScenePixels,
+    found: InstanceSet,
+    config: AssetsConfig,
 ) -> tuple[Solid, ObjectFrame, str]:
     """Return an object's closed shape in its grid frame, that frame, and how the shape was made."""
     seen = lift_object(posed, depth, pixels, item.id)
@@ -35,7 +135,7 @@ def object_solid(
     body = solid.taubin(body, int(np.clip(round(3 + 6 * volume.noise_m / volume.voxel_m), 3, 15)), on_bottom)
     budget = config.faces_furniture if furniture else config.faces_small
     body = solid.lighten(body, budget, 0.3 * volume.voxel_m)
-    return body, frame, "observed+" + ("+".join(s.split()[0] for s in field.symmetries) or "carved")
+    return body, frame, "observed+" + ("+".join(field.symmetries) or "carved")
 
 
 def box_fallback(item: Instance, points: np.ndarray) -> tuple[Solid, ObjectFrame]:

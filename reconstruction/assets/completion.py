@@ -25,7 +25,9 @@ class CompletedField:
     symmetries: tuple[str, ...]
 
 
-def complete(volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig, *, furniture: bool) -> CompletedField:
+def complete(
+    volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig, *, furniture: bool
+) -> CompletedField:
     """Close the unknown part of an object's volume."""
     volume = _cut_at_support(volume, frame)
     names: list[str] = []
@@ -57,8 +59,8 @@ def _cut_at_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume:
 def _apply_symmetries(volume: ObjectVolume, frame: ObjectFrame) -> tuple[ObjectVolume, list[str]]:
     axis = symmetry.fit_axis(frame.points, frame.normals)
     if axis is not None and np.linalg.norm(axis) < 0.35 * np.ptp(frame.points[:, :2], axis=0).max():
-        distance, known, score = symmetry.rotate_complete(volume, axis, volume.distance)
-        if score > 0.8:
+        distance, known, score = symmetry.rotate_complete(volume, axis, frame.points, frame.normals)
+        if score > 0.75:
             return replace(volume, distance=distance, known=known), [f"rotation {score:.2f}"]
     names = []
     for direction in (0, 1):
@@ -123,10 +125,10 @@ def _meets(unknown: np.ndarray, inside: np.ndarray, dx: int, dy: int) -> np.ndar
 
 def _contact(volume: ObjectVolume, hull: np.ndarray, frame: ObjectFrame, *, furniture: bool) -> np.ndarray:
     """Unknown voxels between the object and its support close below: seen surface ends there, so it stands there."""
-    if not frame.on_support:
-        reach = 0.02
     size = np.percentile(frame.points, 99, axis=0) - np.percentile(frame.points, 1, axis=0)
     reach = 0.03 if furniture else max(0.03, 0.4 * float(size[:2].min()))
+    if not frame.on_support:
+        reach = min(reach, 0.02)
     solid_above = volume.known & (volume.distance < 0)
     layers = min(int(np.ceil(reach / volume.voxel_m)), volume.distance.shape[2] - 1)
     z = volume.centers(2)

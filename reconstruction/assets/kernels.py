@@ -85,7 +85,22 @@ def _beside_own(ids, f, target, iu, iv, w, h):  # pragma: no cover - compiled
 
 @njit(cache=True, parallel=True)
 def fuse_object(
-    depth, confidence, ids, cosine, frames, camera_from_grid, fx, fy, cx, cy, target, shape, origin, voxel, trunc, tau
+    depth,
+    confidence,
+    ids,
+    cosine,
+    frames,
+    camera_from_grid,
+    fx,
+    fy,
+    cx,
+    cy,
+    target,
+    shape,
+    origin,
+    voxel,
+    trunc,
+    tau,
 ):  # pragma: no cover - compiled
     """Sum the evidence of all frames in every voxel of one object's grid.
 

@@ -46,11 +46,15 @@ def _without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
 
     f = solid.faces
     n = len(solid.vertices)
-    edges = coo_matrix((np.ones(2 * len(f)), (np.r_[f[:, 0], f[:, 1]], np.r_[f[:, 1], f[:, 2]])), shape=(n, n))
+    edges = coo_matrix(
+        (np.ones(2 * len(f)), (np.r_[f[:, 0], f[:, 1]], np.r_[f[:, 1], f[:, 2]])), shape=(n, n)
+    )
     _, label = connected_components(edges, directed=False)
     face_label = label[f[:, 0]]
     a, b, c = (solid.vertices[f[:, k]] for k in range(3))
-    volumes = np.bincount(face_label, weights=np.einsum("nk,nk->n", a, np.cross(b, c)) / 6, minlength=label.max() + 1)
+    volumes = np.bincount(
+        face_label, weights=np.einsum("nk,nk->n", a, np.cross(b, c)) / 6, minlength=label.max() + 1
+    )
     keep = volumes > share * volumes.max()
     if volumes.max() <= 0:
         return None
@@ -90,7 +94,10 @@ def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
     start = solid
     if len(solid.faces) > max_faces:
         vertices, faces = fast_simplification.simplify(
-            np.asarray(solid.vertices, np.float32), np.asarray(solid.faces, np.int32), target_count=int(max_faces), agg=4
+            np.ascontiguousarray(solid.vertices, np.float64),
+            np.ascontiguousarray(solid.faces, np.int32),
+            target_count=int(max_faces),
+            agg=4,
         )
         light = compact(Solid(vertices.astype(np.float64), faces.astype(np.int32)))
         closed = to_manifold(light)
@@ -119,7 +126,9 @@ def to_manifold(solid: Solid) -> Solid | None:
 def from_manifold(body) -> Solid:  # noqa: ANN001 - manifold3d is imported on use
     """Read a manifold3d body."""
     out = body.to_mesh()
-    return Solid(np.asarray(out.vert_properties[:, :3], np.float64), np.asarray(out.tri_verts, np.int32))
+    return Solid(
+        np.array(out.vert_properties[:, :3], np.float64, order="C"), np.array(out.tri_verts, np.int32, order="C")
+    )
 
 
 def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
@@ -180,7 +189,9 @@ def fit_cuboid(points: np.ndarray, normals: np.ndarray, solid: Solid, tolerance_
     seen = 0
     for axis in range(3):
         for bound, sign in ((low, -1), (high, 1)):
-            on = (n[:, axis] * sign > 0.85) & (np.abs(p[:, axis] - bound[axis]) < max(4 * tolerance_m, 0.1 * size[axis]))
+            on = (n[:, axis] * sign > 0.85) & (
+                np.abs(p[:, axis] - bound[axis]) < max(4 * tolerance_m, 0.1 * size[axis])
+            )
             if on.sum() > 0.02 * len(p) and not (axis == 2 and sign < 0):
                 bound[axis] = np.median(p[on, axis])
                 seen += 1

@@ -40,16 +40,19 @@ def fit_axis(points: np.ndarray, normals: np.ndarray) -> np.ndarray | None:
     return center
 
 
-def rotate_complete(volume: ObjectVolume, axis: np.ndarray, sign: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def rotate_complete(
+    volume: ObjectVolume, axis: np.ndarray, points: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Complete about a vertical axis: every ring of equal radius and height takes what most of it is known to be.
 
     Args:
         volume: The evidence.
         axis: x, y of the axis (2,).
-        sign: Not used where nothing is known; kept for callers that pass completed fields.
+        points: Seen points (k, 3), which decide whether the symmetry holds.
+        normals: Their normals (k, 3); level surface says nothing about the symmetry.
 
     Returns:
-        Signed distance (nx, ny, nz), whether it is known now, and the share of surface voxels that agree.
+        Signed distance (nx, ny, nz), whether it is known now, and the share of seen side surface that agrees.
     """
     v = volume.voxel_m
     x, y = volume.centers(0) - axis[0], volume.centers(1) - axis[1]
@@ -64,19 +67,39 @@ def rotate_complete(volume: ObjectVolume, axis: np.ndarray, sign: np.ndarray) ->
     mean = np.bincount(index[known], weights=clipped[known], minlength=n_rings * nz) / np.maximum(count, 1)
     inside = np.bincount(index[known], weights=(clipped[known] < 0).astype(float), minlength=n_rings * nz)
     share = inside / np.maximum(count, 1)
-    # Which surface voxels agree with their ring?
-    tolerance = max(1.2 * v, 2.0 * volume.noise_m)
-    near = known & (np.abs(clipped) < volume.trunc_m * 0.6)
-    ring_mean = mean[index]
-    agree = near & (np.abs(ring_mean - clipped) < tolerance)
-    score = float(agree.sum() / max(near.sum(), 1))
     decided = (count > 0.08 * total) & ((share > 0.75) | (share < 0.25)) & (count > 3)
+    tolerance = max(1.2 * v, 2.0 * volume.noise_m)
+    score = _round_share(volume, axis, points, normals)
+    ring_mean = mean[index]
     fill = ~known & decided[index]
     out = volume.distance.ravel().copy()
     out[fill] = ring_mean[fill]
     smooth = known & decided[index] & (np.abs(ring_mean - clipped) < tolerance)
     out[smooth] = 0.3 * clipped[smooth] + 0.7 * ring_mean[smooth]
-    return out.reshape(volume.distance.shape).astype(np.float32), (known | fill).reshape(volume.known.shape), score
+    return (
+        out.reshape(volume.distance.shape).astype(np.float32),
+        (known | fill).reshape(volume.known.shape),
+        score,
+    )
+
+
+def _round_share(volume: ObjectVolume, axis: np.ndarray, points: np.ndarray, normals: np.ndarray) -> float:
+    """Share of seen side surface that has the usual radius of its height (outside and inside apart)."""
+    sideways = np.hypot(normals[:, 0], normals[:, 1]) > 0.7
+    if sideways.sum() < 50:
+        return 0.0
+    p, n = points[sideways], normals[sideways]
+    away = p[:, :2] - axis
+    radius = np.hypot(away[:, 0], away[:, 1])
+    outwards = np.einsum("nk,nk->n", away, n[:, :2]) > 0
+    layer = np.floor((p[:, 2] - volume.origin[2]) / max(volume.voxel_m, 0.003)).astype(int)
+    group = 2 * (layer - layer.min()) + outwards
+    order = np.lexsort((radius, group))
+    starts = np.searchsorted(group[order], np.arange(group.max() + 2))
+    middle = np.minimum((starts[:-1] + starts[1:]) // 2, len(order) - 1)
+    usual = radius[order][middle][group]
+    tolerance = max(1.0 * volume.voxel_m, 2.0 * volume.noise_m, 0.03 * float(np.percentile(radius, 90)))
+    return float((np.abs(radius - usual) < tolerance).mean())
 
 
 def _sample(volume: ObjectVolume, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

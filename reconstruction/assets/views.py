@@ -51,7 +51,9 @@ def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:
         flat = np.flatnonzero(np.asarray(maps[a]).ravel() > 0)[::step]
         v, u = np.divmod(flat, camera.width)
         z = maps[a][v, u].astype(np.float64)
-        local = np.stack([(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], -1)
+        local = np.stack(
+            [(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], -1
+        )
         world = transform_points(posed.world_from_camera[a], local)
         seen = transform_points(invert_rigid(posed.world_from_camera[b]), world)
         front = seen[:, 2] > 0.05
@@ -78,7 +80,9 @@ class SeenPoints:
     pixel_m: np.ndarray  # float64 (k,) size of a pixel at the point
 
 
-def lift_object(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, target: int, limit: int = 60_000) -> SeenPoints:
+def lift_object(
+    posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, target: int, limit: int = 60_000
+) -> SeenPoints:
     """Lift the depth pixels of instance `target`, evenly thinned to about `limit` points, with normals."""
     camera = depth.camera
     rows, v, u = np.nonzero((pixels.ids == target) & (pixels.depth > 0))
@@ -101,7 +105,9 @@ def _pixel_normals(pixels: ScenePixels, camera, rows, v, u) -> np.ndarray:  # no
 
     def lift(vv: np.ndarray, uu: np.ndarray) -> np.ndarray:
         z = maps[rows, vv, uu].astype(np.float64)
-        return np.stack([(uu + 0.5 - camera.cx) / camera.fx * z, (vv + 0.5 - camera.cy) / camera.fy * z, z], -1)
+        return np.stack(
+            [(uu + 0.5 - camera.cx) / camera.fx * z, (vv + 0.5 - camera.cy) / camera.fy * z, z], -1
+        )
 
     right, left = lift(v, np.minimum(u + 2, width - 1)), lift(v, np.maximum(u - 2, 0))
     down, up = lift(np.minimum(v + 2, height - 1), u), lift(np.maximum(v - 2, 0), u)

@@ -43,7 +43,12 @@ class ObjectFrame:
 
 
 def frame_object(
-    item: Instance, seen: SeenPoints, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet
+    item: Instance,
+    seen: SeenPoints,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    pixels: ScenePixels,
+    found: InstanceSet,
 ) -> ObjectFrame:
     """Choose an upright frame: yaw from vertical faces, bottom at the support below."""
     points, normals = _without_outliers(seen)
@@ -123,12 +128,19 @@ def _wall_of(item: Instance, found: InstanceSet) -> np.ndarray | None:
             return base.surface.plane
     near = [b for b in walls if abs(b.surface.plane[:3] @ item.center + b.surface.plane[3]) < 0.15]
     if near:
-        return min(near, key=lambda b: abs(b.surface.plane[:3] @ item.center + b.surface.plane[3])).surface.plane
+        return min(
+            near, key=lambda b: abs(b.surface.plane[:3] @ item.center + b.surface.plane[3])
+        ).surface.plane
     return None
 
 
 def support_height(
-    item: Instance, points: np.ndarray, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet
+    item: Instance,
+    points: np.ndarray,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    pixels: ScenePixels,
+    found: InstanceSet,
 ) -> float | None:
     """Return the height of what the object stands on, just below it, or None where that is not known.
 
@@ -183,7 +195,12 @@ def _support_ring(
 
 
 def fuse_volume(
-    target: int, frame: ObjectFrame, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, config: AssetsConfig
+    target: int,
+    frame: ObjectFrame,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    pixels: ScenePixels,
+    config: AssetsConfig,
 ) -> ObjectVolume:
     """Fuse the object's pixels into its grid, and the free space of all pixels."""
     from reconstruction.assets.kernels import fuse_object
@@ -210,8 +227,12 @@ def fuse_volume(
         # z = 0 lies between two layers, so that bottoms come out flat on the support.
         origin[2] = -np.ceil(max(-(low[2] - margin[2]), 0.0) / voxel) * voxel - pad * voxel
     shape = tuple(int(np.ceil((high[a] + margin[a] - origin[a]) / voxel)) + pad for a in range(3))
-    frames = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8).astype(np.int32)
-    camera_from_grid = np.stack([invert_rigid(posed.world_from_camera[f]) @ frame.world_from_grid for f in frames])
+    frames = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8).astype(
+        np.int32
+    )
+    camera_from_grid = np.stack(
+        [invert_rigid(posed.world_from_camera[f]) @ frame.world_from_grid for f in frames]
+    )
     distance_m = float(np.median(camera_from_grid[:, 2, 3]))
     noise = pixels.noise_relative * distance_m
     trunc = max(2.5 * voxel, 3.0 * noise)

@@ -1,0 +1,80 @@
+"""A mesh of the user's own in place of a reconstructed one (`--overrides`)."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.assets.collision import collision_parts
+from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.mass import physical_attributes
+from reconstruction.assets.materials import MaterialChoice
+from reconstruction.assets.solid import Solid, hull_solid, to_manifold
+from reconstruction.types import ObjectAsset, TexturedMesh
+from registry.errors import UsageError
+from registry.geometry import WORLD_FROM_GLTF
+
+
+def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = None) -> ObjectAsset:
+    """Return the object with the mesh of a file: metres, upright as in any viewer, standing where the object stood.
+
+    Args:
+        item: The object.
+        path: Anything that trimesh reads; .glb and .gltf are +y up, all others +z up.
+        config: For the collision shape.
+
+    Raises:
+        UsageError: the file is missing or holds no usable mesh.
+    """
+    import trimesh
+
+    config = config or AssetsConfig()
+    if not path.is_file():
+        raise UsageError(f"overrides: the mesh {path} of object {item.id} does not exist")
+    try:
+        loaded = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # trimesh raises whatever its many readers raise
+        raise UsageError(f"overrides: cannot read the mesh {path} of object {item.id}: {error}") from error
+    if len(getattr(loaded, "faces", ())) < 4:
+        raise UsageError(f"overrides: {path} of object {item.id} holds no mesh of at least 4 triangles")
+    vertices = np.asarray(loaded.vertices, np.float64)
+    if path.suffix.lower() in (".glb", ".gltf"):
+        vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = vertices - np.array([*(low + high)[:2] / 2, low[2]])
+    if not np.isfinite(vertices).all() or (high - low).max() > 20 or (high - low).max() < 1e-3:
+        raise UsageError(f"overrides: {path} of object {item.id} is {(high - low).round(3)} m large; metres are expected")
+    faces = np.asarray(loaded.faces, np.int32)
+    uvs, texture = _looks(loaded, len(vertices))
+    body = to_manifold(Solid(vertices, faces)) or hull_solid(vertices)
+    choice = MaterialChoice(item.physics.material, False, 0.0, "user's mesh")
+    physics = replace(
+        physical_attributes(body, choice), friction=item.physics.friction, restitution=item.physics.restitution
+    )
+    return replace(
+        item,
+        visual=TexturedMesh(vertices.astype(np.float32), faces, uvs, texture),
+        collision=collision_parts(body, config),
+        physics=physics,
+        provenance=replace(item.provenance, geometry=f"user mesh {path.name}", appearance=f"user mesh {path.name}"),
+    )
+
+
+def _looks(loaded, count: int) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN001 - trimesh is imported on use
+    """Return uvs (v, 2) and a square texture of a trimesh; a plain colour where it has none."""
+    import cv2
+
+    visual = loaded.visual
+    uv = getattr(visual, "uv", None)
+    material = getattr(visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if uv is not None and len(uv) == count and image is not None:
+        picture = np.asarray(image.convert("RGB"))
+        side = int(min(1024, max(picture.shape[:2])))
+        return np.asarray(uv, np.float32), cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+    try:
+        color = np.asarray(visual.to_color().vertex_colors[:, :3], np.float64).mean(axis=0)
+    except (AttributeError, IndexError, ValueError):
+        color = np.full(3, 170.0)
+    texture = np.broadcast_to(np.round(color).astype(np.uint8), (8, 8, 3)).copy()
+    return np.full((count, 2), 0.5, np.float32), texture
