@@ -181,7 +181,7 @@ def add_room(writer: BundleWriter) -> None:
 
 
 def add_furniture(writer: BundleWriter) -> None:
-    """Add a table against the wall, a box, a cylinder and a book with a knob on it, and a picture on the wall."""
+    """Add a table with a box, a cylinder and a book with a knob on it, and a picture on the wall."""
     legs = [box((0.05, 0.05, 0.57), at=(sx * 0.5, sy * 0.3)) for sx in (-1, 1) for sy in (-1, 1)]
     table = [box((1.1, 0.7, 0.03), 0.57), *legs]
     at_table = (-0.3, 1.05)

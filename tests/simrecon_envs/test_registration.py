@@ -20,8 +20,8 @@ start = time.process_time()
 import simrecon_envs
 seconds = time.process_time() - start
 ours = [name for name in gymnasium.registry if name.startswith("SimRecon/")]
-heavy = [name for name in ("torch", "sapien", "mani_skill", "numba", "pandas", "scipy", "cv2", "reconstruction")
-         if name in sys.modules]
+unwanted = ("torch", "sapien", "mani_skill", "numba", "pandas", "scipy", "cv2", "reconstruction")
+heavy = [name for name in unwanted if name in sys.modules]
 print(len(ours), seconds, heavy)
 """
 

@@ -95,7 +95,7 @@ def test_actors_are_as_the_bundle_says(env: gym.Env) -> None:
     env.reset(seed=0)
     builder = env.unwrapped.builder
     kinds = {key: placed.dynamic for key, placed in builder.objects.items()}
-    # The picture is "dynamic" in the bundle, but hangs on a wall; the knob is part of the book that it is fixed to.
+    # The picture is "dynamic" in the bundle, but hangs on a wall; the knob is welded to the book.
     assert kinds == {BOX: True, CYLINDER: True, BOOK: True, KNOB: True, TABLE: False, PICTURE: False}
     assert builder.objects[KNOB].actor is builder.objects[BOOK].actor
     assert env.unwrapped.movable_ids == (BOX, CYLINDER, BOOK)
