@@ -1,6 +1,8 @@
 """Structure from motion by COLMAP: a database of verified pairs in, the largest consistent model out."""
 
 import contextlib
+import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +19,9 @@ def colmap_log(folder: Path) -> Iterator[None]:
     """Send what COLMAP logs to files in `folder` instead of the terminal while the block runs."""
     import pycolmap
 
+    # On import pycolmap makes SIGTERM print a stack trace; killing a run is no crash.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     log = pycolmap.logging
     names = ("alsologtostderr", "logtostderr", "logtostdout", "stderrthreshold")
     before = {name: getattr(log, name) for name in names}

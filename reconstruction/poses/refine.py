@@ -35,7 +35,12 @@ def bundle_adjust(model: object, config: PosesConfig) -> None:
     options.ceres.solver_options.max_num_iterations = 40
     options.ceres.solver_options.function_tolerance = 1e-6
     options.ceres.solver_options.num_threads = config.threads
-    pycolmap.bundle_adjustment(model, options)
+    problem = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        problem.add_image(image_id)
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # `pycolmap.bundle_adjustment` would do the same, but logs to the terminal whatever the log settings are.
+    pycolmap.create_default_bundle_adjuster(options, problem, model).solve()
 
 
 def filter_points(model: object, max_error_px: float, min_track_length: int) -> None:
