@@ -143,7 +143,8 @@ def _without_base_crumbs(
         nearest = distances.min(axis=0)
         spread = np.sort(np.ptp(points, axis=0))
         thin = np.percentile(nearest, 90) < 0.035 or (spread[2] < 0.12 and np.median(nearest) < 0.025)
-        if thin and spread[2] < 0.6:
+        hugging = (nearest < 0.045).mean() > 0.8
+        if (thin and spread[2] < 0.6) or hugging:
             crumbs.append((thing.vertices, first + int(np.argmin(np.median(distances, axis=1)))))
         else:
             kept.append(thing)

@@ -127,7 +127,7 @@ def _join_parts(graph: MeshGraph, found: list[np.ndarray], config: InstancesConf
                     break
             if changed:
                 break
-    bodies = _carry_floating(graph, bodies)
+    bodies = _join_torn(graph, _carry_floating(graph, bodies))
     if not bodies or not crumbs:
         return bodies
     owner = np.concatenate([np.full(len(body), i) for i, body in enumerate(bodies)])
@@ -161,6 +161,33 @@ def _carry_floating(graph: MeshGraph, bodies: list[np.ndarray]) -> list[np.ndarr
             if under and low[2] > points[:, 2].max() - 0.05 and points[:, 2].max() > 0.4 * low[2]:
                 bodies[i] = np.sort(np.concatenate([bodies[i], lower]))
                 bodies[j] = lower[:0]
+    return [body for body in bodies if len(body)]
+
+
+def _join_torn(graph: MeshGraph, bodies: list[np.ndarray]) -> list[np.ndarray]:
+    """Join pieces in mid-air to the furniture around them that has their color: boards torn off by holes."""
+    floor_m = 0.1
+    bodies = list(bodies)
+    whole = [i for i, b in enumerate(bodies) if graph.points[b, 2].min() < floor_m]
+    for i in range(len(bodies)):
+        points = graph.points[bodies[i]]
+        if i in whole or points[:, 2].min() < floor_m:
+            continue
+        color = np.median(graph.lab[bodies[i]], axis=0)
+        best, best_gap = -1, 0.12
+        for j in whole:
+            around = graph.points[bodies[j]]
+            low, high = around.min(axis=0) - 0.05, around.max(axis=0) + 0.05
+            if ((points > low) & (points < high)).all(axis=1).mean() < 0.8:
+                continue
+            gap, index = cKDTree(around).query(points[:: max(1, len(points) // 500)])
+            near = bodies[j][index[np.argsort(gap, kind="stable")[: max(10, len(gap) // 5)]]]
+            alike = np.linalg.norm(np.median(graph.lab[near], axis=0) - color) < 12.0
+            if alike and gap.min() < best_gap:
+                best, best_gap = j, float(gap.min())
+        if best >= 0:
+            bodies[best] = np.sort(np.concatenate([bodies[best], bodies[i]]))
+            bodies[i] = bodies[i][:0]
     return [body for body in bodies if len(body)]
 
 

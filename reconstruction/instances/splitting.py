@@ -5,6 +5,8 @@ A label on a can has another color but no crease; the inside of a bowl has creas
 
 import numpy as np
 from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.mesh_graph import MeshGraph
@@ -22,7 +24,7 @@ def split_touching(graph: MeshGraph, body: np.ndarray, config: InstancesConfig) 
     links = links[(links >= 0).all(axis=1)]
     if len(links) == 0:
         return [body]
-    patch = _color_patches(graph.lab[body], links, graph.areas[body], config)
+    patch = _color_patches(graph.lab[body], links, config)
     if patch.max() == 0:
         return [body]
     label = _merge_patches(graph, body, links, patch, config)
@@ -30,17 +32,29 @@ def split_touching(graph: MeshGraph, body: np.ndarray, config: InstancesConfig) 
     return sorted(parts, key=lambda part: (-graph.areas[part].sum(), part[0]))
 
 
-def _color_patches(
-    lab: np.ndarray, links: np.ndarray, areas: np.ndarray, config: InstancesConfig
-) -> np.ndarray:
-    """Grow patches of similar color over mesh edges (Felzenszwalb's criterion); return a patch per vertex."""
-    weight = np.linalg.norm(lab[links[:, 0]] - lab[links[:, 1]], axis=1)
-    order = np.argsort(weight, kind="stable")
-    from reconstruction.instances._kernels import grow_patches
-
-    scale = 12.0 * config.min_object_vertices
-    roots = grow_patches(links[order].astype(np.int64), weight[order].astype(np.float64), len(lab), scale, 20)
-    return np.unique(roots, return_inverse=True)[1]
+def _color_patches(lab: np.ndarray, links: np.ndarray, config: InstancesConfig) -> np.ndarray:
+    """Return a patch per vertex: connected pieces of one color out of the few that the thing has."""
+    centers = [np.median(lab, axis=0)]
+    for _ in range(7):  # farthest color first, ignoring a few percent of strays
+        distance = np.min([np.linalg.norm(lab - c, axis=1) for c in centers], axis=0)
+        limit = np.percentile(distance, 96)
+        if limit < config.split_color_contrast:
+            break
+        far = distance >= limit
+        seed = lab[int(np.argmin(np.abs(distance - limit)))]
+        near = far | (np.linalg.norm(lab - seed, axis=1) < 0.5 * config.split_color_contrast)
+        centers.append(np.median(lab[near & (np.linalg.norm(lab - seed, axis=1) < 20)], axis=0))
+    means = np.array(centers)
+    for _ in range(6):
+        nearest = np.argmin(np.linalg.norm(lab[:, None] - means[None], axis=2), axis=1)
+        means = np.array(
+            [lab[nearest == k].mean(axis=0) if (nearest == k).any() else m for k, m in enumerate(means)]
+        )
+    same = nearest[links[:, 0]] == nearest[links[:, 1]]
+    adjacency = coo_matrix(
+        (np.ones(same.sum(), np.int8), (links[same, 0], links[same, 1])), shape=(len(lab),) * 2
+    )
+    return connected_components(adjacency, directed=False)[1]
 
 
 def _merge_patches(
@@ -86,9 +100,8 @@ def _contacts(
     unique, inverse = np.unique(keys, return_inverse=True)
     pairs = np.stack([unique // count, unique % count], axis=1)
     length = np.bincount(inverse)
-    first, second = body[links[crossing, 0]], body[links[crossing, 1]]
-    angle = crease_angles(graph, body, links, first, second)
-    concave = np.bincount(inverse, weights=np.clip(angle, -60, 90)) / length
+    middle = 0.5 * (graph.points[body[links[crossing, 0]]] + graph.points[body[links[crossing, 1]]])
+    concave = crease_angles(graph, body, label, pairs, middle, inverse)
     median_lab = np.stack([np.median(graph.lab[body[label == i]], axis=0) for i in range(count)])
     color = np.linalg.norm(median_lab[pairs[:, 0]] - median_lab[pairs[:, 1]], axis=1)
     strength = np.minimum(concave / config.split_angle_deg, color / config.split_color_contrast)
@@ -96,35 +109,48 @@ def _contacts(
 
 
 def crease_angles(
-    graph: MeshGraph, body: np.ndarray, links: np.ndarray, first: np.ndarray, second: np.ndarray
+    graph: MeshGraph,
+    body: np.ndarray,
+    label: np.ndarray,
+    pairs: np.ndarray,
+    middle: np.ndarray,
+    which: np.ndarray,
 ) -> np.ndarray:
-    """Return the crease at edges in degrees, positive where concave, from normals two steps to either side."""
-    local = np.full(len(graph.points), -1, np.int64)
-    local[body] = np.arange(len(body))
-    count = len(body)
-    rows = np.concatenate([links[:, 0], links[:, 1]])
-    columns = np.concatenate([links[:, 1], links[:, 0]])
-    adjacency = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
-    a, b = local[first], local[second]
-    side = graph.points[second] - graph.points[first]
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    # The vertex two steps away that lies farthest along the edge's own direction, on either side.
-    normals, points = graph.normals[body], graph.points[body]
-    far_a, far_b = a, b
-    for _ in range(2):
-        far_a = _step(adjacency, points, far_a, -side)
-        far_b = _step(adjacency, points, far_b, side)
-    across = points[far_b] - points[far_a]
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-    bend = np.degrees(np.arccos(np.clip((normals[far_a] * normals[far_b]).sum(axis=1), -1, 1)))
-    sign = ((normals[far_a] - normals[far_b]) * across).sum(axis=1)
-    return np.where(sign > 0, bend, -bend)
+    """Return the mean crease along each contact in degrees, positive where concave.
 
+    Both sides are described by the mean position and normal of their vertices within a few spacings of the contact,
+    because the edge of a color rarely lies exactly in the crease.
 
-def _step(adjacency, points: np.ndarray, at: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    from reconstruction.instances._kernels import step_along
-
-    return step_along(adjacency.indptr, adjacency.indices, points, at, direction)
+    Args:
+        graph: the surface.
+        body: vertices of the thing.
+        label: patch of each of them.
+        pairs: int (n, 2) touching patches.
+        middle: float (m, 3) middles of the mesh edges that cross from patch to patch.
+        which: int (m,) row of `pairs` that each belongs to.
+    """
+    points, normals = graph.points[body], graph.normals[body]
+    radius = max(0.02, 2.5 * graph.spacing_m)
+    trees = {int(k): np.flatnonzero(label == k) for k in np.unique(pairs)}
+    search = {k: cKDTree(points[index]) for k, index in trees.items()}
+    out = np.zeros(len(pairs))
+    for row, (a, b) in enumerate(pairs):
+        samples = middle[which == row]
+        samples = samples[:: max(1, len(samples) // 40)]
+        angles = []
+        sides = [search[int(k)].query_ball_point(samples, radius) for k in (a, b)]
+        for in_a, in_b in zip(*sides):
+            if len(in_a) < 3 or len(in_b) < 3:
+                continue
+            one, two = trees[int(a)][in_a], trees[int(b)][in_b]
+            normal_a, normal_b = normals[one].mean(axis=0), normals[two].mean(axis=0)
+            normal_a = normal_a / max(np.linalg.norm(normal_a), 1e-9)
+            normal_b = normal_b / max(np.linalg.norm(normal_b), 1e-9)
+            bend = np.degrees(np.arccos(np.clip(normal_a @ normal_b, -1, 1)))
+            across = points[two].mean(axis=0) - points[one].mean(axis=0)
+            angles.append(bend if (normal_a - normal_b) @ across > 0 else -bend)
+        out[row] = np.mean(np.clip(angles, -60, 90)) if angles else 0.0
+    return out
 
 
 def _only_compact(

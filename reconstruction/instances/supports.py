@@ -34,8 +34,14 @@ class Footprint:
         convex = np.zeros(occupied.shape, np.uint8)
         cv2.fillConvexPoly(convex, hull, 1)
         filled = binary_fill_holes(occupied)
-        if filled.sum() >= 0.7 * convex.sum():
+        if filled.sum() >= 0.5 * convex.sum():
             filled = filled | convex.astype(bool)
+        else:  # an L-shaped top, or one full of holes: bridge what things standing on it hide
+            radius = max(1, round(0.06 / cell_m))
+            disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
+            padded = np.pad(filled.astype(np.uint8), radius)
+            closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[radius:-radius, radius:-radius]
+            filled = binary_fill_holes(closed > 0)
         return cls(origin, cell_m, filled, occupied)
 
     @property
@@ -80,7 +86,11 @@ def find_supports(graph: MeshGraph, chosen: np.ndarray, config: InstancesConfig)
         z = graph.points[piece, 2]
         height = float(np.median(z))
         noise = 1.4826 * float(np.median(np.abs(z - height)))
-        footprint = Footprint.of(graph.points[piece, :2], max(0.01, graph.spacing_m))
+        # Noise tilts normals: for the outline every roughly level vertex at this height counts, if near the rest.
+        level = chosen[(np.abs(graph.points[chosen, 2] - height) < 0.012) & (graph.normals[chosen, 2] > 0.5)]
+        gap, _ = cKDTree(graph.points[piece, :2]).query(graph.points[level, :2], distance_upper_bound=0.1)
+        outline = np.union1d(piece, level[np.isfinite(gap)])
+        footprint = Footprint.of(graph.points[outline, :2], max(0.01, graph.spacing_m))
         regions.append(SupportRegion(piece, height, noise, footprint, np.median(graph.lab[piece], axis=0)))
     return sorted(regions, key=lambda region: (region.height_m, int(region.vertices[0])))
 
@@ -157,6 +167,7 @@ def candidates_on(
             for candidate in pieces(graph, high):
                 if len(candidate) < config.min_object_vertices:
                     continue
+                candidate = _without_stain(graph, candidate, support)
                 if stands_on(graph, body, support, candidate, level, config):
                     out.append(
                         _with_foot(graph, candidate, above, level + support.height_m)
@@ -167,6 +178,21 @@ def candidates_on(
                     refused.append(candidate)
         pool = refused
     return _disjoint(out)
+
+
+def _without_stain(graph: MeshGraph, candidate: np.ndarray, support: SupportRegion) -> np.ndarray:
+    """Leave out what clings to the foot of a thing but has the support's color: noise around the contact."""
+    z = graph.points[candidate, 2] - support.height_m
+    body = candidate[z > min(0.03, float(np.percentile(z, 60)))]
+    if len(body) < 5:
+        return candidate
+    own = np.median(graph.lab[body], axis=0)
+    if np.linalg.norm(own - support.lab) < 18.0:
+        return candidate
+    to_support = np.linalg.norm(graph.lab[candidate] - support.lab, axis=1)
+    to_own = np.linalg.norm(graph.lab[candidate] - own, axis=1)
+    clean = candidate[~((z < 0.03) & (to_support < 7.0) & (to_own > 2 * to_support))]
+    return clean if len(clean) >= 0.4 * len(candidate) else candidate
 
 
 def _with_foot(graph: MeshGraph, candidate: np.ndarray, above: np.ndarray, level: float) -> np.ndarray:
@@ -203,7 +229,7 @@ def stands_on(
     foot = points[points[:, 2] < max(level, points[:, 2].min()) + step]
     if points[:, 2].min() > level + 0.02 or len(foot) < 3:
         return False
-    if support.footprint.contains(foot[:, :2], 1).mean() < 0.6:
+    if support.footprint.contains(foot[:, :2], 2).mean() < 0.5:
         return False
     extents = points.max(axis=0) - points.min(axis=0)
     if np.sort(extents)[1] < config.min_object_m or len(candidate) < config.min_object_vertices:
@@ -238,7 +264,7 @@ def _belongs_to_body(
     convex = _convex(foot_print)
     seen_inside = convex.contains(inner).sum() * cell**2 * (graph.areas[support.vertices].mean() / cell**2)
     seen_share = seen_inside / max(convex.area_m2, 1e-6)
-    if convex.area_m2 > 0.55 * support.footprint.area_m2 and seen_share > 0.45:
+    if convex.area_m2 > 0.55 * support.footprint.area_m2 and seen_share > 0.4:
         return True
     # Continuation: right below the foot, outside the support, the same side goes on downwards.
     points = graph.points[body]
