@@ -34,7 +34,7 @@ class WorldConfig:
     """Relative 1-sigma of that."""
     table_height_prior_m: float = 0.74
     """Height of a table, for videos that see a table top but no floor."""
-    subject_distance_prior_m: float = 1.2
+    subject_distance_prior_m: float = 1.0
     """Median distance from which people film a thing, for videos without any horizontal surface."""
     max_frames: int = 48
     """How many keyframes are looked at."""

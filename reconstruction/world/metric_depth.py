@@ -38,7 +38,7 @@ class TransformersBackend:
                 "or leave out --set world.metric_depth=transformers"
             ) from error
         try:
-            self._pipeline = pipeline("depth-estimation", model=model, device_map="auto")
+            self._pipeline = pipeline("depth-estimation", model=model)
         except (ImportError, OSError, ValueError, RuntimeError) as error:
             raise EnvironmentMissing(
                 f"world: the metric depth model {model!r} cannot be loaded ({error}); download it first, "

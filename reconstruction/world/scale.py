@@ -21,7 +21,7 @@ from registry.geometry import invert_rigid
 _USER_HEIGHT_SIGMA = 0.04
 _USER_DISTANCE_SIGMA = 0.015
 _TABLE_SIGMA = 0.30
-_SUBJECT_SIGMA = 0.45
+_SUBJECT_SIGMA = 0.5
 _MARKER_SIGMA = 0.005  # print and measuring
 _NEIGHBOURS = 6
 _SEARCH_PX = 3.0
