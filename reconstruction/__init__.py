@@ -21,7 +21,9 @@ _HOME = {
 def __getattr__(name: str) -> object:
     """Load a public name on first use (PEP 562)."""
     if name not in _HOME:
-        raise AttributeError(f"module 'reconstruction' has no attribute {name!r}; it has {', '.join(__all__)}")
+        raise AttributeError(
+            f"module 'reconstruction' has no attribute {name!r}; it has {', '.join(__all__)}"
+        )
     import importlib
 
     return getattr(importlib.import_module(_HOME[name]), name)

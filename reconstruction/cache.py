@@ -24,7 +24,12 @@ T = TypeVar("T")
 KEPT_PER_STAGE = 2
 _MANIFEST = "manifest.json"
 # What several stages compute with; a change there invalidates all of them.
-_SHARED_MODULES = ("reconstruction.types", "reconstruction.artifacts", "reconstruction.rasterize", "registry.geometry")
+_SHARED_MODULES = (
+    "reconstruction.types",
+    "reconstruction.artifacts",
+    "reconstruction.rasterize",
+    "registry.geometry",
+)
 
 
 def canonical_json(value: Any) -> str:

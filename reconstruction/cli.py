@@ -87,12 +87,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 4
     except MemoryError:
         print(
-            f"simrecon {arguments.verb}: out of memory. Close other programs, or try --preset fast.", file=sys.stderr
+            f"simrecon {arguments.verb}: out of memory. Close other programs, or try --preset fast.",
+            file=sys.stderr,
         )
         return 4
     except KeyboardInterrupt:
         print(
-            "\ninterrupted; finished stages are kept, run the same command again to go on from there", file=sys.stderr
+            "\ninterrupted; finished stages are kept, run the same command again to go on from there",
+            file=sys.stderr,
         )
         return 130
     except BrokenPipeError:

@@ -83,7 +83,9 @@ class PipelineConfig:
         config = getattr(self, stage)
         hints = typing.get_type_hints(type(config))
         if name not in hints:
-            raise UsageError(f"--set {text}: {stage} has no option {name!r}; it has {', '.join(sorted(hints))}")
+            raise UsageError(
+                f"--set {text}: {stage} has no option {name!r}; it has {', '.join(sorted(hints))}"
+            )
         try:
             changed = dataclasses.replace(config, **{name: _parse(hints[name], value.strip())})
         except (ValueError, TypeError) as error:
@@ -136,6 +138,10 @@ def _field_docs(cls: type) -> dict[str, str]:
     body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
     docs = {}
     for node, after in zip(body, body[1:]):
-        if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+        if (
+            isinstance(node, ast.AnnAssign)
+            and isinstance(after, ast.Expr)
+            and isinstance(after.value, ast.Constant)
+        ):
             docs[node.target.id] = str(after.value.value)
     return docs

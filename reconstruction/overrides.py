@@ -51,7 +51,9 @@ class Overrides:
         if entries is None:
             entries = []
         if not isinstance(entries, list):
-            raise UsageError(f"--overrides {path}: expected a list of entries such as `- {{id: 3, relabel: mug}}`")
+            raise UsageError(
+                f"--overrides {path}: expected a list of entries such as `- {{id: 3, relabel: mug}}`"
+            )
         for number, entry in enumerate(entries, start=1):
             _check(entry, f"--overrides {path}: entry {number}")
         return cls(entries, Path(path).resolve().parent)
@@ -87,9 +89,13 @@ class Overrides:
             item = _addressed(entry, objects)
             parent = entry["parent"]
             if parent not in known:
-                raise UsageError(f"overrides: object {item.id} cannot have parent {parent}; ids are {sorted(known)}")
+                raise UsageError(
+                    f"overrides: object {item.id} cannot have parent {parent}; ids are {sorted(known)}"
+                )
             relation = entry.get("relation", edges[item.id].relation)
-            edges[item.id] = replace(edges[item.id], parent=parent, relation=relation, confidence=1.0, evidence="user")
+            edges[item.id] = replace(
+                edges[item.id], parent=parent, relation=relation, confidence=1.0, evidence="user"
+            )
             step, seen = parent, {item.id}
             while step in edges:
                 if step in seen:
@@ -113,7 +119,9 @@ def _check(entry: Any, where: str) -> None:
         raise UsageError(f"{where}: expected a mapping such as {{id: 3, relabel: mug}}, got {entry!r}")
     unknown = sorted(set(entry) - set(allowed) - set(_ADDRESS))
     if unknown:
-        raise UsageError(f"{where}: unknown {', '.join(map(repr, unknown))}; an entry may have {', '.join(allowed)}")
+        raise UsageError(
+            f"{where}: unknown {', '.join(map(repr, unknown))}; an entry may have {', '.join(allowed)}"
+        )
     if not set(entry) & set(allowed):
         raise UsageError(f"{where}: says nothing to do; use one of {', '.join(allowed)}")
     if "merge" not in entry and not isinstance(entry.get("id"), int):
@@ -132,9 +140,13 @@ def _addressed(entry: dict, objects: dict[int, "ObjectAsset"]) -> "ObjectAsset":
         raise UsageError(f"overrides: no object {entry['id']}; objects are {sorted(objects)}")
     if "near" in entry:
         center = item.world_from_object[:3, 3]
-        if np.linalg.norm(center - np.asarray(entry["near"], float)) > ANCHOR_RADIUS_M + float(np.ptp(item.visual.vertices)):
+        if np.linalg.norm(center - np.asarray(entry["near"], float)) > ANCHOR_RADIUS_M + float(
+            np.ptp(item.visual.vertices)
+        ):
             where = ", ".join(f"{x:.2f}" for x in center)
-            raise UsageError(f"overrides: object {item.id} ({item.label}) is at [{where}], not near {entry['near']}")
+            raise UsageError(
+                f"overrides: object {item.id} ({item.label}) is at [{where}], not near {entry['near']}"
+            )
     return item
 
 
@@ -144,7 +156,9 @@ def _with_physics(item: "ObjectAsset", entry: dict) -> "ObjectAsset":
         from reconstruction.assets.materials import MATERIALS
 
         if entry["material"] not in MATERIALS:
-            raise UsageError(f"overrides: no material {entry['material']!r}; there are {', '.join(sorted(MATERIALS))}")
+            raise UsageError(
+                f"overrides: no material {entry['material']!r}; there are {', '.join(sorted(MATERIALS))}"
+            )
         chosen = MATERIALS[entry["material"]]
         factor = chosen.density_kg_m3 / physics.density_kg_m3
         physics = replace(

@@ -95,7 +95,13 @@ class Run:
             notes: list[str] = []
             with UsageMeter() as meter:
                 result = self._compute(stage, config, _NoteTaker(self.listener, notes))
-            record = {"stage": stage.name, "key": key, "usage": asdict(meter.usage), "notes": notes, "config": config}
+            record = {
+                "stage": stage.name,
+                "key": key,
+                "usage": asdict(meter.usage),
+                "notes": notes,
+                "config": config,
+            }
             self.store.save(result, number, stage.name, key, record)
             del result
         manifest = self.store.manifest(number, stage.name, key)
@@ -131,7 +137,9 @@ class Run:
         if stage.name == "instances":
             found = module.find_instances(posed, depth, done["surface"], config, progress=progress)
             return self.overrides.apply_to_instances(found, done["surface"])
-        assets = module.build_assets(posed, depth, done["surface"], done["instances"], config, progress=progress)
+        assets = module.build_assets(
+            posed, depth, done["surface"], done["instances"], config, progress=progress
+        )
         return self.overrides.apply_to_assets(assets)
 
     def in_world(self) -> tuple[PosedFrames, DepthMaps]:
@@ -225,7 +233,9 @@ def _with_object_scale(run: Run) -> Run:
     found = [item for item in assets.objects if item.id == request.object_id]
     if not found:
         ids = ", ".join(f"{item.id} ({item.label})" for item in assets.objects)
-        raise UsageError(f"--scale {run.config.world.scale}: no object {request.object_id}; there are {ids or 'none'}")
+        raise UsageError(
+            f"--scale {run.config.world.scale}: no object {request.object_id}; there are {ids or 'none'}"
+        )
     measured_m = float(found[0].visual.vertices[:, 2].max() - found[0].visual.vertices[:, 2].min())
     world = replace(run.config.world, object_measured_height_m=measured_m)
     again = replace(run, config=replace(run.config, world=world), results={}, keys={}, usage={}, notes=[])

@@ -11,7 +11,10 @@ _BACKGROUND = np.array([236, 238, 241], np.float32)
 
 
 def render_textured(
-    meshes: list[tuple[TexturedMesh, np.ndarray]], camera: Camera, world_from_camera: np.ndarray, supersample: int = 2
+    meshes: list[tuple[TexturedMesh, np.ndarray]],
+    camera: Camera,
+    world_from_camera: np.ndarray,
+    supersample: int = 2,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw textured meshes, each with its `world_from_mesh`, unshaded.
 
@@ -41,7 +44,9 @@ def render_textured(
 def scene_meshes(assets: AssetSet, assembled: AssembledScene) -> list[tuple[TexturedMesh, np.ndarray]]:
     """Return every mesh of the assembled scene with its world pose."""
     pose = {item.id: item.world_from_object for item in assembled.placed}
-    return [(item.visual, np.eye(4)) for item in assets.base] + [(o.visual, pose[o.id]) for o in assets.objects]
+    return [(item.visual, np.eye(4)) for item in assets.base] + [
+        (o.visual, pose[o.id]) for o in assets.objects
+    ]
 
 
 def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFrames) -> np.ndarray:
@@ -49,7 +54,9 @@ def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFram
     camera = posed.camera.resized(640, round(640 * posed.camera.height / posed.camera.width))
     best = _best_view(assets, assembled, posed, camera)
     picture, _ = render_textured(scene_meshes(assets, assembled), camera, posed.world_from_camera[best])
-    frame = cv2.resize(np.asarray(posed.images[best]), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    frame = cv2.resize(
+        np.asarray(posed.images[best]), (camera.width, camera.height), interpolation=cv2.INTER_AREA
+    )
     return np.hstack([frame, picture])
 
 
@@ -63,7 +70,13 @@ def _best_view(assets: AssetSet, assembled: AssembledScene, posed: PosedFrames, 
         u = camera.fx * local[:, 0] / z + camera.cx
         v = camera.fy * local[:, 1] / z + camera.cy
         margin = 0.05 * camera.width
-        inside = (local[:, 2] > 0.1) & (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin)
+        inside = (
+            (local[:, 2] > 0.1)
+            & (u > margin)
+            & (u < camera.width - margin)
+            & (v > margin)
+            & (v < camera.height - margin)
+        )
         distance = float(np.linalg.norm(local, axis=1).mean()) if len(local) else 0.0
         scores.append(inside.sum() - 0.1 * distance)
     return int(np.argmax(scores)) if scores else 0

@@ -23,7 +23,17 @@ if TYPE_CHECKING:
     from reconstruction.pipeline import Run
 
 SCHEMA = "simrecon.scene/1"
-_RECORDED_PACKAGES = ("simrecon", "numpy", "pycolmap", "numba", "sapien", "mani-skill", "coacd", "trimesh", "torch")
+_RECORDED_PACKAGES = (
+    "simrecon",
+    "numpy",
+    "pycolmap",
+    "numba",
+    "sapien",
+    "mani-skill",
+    "coacd",
+    "trimesh",
+    "torch",
+)
 
 
 def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require_stable: bool) -> SceneRecord:
@@ -84,7 +94,11 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
 
 
 def _scale(world: WorldFrame) -> dict:
-    return {"method": world.scale.method, "uncertainty": world.scale.uncertainty, "detail": world.scale.detail}
+    return {
+        "method": world.scale.method,
+        "uncertainty": world.scale.uncertainty,
+        "detail": world.scale.detail,
+    }
 
 
 def _world(world: WorldFrame) -> dict:
@@ -185,12 +199,19 @@ def _report(run: "Run") -> dict:
         "peak_memory_mb": round(max(usage.peak_memory_mb for usage in run.usage.values()), 1),
         "volatile": {
             "cpu_s": {name: round(usage.cpu_s, 3) for name, usage in run.usage.items()},
-            "stage_peak_memory_mb": {name: round(usage.peak_memory_mb, 1) for name, usage in run.usage.items()},
+            "stage_peak_memory_mb": {
+                name: round(usage.peak_memory_mb, 1) for name, usage in run.usage.items()
+            },
             "machine": f"{platform.machine()} {platform.system()}",
             "versions": _versions(),
             "commit": _commit(),
         },
-        "backends": {"poses": "pycolmap", "depth": "plane-sweep", "assets": "embedded", "relations": "geometry"},
+        "backends": {
+            "poses": "pycolmap",
+            "depth": "plane-sweep",
+            "assets": "embedded",
+            "relations": "geometry",
+        },
         "config": dataclasses.asdict(run.config),
         "overrides": run.overrides.entries,
         "notes": run.notes,
@@ -217,5 +238,7 @@ def _commit() -> str:
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return ""
-    done = subprocess.run(["git", "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    done = subprocess.run(
+        ["git", "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    )
     return done.stdout.strip() if done.returncode == 0 else ""

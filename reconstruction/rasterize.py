@@ -27,7 +27,9 @@ class Raster:
         """Interpolate per-vertex values (v, c) to float32 (h, w, c); zero where nothing is seen."""
         out = np.zeros((*self.face.shape, values.shape[1]), np.float32)
         hit = self.face >= 0
-        out[hit] = np.einsum("nk,nkc->nc", self.barycentric[hit], values[faces[self.face[hit]]].astype(np.float32))
+        out[hit] = np.einsum(
+            "nk,nkc->nc", self.barycentric[hit], values[faces[self.face[hit]]].astype(np.float32)
+        )
         return out
 
 
@@ -100,7 +102,9 @@ def _draw(points, faces, fx, fy, cx, cy, near, depth, face_map, bary):  # pragma
                     face_map[y, x] = f
                     for k in range(3):
                         bary[y, x, k] = z * (
-                            wa * iz[a] * poly[a, 3 + k] + wb * iz[b] * poly[b, 3 + k] + wc * iz[c] * poly[c, 3 + k]
+                            wa * iz[a] * poly[a, 3 + k]
+                            + wb * iz[b] * poly[b, 3 + k]
+                            + wc * iz[c] * poly[c, 3 + k]
                         )
 
 

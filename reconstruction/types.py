@@ -36,11 +36,15 @@ class FrameSet:
     indices: np.ndarray  # int32 (n,) decoded video frame number of each
     times_s: np.ndarray  # float64 (n,)
     sharpness: np.ndarray  # float32 (n,) larger is sharper, comparable within one video only
-    held_out_images: np.ndarray  # uint8 (m, h, w, 3) every tenth video frame (index % 10 == 0), for evaluation only
+    held_out_images: (
+        np.ndarray
+    )  # uint8 (m, h, w, 3) every tenth video frame (index % 10 == 0), for evaluation only
     held_out_indices: np.ndarray  # int32 (m,)
     held_out_times_s: np.ndarray  # float64 (m,)
     focal_prior_px: float  # from metadata, 0 where unknown
-    ordered: bool  # True for a video, False for a folder of images (neighbours in name order may be far apart)
+    ordered: (
+        bool  # True for a video, False for a folder of images (neighbours in name order may be far apart)
+    )
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,9 @@ class PosedFrames:
     point_colors: np.ndarray  # uint8 (p, 3)
     point_errors_px: np.ndarray  # float32 (p,) mean reprojection error
     observations: np.ndarray  # int32 (o, 2) pairs (frame row, point row): which frame saw which point
-    chosen_frames: int  # how many keyframes were given, so that len(images) / chosen_frames is the registered share
+    chosen_frames: (
+        int  # how many keyframes were given, so that len(images) / chosen_frames is the registered share
+    )
     ordered: bool  # frames follow each other in time
     reprojection_error_px: float
 
@@ -95,7 +101,9 @@ class DepthMaps:
 
     camera: Camera  # the frames' camera at depth resolution
     depth: np.ndarray  # float32 (n, h, w) z-depth, 0 = unknown
-    confidence: np.ndarray  # uint8 (n, h, w): 0 unknown, 1 completed (a plane that its surroundings support), 2 measured
+    confidence: (
+        np.ndarray
+    )  # uint8 (n, h, w): 0 unknown, 1 completed (a plane that its surroundings support), 2 measured
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,9 @@ OUT = ROOT / "demo"
 def main() -> int:
     """Run the main job on the demo video."""
     video = ROOT / "examples" / "data" / "demo_room.mp4"
-    done = subprocess.run([sys.executable, "-m", "reconstruction.cli", "reconstruct", str(video), "--scene", SCENE], cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-m", "reconstruction.cli", "reconstruct", str(video), "--scene", SCENE], cwd=ROOT
+    )
     if done.returncode:
         return done.returncode
     sys.path.insert(0, str(ROOT))

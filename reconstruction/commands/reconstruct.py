@@ -37,19 +37,35 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("video", metavar="VIDEO", type=Path, nargs="?", help="a video file or a folder of images")
-    parser.add_argument("--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)")
+    parser.add_argument(
+        "video", metavar="VIDEO", type=Path, nargs="?", help="a video file or a folder of images"
+    )
+    parser.add_argument(
+        "--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)"
+    )
     parser.add_argument("--work-dir", type=Path, metavar="DIR", help="where finished stages are kept")
     parser.add_argument("--preset", choices=("fast", "default", "quality"), default="default")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where stages compute")
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where stages compute"
+    )
     parser.add_argument("--scale", metavar="HOW", help="where metres come from; see below")
-    parser.add_argument("--marker-size", type=float, metavar="METRES", help="side of a printed marker in view")
-    parser.add_argument("--poses", type=Path, metavar="PATH", help="a COLMAP model or transforms.json to use as poses")
-    parser.add_argument("--overrides", type=Path, metavar="FILE", help="your corrections (YAML); see docs/overrides.md")
+    parser.add_argument(
+        "--marker-size", type=float, metavar="METRES", help="side of a printed marker in view"
+    )
+    parser.add_argument(
+        "--poses", type=Path, metavar="PATH", help="a COLMAP model or transforms.json to use as poses"
+    )
+    parser.add_argument(
+        "--overrides", type=Path, metavar="FILE", help="your corrections (YAML); see docs/overrides.md"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default 0)")
-    parser.add_argument("--set", action="append", default=[], metavar="STAGE.FIELD=VALUE", help="set any option")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="STAGE.FIELD=VALUE", help="set any option"
+    )
     parser.add_argument("--list-options", action="store_true", help="print every option for --set and stop")
-    parser.add_argument("--require-stable", action="store_true", help="refuse to publish a scene that does not rest")
+    parser.add_argument(
+        "--require-stable", action="store_true", help="refuse to publish a scene that does not rest"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress, only the result")
     add_common(parser)
     parser.set_defaults(run=run)
@@ -135,8 +151,12 @@ def _print_result(result: object, arguments: argparse.Namespace) -> None:
     print(f"\n{result.env_id} is registered. Next:")
     print(f"  simrecon show {result.record.scene_id}{at}")
     if arguments.registry:
-        print(f'  python -c \'import gymnasium as gym, simrecon_envs; simrecon_envs.register_scenes("{arguments.registry}"); '
-              f'env = gym.make("{result.env_id}"); print(env.reset())\'')
+        print(
+            f'  python -c \'import gymnasium as gym, simrecon_envs; simrecon_envs.register_scenes("{arguments.registry}"); '
+            f'env = gym.make("{result.env_id}"); print(env.reset())\''
+        )
     else:
-        print(f'  python -c \'import gymnasium as gym, simrecon_envs; env = gym.make("{result.env_id}"); print(env.reset())\'')
+        print(
+            f"  python -c 'import gymnasium as gym, simrecon_envs; env = gym.make(\"{result.env_id}\"); print(env.reset())'"
+        )
     sys.stdout.flush()

@@ -81,14 +81,21 @@ class BarListener(QuietListener):
         """Replace the bar with what the stage cost."""
         self._close()
         if usage:
-            tqdm.write(f"{self._stage}: {usage.wall_s:.1f} s, peak {usage.peak_memory_mb / 1024:.1f} GB", file=sys.stderr)
+            tqdm.write(
+                f"{self._stage}: {usage.wall_s:.1f} s, peak {usage.peak_memory_mb / 1024:.1f} GB",
+                file=sys.stderr,
+            )
 
     def start(self, total: int, label: str) -> None:
         """Begin a step's bar."""
         self._close()
         layout = "{desc} {bar} {n_fmt}/{total_fmt} {remaining} left" if total else "{desc} {elapsed}"
         self._bar = tqdm(
-            total=total or None, desc=f"{self._stage}: {label}", bar_format=layout, leave=False, file=sys.stderr
+            total=total or None,
+            desc=f"{self._stage}: {label}",
+            bar_format=layout,
+            leave=False,
+            file=sys.stderr,
         )
 
     def advance(self, n: int = 1) -> None:

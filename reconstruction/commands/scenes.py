@@ -23,7 +23,9 @@ def add_parsers(verbs: argparse._SubParsersAction) -> None:
     add("list", "list the scenes of the registry", run_list, scene=False)
     add("show", "show what a scene holds: objects, relations, scale, stability, files", run_show)
     verify = add("verify", "check every file of a scene against its hash and its schema", run_verify)
-    verify.add_argument("--physics", action="store_true", help="also simulate 10 s and recompute the report card")
+    verify.add_argument(
+        "--physics", action="store_true", help="also simulate 10 s and recompute the report card"
+    )
     remove = add("remove", "remove a scene and its files from the registry", run_remove)
     remove.add_argument("--yes", action="store_true", help="do not ask")
 
@@ -69,7 +71,11 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
     lines = [f"{len(scene['objects'])} objects, {len(scene['base'])} base surfaces"]
     for item in sorted(scene["objects"], key=lambda o: o["id"]):
         edge = parents.get(item["id"])
-        relation = "" if edge is None else f"{edge['relation'].replace('_', ' ')} {names[edge['parent']]} ({edge['parent']})"
+        relation = (
+            ""
+            if edge is None
+            else f"{edge['relation'].replace('_', ' ')} {names[edge['parent']]} ({edge['parent']})"
+        )
         size = " x ".join(f"{100 * side:.0f}" for side in item["scale"])
         kind = "movable" if item["dynamic"] else "fixed"
         lines.append(
@@ -77,7 +83,9 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
             f"{relation:<32} seen {item['provenance']['observed_fraction']:.0%}"
         )
     scale = scene["scale"]
-    lines.append(f"scale: {scale['method']}, sure to {100 * scale['uncertainty']:.0f} % (1 sigma). {scale.get('detail', '')}")
+    lines.append(
+        f"scale: {scale['method']}, sure to {100 * scale['uncertainty']:.0f} % (1 sigma). {scale.get('detail', '')}"
+    )
     physics = scene["report"]["physics"]
     if "stable_rate" in physics:
         lines.append(
@@ -104,7 +112,9 @@ def run_verify(arguments: argparse.Namespace) -> int:
     else:
         for problem in report.problems:
             print(problem)
-        print(f"{arguments.scene}: {'all files are as published' if report.ok else 'damaged; reconstruct it again'}")
+        print(
+            f"{arguments.scene}: {'all files are as published' if report.ok else 'damaged; reconstruct it again'}"
+        )
         if "physics" in result:
             physics = result["physics"]
             print(

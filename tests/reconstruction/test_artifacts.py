@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from reconstruction import artifacts
-from reconstruction.types import AssembledScene, DepthMaps, Camera, Edge, PlacedObject, SceneGraph, Surface, SpaceGrid
+from reconstruction.types import (
+    AssembledScene,
+    DepthMaps,
+    Camera,
+    Edge,
+    PlacedObject,
+    SceneGraph,
+    Surface,
+    SpaceGrid,
+)
 
 
 def _assembled() -> AssembledScene:
@@ -17,7 +26,9 @@ def _assembled() -> AssembledScene:
         for i in range(3)
     )  # fmt: skip
     graph = SceneGraph(edges=(Edge(1, "supported_by", 0, 0.5, "contact"),))
-    return AssembledScene(placed=placed, graph=graph, physics_report={"stable_rate": 1.0, "objects": {"1": [1, 2.5]}})
+    return AssembledScene(
+        placed=placed, graph=graph, physics_report={"stable_rate": 1.0, "objects": {"1": [1, 2.5]}}
+    )
 
 
 def test_nested_dataclasses_round_trip(tmp_path):
@@ -51,6 +62,14 @@ def test_arrays_keep_dtype_shape_and_bits(tmp_path):
 def test_non_finite_plain_numbers_are_refused(tmp_path):
     grid = SpaceGrid(np.zeros(3), float("nan"), np.zeros((1, 1, 1), np.uint8))
     empty = np.zeros((0, 3), np.float32)
-    surface = Surface(empty, np.zeros((0, 3), np.int32), empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), 0.01, grid)
+    surface = Surface(
+        empty,
+        np.zeros((0, 3), np.int32),
+        empty,
+        np.zeros((0, 3), np.uint8),
+        np.zeros(0, np.float32),
+        0.01,
+        grid,
+    )
     with pytest.raises(ValueError, match="JSON"):
         artifacts.save(surface, tmp_path / "s")

@@ -7,7 +7,14 @@ import sys
 
 import pytest
 
-from reconstruction.cache import KEPT_PER_STAGE, StageStore, canonical_json, digest_input, fingerprint, source_digest
+from reconstruction.cache import (
+    KEPT_PER_STAGE,
+    StageStore,
+    canonical_json,
+    digest_input,
+    fingerprint,
+    source_digest,
+)
 from reconstruction.types import Edge, SceneGraph
 from registry.errors import EnvironmentMissing
 
@@ -73,7 +80,9 @@ def test_old_fingerprints_are_pruned_but_the_last_ones_stay(tmp_path):
 
 
 def test_leftovers_of_a_dead_process_are_swept_and_of_a_living_one_kept(tmp_path):
-    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True)
+    dead = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True
+    )
     (tmp_path / f"tmp-{dead.stdout.strip()}-poses").mkdir()
     (tmp_path / "tmp-1-poses").mkdir()  # pid 1 always lives
     StageStore(tmp_path)
