@@ -33,6 +33,8 @@ class AssemblyConfig:
     """An object that slides farther has slipped."""
     max_drop_m: float = 0.05
     """An object that drops farther (from clear of its parent) has missed its parent."""
+    max_fall_m: float = 0.15
+    """What falls over or down, but no farther than this, is left where it came to rest, and that is said."""
     foot_bands_mm: tuple[float, ...] = (2.0, 5.0, 10.0)
     """Unevenness taken off the underside, tried in this order, when an object does not stand by itself."""
     search_shifts_m: tuple[float, ...] = (0.006, 0.012)

@@ -277,6 +277,12 @@ class Placer:
         edge = self._seen_parent(item.edge, end)
         if edge is not item.edge:
             notes = (*notes, f"came to rest on {edge.parent} instead of {item.edge.parent}")
+        fell = pose_change(pose, end.pose)[0]
+        if cost >= 10 and clear and end.at_rest and fell < config.max_fall_m:
+            # In the simulation it would fall at once; at rest it is at least near and harmless.
+            return cost, replace(
+                item, pose=end.pose, edge=edge, notes=(*notes, _why(end, clear)), stands=True
+            )
         if cost >= 10:
             # Where it was cleared is closer to the truth than where it tumbled to.
             return cost, replace(item, pose=pose, notes=(*notes, _why(end, clear)), stands=False)

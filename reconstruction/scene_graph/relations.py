@@ -44,9 +44,9 @@ class RelationConfig:
     """Largest distance to a wall or ceiling that counts as touching it."""
     wall_thickness_m: float = 0.15
     """Things thinner than this (or than a third of their size), measured off the wall, can hang on it."""
-    bridge_gap_m: float = 0.30
+    bridge_gap_m: float = 0.15
     """A gap this large below an object is put down to missing reconstruction."""
-    near_object_m: float = 0.04
+    near_object_m: float = 0.08
     """Something that nothing carries is attached to an object at most this far away."""
 
 

@@ -124,14 +124,22 @@ def test_furniture_that_reaches_into_the_floor_keeps_its_height():
     assert_at_rest(scene)
 
 
-def test_what_cannot_stand_is_said_not_to():
-    pole = box(10, (0.01, 0.01, 0.5), (0, 0, 0), turn=tilt(30.0))
-    _, placed = build(room(pole))
-    assert not placed[10].stable
+def test_what_falls_over_lies_at_rest_and_says_so():
+    scene, placed = build(room(box(10, (0.01, 0.01, 0.1), (0, 0, 0), turn=tilt(30.0))))
+    assert_at_rest(scene)
+    assert placed[10].turned_deg > 30
     assert "does not stand" in placed[10].repair
-    frozen, placed = build(room(pole), freeze_unstable=True)
-    assert not placed[10].dynamic
-    assert "immovable" in placed[10].repair
+
+
+def test_what_cannot_stand_is_said_not_to():
+    # Its center of mass hangs over the edge of a post, 0.8 m above the floor.
+    assets = room(box(10, (0.1, 0.1, 0.8), (0, 0, 0)), box(11, (0.3, 0.06, 0.06), (0.12, 0, 0.8)))
+    _, placed = build(assets)
+    assert not placed[11].stable
+    assert "does not stand" in placed[11].repair
+    frozen, placed = build(assets, freeze_unstable=True)
+    assert not placed[11].dynamic
+    assert "immovable" in placed[11].repair
     assert frozen.physics_report["dynamic_objects"] == 0
 
 

@@ -65,11 +65,11 @@ def test_ids_and_order_of_objects_do_not_matter():
 
 
 def test_thing_in_the_air_is_bridged_and_says_so():
-    graph = infer_scene_graph(room(box(10, (0.2, 0.2, 0.2), (0, 0, 0.15))), SceneGraphConfig())
+    graph = infer_scene_graph(room(box(10, (0.2, 0.2, 0.2), (0, 0, 0.1))), SceneGraphConfig())
     (edge,) = graph.edges
     assert (edge.relation, edge.parent) == ("supported_by", 1)
     assert edge.confidence < 0.5
-    assert "15 cm below" in edge.evidence
+    assert "10 cm below" in edge.evidence
 
 
 def test_deeply_sunk_box_still_finds_its_table():
