@@ -80,7 +80,7 @@ def label_costs(
         for x in range(w):
             xn, yn = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
             z = depth[y, x]
-            cost[y, x, labels] = 35 if z > 0.0 else 62
+            cost[y, x, labels] = 35 if z > 0.0 else 42
             for c in range(labels):
                 p = planes[c]
                 rho = -(p[0] * xn + p[1] * yn + p[2]) / p[3]
@@ -109,7 +109,7 @@ def label_costs(
                         through += 1
                     elif d > 0.985 * qz and d < 1.015 * qz:
                         agree += 1
-                value = 45.0 + 40.0 * through - 15.0 * min(agree, 2)
+                value = 44.0 + 40.0 * through - 15.0 * min(agree, 2)
                 if raw[y, x] > 0.0 and abs(raw[y, x] * rho - 1.0) < 0.015:
                     value -= 12.0
                 cost[y, x, c] = np.uint8(min(200.0, max(0.0, value)))
@@ -139,7 +139,7 @@ def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarra
         count, pieces = cv2.connectedComponents((label == value).astype(np.uint8), connectivity=4)
         size = np.bincount(pieces.ravel(), minlength=count)
         anchor = np.bincount(pieces.ravel(), measured.ravel(), minlength=count)
-        good = (anchor >= min_px) & (anchor >= 0.12 * size)
+        good = (anchor >= min_px) & (anchor >= 0.04 * size)
         good[0] = False
         keep |= good[pieces]
     return keep

@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-_REACH = 7
+_REACH = 10
 _STRIDE = 2
 _MAX_CANDIDATES = 5
 
@@ -14,8 +14,8 @@ _MAX_CANDIDATES = 5
 def _near_jump(rho, y, x, jump):  # pragma: no cover - compiled
     h, w = rho.shape
     r = rho[y, x]
-    for dy in (-_REACH, 0, _REACH):
-        for dx in (-_REACH, 0, _REACH):
+    for dy in (-6, 0, 6):
+        for dx in (-6, 0, 6):
             j, i = min(max(y + dy, 0), h - 1), min(max(x + dx, 0), w - 1)
             if abs(rho[j, i] - r) > jump * r:
                 return True
@@ -36,13 +36,18 @@ def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compile
     """
     h, w = rho.shape
     far = _REACH + 2
+    # Pixels beside a jump are the ones in doubt: they have little say about each other.
+    doubt = np.empty((h, w), np.bool_)
+    for y in range(h):
+        for x in range(w):
+            doubt[y, x] = rho[y, x] > 0.0 and _near_jump(rho, y, x, 0.025)
     candidates = np.empty((_MAX_CANDIDATES, 3))
     votes = np.empty(_MAX_CANDIDATES)
     for y in range(h):
         for x in range(w):
             r = rho[y, x]
             out[y, x] = r
-            if r <= 0.0 or not _near_jump(rho, y, x, 0.025):
+            if not doubt[y, x]:
                 continue
             candidates[0, 0], candidates[0, 1], candidates[0, 2] = r, gx[y, x], gy[y, x]
             count = 1
@@ -77,8 +82,8 @@ def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compile
                         d = max(d, abs(color[j, i, a] - color[y, x, a]))
                     if d > 30.0:
                         continue
-                    q = math.exp(-0.5 * (d / 9.0) ** 2 - 0.5 * (dx * dx + dy * dy) / 25.0)
-                    q *= max(0.15, score[j, i])
+                    q = math.exp(-0.5 * (d / 9.0) ** 2 - 0.5 * (dx * dx + dy * dy) / 50.0)
+                    q *= max(0.15, score[j, i]) * (0.25 if doubt[j, i] else 1.0)
                     for c in range(count):
                         expected = candidates[c, 0] + candidates[c, 1] * dx + candidates[c, 2] * dy
                         if abs(rho[j, i] - expected) < 0.012 * expected:

@@ -37,7 +37,7 @@ def find_planes(
     max_planes: int,
     seed: int,
 ) -> np.ndarray:
-    """Return planes (k, 4), n.x + d = 0 with n towards the cameras, by sequential sampling, largest first.
+    """Return planes (k, 4), n.x + d = 0 with n towards the cameras: by sequential sampling, then parallel ones.
 
     A point supports a plane within `tolerance` times the depth at which it was measured, if their normals agree.
     """
@@ -73,7 +73,41 @@ def find_planes(
         left &= ~(np.abs(points @ plane[:3] + plane[3]) < 1.5 * tolerance * depths) | (
             normals @ plane[:3] < 0.5
         )
-    return np.array(planes).reshape(-1, 4)
+    found = np.array(planes).reshape(-1, 4)
+    return np.concatenate([found, _parallel_planes(found, points[left], depths[left], least // 3, tolerance)])
+
+
+def _parallel_planes(planes: np.ndarray, points, depths, least: int, tolerance: float) -> np.ndarray:
+    """Return planes parallel to the largest ones at offsets where many unexplained points gather, normals unheard.
+
+    Of a blank table top only the rim can be measured, and the rim of anything that stands square gathers at one
+    height. A wrong guess does no harm: it finds no view to be anchored in.
+    """
+    directions: list[np.ndarray] = []
+    for plane in planes:
+        if len(directions) < 4 and all(abs(plane[:3] @ d) < 0.9 for d in directions):
+            directions.append(plane[:3])
+    out: list[np.ndarray] = []
+    if len(points) < least:
+        return np.zeros((0, 4))
+    width = 0.6 * tolerance * float(np.median(depths))
+    for direction in directions:
+        offset = points @ direction
+        low = offset.min()
+        histogram = np.bincount(((offset - low) / width).astype(np.int64))
+        peaked = np.convolve(histogram, [1, 1, 1], "same")
+        background = np.convolve(histogram, np.ones(41) / 41 * 3, "same")
+        order = np.argsort(-peaked, kind="stable")
+        taken = np.zeros(len(peaked), bool)
+        for b in order[:200]:
+            if len(out) >= 24 or peaked[b] < least or peaked[b] < 2.0 * background[b]:
+                break
+            if taken[max(0, b - 3) : b + 4].any():
+                continue
+            taken[b] = True
+            near = np.abs(offset - low - (b + 0.5) * width) < 1.5 * width
+            out.append(np.append(direction, -np.median(offset[near])))
+    return np.array(out).reshape(-1, 4)
 
 
 def _support(plane, points, normals, depths, tolerance) -> np.ndarray:
