@@ -1,4 +1,4 @@
-"""Convex collision parts: one hull for nearly convex things, else CoACD with its inflation taken back."""
+"""Convex collision parts: one hull for nearly convex things, else CoACD, brought to the visual bounds."""
 
 import numpy as np
 
@@ -16,8 +16,9 @@ def collision_parts(solid: Solid, config: AssetsConfig) -> tuple[ConvexPart, ...
         return (_limited(hull.vertices, config, low, high),)
     furniture = float((high - low).max()) > config.furniture_m
     # Thin walls show as a low filled share: the hollower, the finer the cuts.
-    threshold = config.coacd_threshold * (0.5 if filled < 0.5 else 1.0)
+    threshold = config.coacd_threshold * (0.6 if filled < 0.5 else 1.0)
     parts = _decompose(solid, threshold, config.hulls_furniture if furniture else config.hulls_small, config)
+    parts = _to_bounds(parts, low, high)
     parts = [fixed for part in parts if (fixed := _deflate(part, low, high, config)) is not None]
     return tuple(parts) if parts else (_limited(hull.vertices, config, low, high),)
 
@@ -37,17 +38,28 @@ def _decompose(solid: Solid, threshold: float, budget: int, config: AssetsConfig
         mesh,
         threshold=threshold,
         max_convex_hull=budget,
-        preprocess_mode="auto",
-        preprocess_resolution=50,
-        resolution=1200,
-        mcts_nodes=12,
-        mcts_iterations=60,
+        preprocess_mode="off",  # the mesh is manifold already; the voxel remesh would inflate it
+        resolution=500,
+        mcts_nodes=8,
+        mcts_iterations=20,
         mcts_max_depth=2,
         max_ch_vertex=config.hull_vertices,
         decimate=True,
         seed=config.seed,
     )
     return [np.asarray(vertices, np.float64) * scale + center for vertices, _ in pieces]
+
+
+def _to_bounds(parts: list[np.ndarray], low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
+    """Stretch all parts together, axis by axis, so that they span the visual bounds; decimation eats edges."""
+    if not parts:
+        return parts
+    every = np.concatenate(parts)
+    own_low, own_high = every.min(axis=0), every.max(axis=0)
+    scale = (high - low) / np.maximum(own_high - own_low, 1e-9)
+    scale = np.where((scale > 0.85) & (scale < 1.18), scale, 1.0)
+    shift = np.where(scale == 1.0, 0.0, low - own_low * scale)
+    return [part * scale + shift for part in parts]
 
 
 def _deflate(

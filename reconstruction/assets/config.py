@@ -37,16 +37,16 @@ class AssetsConfig:
     """Most frames that one texture is blended from."""
     base_texel_m: float = 0.008
     """Texel size of floor and walls, coarser where `texture_max_px` is reached."""
-    hulls_small: int = 16
+    hulls_small: int = 20
     """Most convex pieces of a small object's collision shape."""
     hulls_furniture: int = 28
     """Most convex pieces of furniture."""
     convex_enough: float = 0.93
     """Solids that fill this share of their convex hull collide as that hull."""
-    collision_faces: int = 1200
+    collision_faces: int = 800
     """Faces of the decimated mesh that is decomposed."""
-    coacd_threshold: float = 0.05
-    """Concavity at which CoACD stops cutting; hollow things use half of it."""
+    coacd_threshold: float = 0.08
+    """Concavity at which CoACD stops cutting; hollow things use 0.6 of it."""
     hull_vertices: int = 48
     """Most vertices of one convex piece (PhysX allows 255)."""
     seed: int = 0
