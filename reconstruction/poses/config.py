@@ -45,9 +45,6 @@ class PosesConfig:
     min_held_out_inliers: int = 20
     """2D-3D matches that a held-out frame needs to be located."""
 
-    threads: int = 2
-    """Threads of the mapper. Part of the config since the sums inside depend on it in the last bits."""
-
     seed: int = 0
     """Seed of every random sampling."""
 

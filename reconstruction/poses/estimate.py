@@ -130,7 +130,7 @@ def _triangulate(
     _matched_database(frames, features, imported.camera, config, database, progress)
     model = importers.model_from_poses(imported, frames, features, database)
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = config.threads
+    options.num_threads = mapping.MAPPER_THREADS
     options.random_seed = config.seed
     options.extract_colors = False
     options.min_num_matches = config.min_inliers

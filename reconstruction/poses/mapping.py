@@ -13,6 +13,9 @@ from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.progress import Progress
 
+# With more threads Ceres adds in an order that changes from run to run, and the last bits of poses with it.
+MAPPER_THREADS = 1
+
 
 @contextlib.contextmanager
 def colmap_log(folder: Path) -> Iterator[None]:
@@ -72,7 +75,7 @@ def incremental_models(
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = config.threads
+    options.num_threads = MAPPER_THREADS
     options.random_seed = config.seed
     options.min_num_matches = config.min_inliers
     options.extract_colors = False
@@ -110,7 +113,7 @@ def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[o
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = config.threads
+    options.num_threads = MAPPER_THREADS
     options.random_seed = config.seed
     options.min_num_matches = config.min_inliers
     output = work_dir / "global"

@@ -3,6 +3,7 @@
 import numpy as np
 
 from reconstruction.poses.config import PosesConfig
+from reconstruction.poses.mapping import MAPPER_THREADS
 
 _LOSS_SCALE_PX = 0.5  # Cauchy: SIFT in compressed video has heavy tails (measured: halves the camera error)
 _MIN_OBSERVATIONS = 15  # a frame that sees fewer points has no trustworthy pose
@@ -14,16 +15,16 @@ def refine_model(model: object, config: PosesConfig) -> object:
     if config.camera_model == "auto" and model.num_reg_images() >= _RICH_MODEL_FROM_FRAMES:
         _change_camera_model(model, "RADIAL")
     filter_points(model, 1.5 * config.max_point_error_px, 2)
-    bundle_adjust(model, config)
+    bundle_adjust(model)
     filter_points(model, config.max_point_error_px, 2)
     drop_weak_frames(model)
-    bundle_adjust(model, config)
+    bundle_adjust(model)
     filter_points(model, config.max_point_error_px, config.min_track_length)
     drop_weak_frames(model)
     return model
 
 
-def bundle_adjust(model: object, config: PosesConfig) -> None:
+def bundle_adjust(model: object) -> None:
     """Adjust cameras, points and intrinsics under a Cauchy loss."""
     import pycolmap
 
@@ -34,7 +35,7 @@ def bundle_adjust(model: object, config: PosesConfig) -> None:
     options.ceres.loss_function_scale = _LOSS_SCALE_PX
     options.ceres.solver_options.max_num_iterations = 40
     options.ceres.solver_options.function_tolerance = 1e-6
-    options.ceres.solver_options.num_threads = config.threads
+    options.ceres.solver_options.num_threads = MAPPER_THREADS
     problem = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         problem.add_image(image_id)
