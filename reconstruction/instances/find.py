@@ -52,7 +52,10 @@ def find_instances(
     segmented, crumbs = _without_base_crumbs(graph, segment(graph, rest, config), planes)
     for vertices, number in crumbs:
         owner[vertices] = number
-    things += _mark_attached(graph, segmented, planes)
+    things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
+    for thing in things:
+        if thing.attached:
+            owner[thing.vertices] = 0
     progress.advance()
     vertex_instance = np.where(hung, 0, owner).astype(np.int32)
     objects = describe(graph, things, base, vertex_instance)
@@ -131,24 +134,26 @@ def _without_base_crumbs(
     graph: MeshGraph, things: list[Thing], planes: list[FittedPlane]
 ) -> tuple[list[Thing], list[tuple[np.ndarray, int]]]:
     """Give bumps of the floor and the walls back to them: small, thin, hugging the base all over."""
-    carriers = {id(t.rests_on) for t in things}
     first = 1 if planes and planes[0].label == "floor" else 2
-    kept, crumbs = [], []
-    for thing in things:
+    kept: list[Thing] = []
+    crumbs = []
+    carriers: set[int] = set()
+    for thing in reversed(things):  # what rests on a thing comes after it
         points = graph.points[thing.vertices]
-        if id(thing) in carriers or thing.rests_on is not None or not planes:
+        if not planes or id(thing) in carriers:
             kept.append(thing)
+            carriers.add(id(thing.rests_on))
             continue
         distances = np.stack([np.abs(plane.distance(points)) for plane in planes])
         nearest = distances.min(axis=0)
         spread = np.sort(np.ptp(points, axis=0))
         thin = np.percentile(nearest, 90) < 0.035 or (spread[2] < 0.12 and np.median(nearest) < 0.025)
-        hugging = (nearest < 0.045).mean() > 0.8
-        if (thin and spread[2] < 0.6) or hugging:
+        if (thin and spread[2] < 0.6) or (nearest < 0.05).mean() > 0.8:
             crumbs.append((thing.vertices, first + int(np.argmin(np.median(distances, axis=1)))))
         else:
             kept.append(thing)
-    return kept, crumbs
+            carriers.add(id(thing.rests_on))
+    return kept[::-1], crumbs
 
 
 def _mark_attached(graph: MeshGraph, things: list[Thing], planes: list[FittedPlane]) -> list[Thing]:
@@ -161,6 +166,24 @@ def _mark_attached(graph: MeshGraph, things: list[Thing], planes: list[FittedPla
             if plane.label == "wall" and np.percentile(plane.distance(points), 5) < 0.06:
                 thing.attached = True
     return things
+
+
+def _merge_attached(graph: MeshGraph, things: list[Thing]) -> list[Thing]:
+    """Join hanging things whose boxes overlap: a picture's frame, its inside, its sides."""
+    hanging = sorted((t for t in things if t.attached), key=lambda t: -float(graph.areas[t.vertices].sum()))
+    out = [t for t in things if not t.attached]
+    kept: list[Thing] = []
+    for thing in hanging:
+        points = graph.points[thing.vertices]
+        for other in kept:
+            around = graph.points[other.vertices]
+            low, high = around.min(axis=0) - 0.03, around.max(axis=0) + 0.03
+            if ((points > low) & (points < high)).all(axis=1).mean() > 0.5:
+                other.vertices = np.union1d(other.vertices, thing.vertices)
+                break
+        else:
+            kept.append(thing)
+    return kept + out
 
 
 def describe(
@@ -244,7 +267,7 @@ def _box_to_wall(graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[Ba
     points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
     turned = upright_box(points, areas, yaw)
     distance = points @ normal + wall.surface.plane[3]
-    front = max(float(np.percentile(distance, 80)), 0.015)
+    front = max(float(np.percentile(distance, 80)), 0.02)
     along = np.array([-np.sin(yaw), np.cos(yaw)])
     center = turned.center.copy()
     center[:2] = (turned.center[:2] @ along) * along + (0.5 * front - wall.surface.plane[3]) * normal[:2]

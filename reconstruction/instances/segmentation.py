@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.mesh_graph import MeshGraph, pieces
+from reconstruction.instances.neighbors import neighbors_of
 from reconstruction.instances.splitting import split_touching
 from reconstruction.instances.supports import SupportRegion, candidates_on, find_supports
 
@@ -43,6 +44,7 @@ def _decompose(
         return [own]
     remaining = body
     carried: list[np.ndarray] = []
+    beside: list[np.ndarray] = []
     for support in find_supports(graph, body, config):
         if not np.isin(support.vertices, remaining, assume_unique=True).mean() > 0.5:
             continue  # it lies on something that was taken off already, whose own turn comes
@@ -50,6 +52,10 @@ def _decompose(
             candidate = _flood_same_color(graph, candidate, remaining, support)
             carried.append(candidate)
             remaining = np.setdiff1d(remaining, candidate, assume_unique=True)
+        if depth > 0:
+            for neighbor in neighbors_of(graph, remaining, support, config):
+                beside.append(neighbor)
+                remaining = np.setdiff1d(remaining, neighbor, assume_unique=True)
     own.vertices = remaining
     out: list[Thing] = []
     parts = split_touching(graph, remaining, config) if depth > 0 or not carried else [remaining]
@@ -57,6 +63,8 @@ def _decompose(
     for part in parts[1:]:
         out.append(Thing(part, _carrier(graph, part, out[0], rests_on), depth))
     carriers = list(out)
+    for neighbor in beside:
+        out.extend(_decompose(graph, neighbor, rests_on, depth, config))
     for candidate in carried:
         parent = _nearest_below(graph, candidate, carriers)
         out.extend(_decompose(graph, candidate, parent, depth + 1, config))

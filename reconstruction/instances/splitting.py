@@ -12,6 +12,8 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.mesh_graph import MeshGraph
 
 _MAX_VERTICES = 40_000
+# Shading changes lightness within one thing; two things mostly differ in hue or strongly in lightness.
+LIGHTNESS_WEIGHT = np.array([0.5, 1.0, 1.0], np.float32)
 
 
 def split_touching(graph: MeshGraph, body: np.ndarray, config: InstancesConfig) -> list[np.ndarray]:
@@ -24,7 +26,7 @@ def split_touching(graph: MeshGraph, body: np.ndarray, config: InstancesConfig) 
     links = links[(links >= 0).all(axis=1)]
     if len(links) == 0:
         return [body]
-    patch = _color_patches(graph.lab[body], links, config)
+    patch = _color_patches(graph.lab[body] * LIGHTNESS_WEIGHT, links, config)
     if patch.max() == 0:
         return [body]
     label = _merge_patches(graph, body, links, patch, config)
@@ -103,7 +105,7 @@ def _contacts(
     middle = 0.5 * (graph.points[body[links[crossing, 0]]] + graph.points[body[links[crossing, 1]]])
     concave = crease_angles(graph, body, label, pairs, middle, inverse)
     median_lab = np.stack([np.median(graph.lab[body[label == i]], axis=0) for i in range(count)])
-    color = np.linalg.norm(median_lab[pairs[:, 0]] - median_lab[pairs[:, 1]], axis=1)
+    color = np.linalg.norm((median_lab[pairs[:, 0]] - median_lab[pairs[:, 1]]) * LIGHTNESS_WEIGHT, axis=1)
     strength = np.minimum(concave / config.split_angle_deg, color / config.split_color_contrast)
     return pairs, strength, length
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_fill_holes
+from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
@@ -177,7 +177,55 @@ def candidates_on(
                 else:
                     refused.append(candidate)
         pool = refused
-    return _disjoint(out)
+    out = _disjoint(out)
+    apart = [part for one in out for part in _fall_apart(graph, body, one, support, base, config)]
+    return _merge_alike(graph, apart)
+
+
+def _fall_apart(
+    graph: MeshGraph,
+    body: np.ndarray,
+    whole: np.ndarray,
+    support: SupportRegion,
+    base: float,
+    config: InstancesConfig,
+) -> list[np.ndarray]:
+    """Cut neighbors that only touch at their feet: higher up they are separate and of different colors."""
+    for level in (1.8 * base, 3.0 * base, 4.5 * base):
+        high = whole[graph.points[whole, 2] > support.height_m + level]
+        parts = [p for p in pieces(graph, high) if graph.areas[p].sum() > 0.12 * graph.areas[whole].sum()]
+        if len(parts) < 2 or not all(stands_on(graph, body, support, p, level, config) for p in parts):
+            continue
+        colors = [_color(graph, p) for p in parts]
+        gaps = [np.linalg.norm(a - b) for i, a in enumerate(colors) for b in colors[:i]]
+        if min(gaps) < 5.0:
+            continue
+        owner = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
+        nearest = cKDTree(graph.points[np.concatenate(parts)]).query(graph.points[whole])[1]
+        return [whole[owner[nearest] == i] for i in range(len(parts))]
+    return [whole]
+
+
+def _merge_alike(graph: MeshGraph, parts: list[np.ndarray]) -> list[np.ndarray]:
+    """Join pieces of one color with a narrow gap between them: one thing torn by holes in the surface."""
+    parts = sorted(parts, key=lambda p: (-graph.areas[p].sum(), p[0]))
+    i = 0
+    while i < len(parts):
+        tree = cKDTree(graph.points[parts[i]])
+        for j in range(i + 1, len(parts)):
+            gap = tree.query(graph.points[parts[j]], distance_upper_bound=0.03)[0].min()
+            if gap < 0.025 and np.linalg.norm(_color(graph, parts[i]) - _color(graph, parts[j])) < 9.0:
+                parts[i] = np.union1d(parts[i], parts[j])
+                del parts[j]
+                break
+        else:
+            i += 1
+    return parts
+
+
+def _color(graph: MeshGraph, vertices: np.ndarray) -> np.ndarray:
+    """Return the median CIELAB color, lightness at half weight because shading changes it."""
+    return np.median(graph.lab[vertices], axis=0) * [0.5, 1, 1]
 
 
 def _without_stain(graph: MeshGraph, candidate: np.ndarray, support: SupportRegion) -> np.ndarray:
@@ -234,11 +282,20 @@ def stands_on(
     extents = points.max(axis=0) - points.min(axis=0)
     if np.sort(extents)[1] < config.min_object_m or len(candidate) < config.min_object_vertices:
         return False
-    color_gap = float(np.linalg.norm(np.median(graph.lab[candidate], axis=0) - support.lab))
+    color_gap = float(np.linalg.norm(_color(graph, candidate) - _color(graph, support.vertices)))
     rise = float(np.percentile(points[:, 2], 95)) - support.height_m
-    if rise < max(0.025, 5 * support.noise_m) and color_gap < 8.0:
+    if rise < max(0.015, support.noise_m) or _is_bump(graph, candidate, rise, color_gap):
         return False  # a bump of the support itself
     return not _belongs_to_body(graph, body, support, candidate, foot, color_gap)
+
+
+def _is_bump(graph: MeshGraph, candidate: np.ndarray, rise: float, color_gap: float) -> bool:
+    """Tell swellings of a noisy support, low, of its color, wide or without steep sides, from flat things."""
+    if rise > 0.055 or color_gap > 10.0:
+        return False
+    extents = np.sort(np.ptp(graph.points[candidate, :2], axis=0))
+    steep = float((graph.normals[candidate, 2] < 0.5).mean())
+    return rise < 0.02 or steep < 0.15 or extents[1] > 0.25 or rise < 0.12 * extents[0]
 
 
 def contact_height(support: SupportRegion, config: InstancesConfig) -> float:
@@ -275,6 +332,14 @@ def _belongs_to_body(
             foot[:, :2], distance_upper_bound=max(0.018, 1.8 * cell)
         )
         if np.isfinite(distance).mean() > 0.4 and color_gap < 30.0:
+            return True
+    # Posts, arms and rims: the body's color, slim or along the edge of the support.
+    if color_gap < 9.0:
+        slim = float(np.sort(np.ptp(graph.points[candidate], axis=0)[:2])[0]) < 0.05
+        edge_cells = max(2, round(0.03 / cell))
+        core = binary_erosion(support.footprint.filled, iterations=edge_cells)
+        inner_print = Footprint(support.footprint.origin, cell, core, core)
+        if slim or inner_print.contains(foot[:, :2]).mean() < 0.5:
             return True
     # A back or arm: as long as the support, the same color, and larger than things usually are.
     span = _span_ratio(graph, support, candidate)
