@@ -57,7 +57,7 @@ def fill_small_gaps(depth, out):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def label_costs(
-    depth, raw, planes, neighbors, relative, maps, k, near, far, cost
+    depth, raw, planes, doubt, neighbors, relative, maps, k, near, far, cost
 ):  # pragma: no cover - compiled
     """Fill cost (h, w, labels + 1): how badly each plane suits a pixel; the last label is "no plane".
 
@@ -65,6 +65,7 @@ def label_costs(
         depth: (h, w) measured depth, 0 = none.
         raw: (h, w) depth before it was checked: a weak hint.
         planes: (labels, 4) in this camera's space: inverse depth = -(n . r) / d.
+        doubt: (labels,) what filling with a plane costs more, because few things in a room lie like it.
         neighbors: (m,) rows of `maps`, -1 = none.
         relative: (m, 4, 4) neighbour_from_view.
         maps: (n, h, w) measured depth of all views.
@@ -109,7 +110,7 @@ def label_costs(
                         through += 1
                     elif d > 0.985 * qz and d < 1.015 * qz:
                         agree += 1
-                value = 44.0 + 40.0 * through - 15.0 * min(agree, 2)
+                value = 44.0 + doubt[c] + 40.0 * through - 15.0 * min(agree, 2)
                 if raw[y, x] > 0.0 and abs(raw[y, x] * rho - 1.0) < 0.015:
                     value -= 12.0
                 cost[y, x, c] = np.uint8(min(200.0, max(0.0, value)))
@@ -145,8 +146,26 @@ def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarra
     return keep
 
 
-def _view_planes(planes: np.ndarray, world_from_camera: np.ndarray, depth, camera: Camera) -> np.ndarray:
-    """Return the planes that enough of this view's measured pixels lie on, in camera space, most supported first."""
+def _crooked(planes: np.ndarray) -> np.ndarray:
+    """Return 1.0 for each plane that is neither parallel nor square to the room's main direction, else 0.0.
+
+    That is the direction to which most planes are parallel or square: the vertical, in a room. Shells that wrong
+    matches of blank surfaces leave behind face the cameras and are crooked.
+    """
+    if len(planes) == 0:
+        return np.zeros(0)
+    cosine = np.abs(planes[:, :3] @ planes[:, :3].T)
+    straight = (cosine > 0.996) | (cosine < 0.087)
+    # The largest planes come first and weigh most.
+    weight = 1.0 / np.arange(2, len(planes) + 2)
+    main = int(np.argmax((straight * weight).sum(1)))
+    return np.where(straight[main], 0.0, 1.0)
+
+
+def _view_planes(
+    planes: np.ndarray, world_from_camera: np.ndarray, depth, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (rows, planes) that enough of this view's measured pixels lie on, planes in camera space, most supported first."""
     local = planes @ world_from_camera  # a plane is a row vector: p_camera = p_world @ world_from_camera
     y, x = np.nonzero(depth[1::3, 1::3])
     y, x = y * 3 + 1, x * 3 + 1
@@ -155,7 +174,8 @@ def _view_planes(planes: np.ndarray, world_from_camera: np.ndarray, depth, camer
         ratio = -(local[:, :3] @ rays) / local[:, 3:] * depth[y, x]
     support = (np.abs(ratio - 1.0) < 0.006).sum(1)
     order = np.argsort(-support, kind="stable")[:_MAX_LABELS]
-    return np.ascontiguousarray(local[order[support[order] >= 15]])
+    order = order[support[order] >= 15]
+    return order, np.ascontiguousarray(local[order])
 
 
 def complete_depth(
@@ -189,18 +209,31 @@ def complete_depth(
     points, normals, depths = (np.concatenate([c[a] for c in clouds]) for a in range(3))
     planes = find_planes(points, normals, depths, tolerance=0.006, max_planes=48, seed=config.seed)
     progress.note(f"depth: {len(planes)} planes support the completion")
+    doubt = 14.0 * _crooked(planes)
     out, confidence = gapless.copy(), np.where(depth > 0, 2, np.where(gapless > 0, 1, 0)).astype(np.uint8)
     k = np.array([small.fx, small.fy, small.cx, small.cy])
 
     def complete(i: int) -> None:
-        local = _view_planes(planes, posed.world_from_camera[i], maps[i], small)
+        chosen, local = _view_planes(planes, posed.world_from_camera[i], maps[i], small)
         if len(local) == 0:
             return
         rows = plan.neighbors[i][:8]
         relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
         hint = cv2.resize(raw[i], size, interpolation=cv2.INTER_NEAREST)
         cost = np.empty((small.height, small.width, len(local) + 1), np.uint8)
-        label_costs(maps[i], hint, local, rows, relative, maps, k, plan.near[i] * 0.8, plan.far[i], cost)
+        label_costs(
+            maps[i],
+            hint,
+            local,
+            doubt[chosen],
+            rows,
+            relative,
+            maps,
+            k,
+            plan.near[i] * 0.8,
+            plan.far[i],
+            cost,
+        )
         gray = cv2.cvtColor(np.ascontiguousarray(posed.images[i]), cv2.COLOR_RGB2GRAY)
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         total = np.zeros(cost.shape, np.uint16)

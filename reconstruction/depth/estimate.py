@@ -136,7 +136,7 @@ def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthCon
         )
         # A window without contrast correlates with anything a little: such depth needs more witnesses.
         good = (count[i] >= config.min_agreeing) & (score[i] >= config.min_correlation)
-        good |= (count[i] >= 2 * config.min_agreeing) & (score[i] >= 0.2 * config.min_correlation)
+        good |= (count[i] >= 2 * config.min_agreeing) & (score[i] >= 0.6 * config.min_correlation)
         fused[i] *= good
         fused[i] *= remove_speckles(fused[i], config.min_speckle_px, 0.02)
 
