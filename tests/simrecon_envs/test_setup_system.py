@@ -27,8 +27,8 @@ def apt(tmp_path: Path) -> Path:
 
 def test_deb822_keeps_mirror_and_key(apt: Path) -> None:
     (apt / "sources.list.d" / "debian.sources").write_text(
-        "# a comment\nTypes: deb deb-src\nURIs: https://mirror.example/debian\n"
-        "Suites: bookworm bookworm-updates\nComponents: main contrib\nSigned-By: /usr/share/keyrings/key.gpg\n"
+        "# x\nTypes: deb deb-src\nURIs: https://mirror.example/debian\n"
+        "Suites: bookworm bookworm-updates\nComponents: main contrib\nSigned-By: /usr/share/key.gpg\n"
         "\nTypes: deb\nURIs: https://mirror.example/security\nSuites: bookworm-security\nComponents: main\n"
     )
     assert _derive(apt).splitlines() == [
@@ -36,7 +36,7 @@ def test_deb822_keeps_mirror_and_key(apt: Path) -> None:
         "URIs: https://mirror.example/debian",
         "Suites: bookworm-backports",
         "Components: main",
-        "Signed-By: /usr/share/keyrings/key.gpg",
+        "Signed-By: /usr/share/key.gpg",
     ]
 
 
