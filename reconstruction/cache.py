@@ -22,6 +22,7 @@ from registry.errors import EnvironmentMissing
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 KEPT_PER_STAGE = 2
+_NEEDED_BYTES = 3 << 29  # The stages of one video take about 1.5 GB.
 _MANIFEST = "manifest.json"
 # What several stages compute with; a change there invalidates all of them.
 _SHARED_MODULES = (
@@ -86,10 +87,17 @@ class StageStore:
         try:
             work_dir.mkdir(parents=True, exist_ok=True)
             self._sweep()
+            free_bytes = shutil.disk_usage(work_dir).free
         except OSError as error:
             raise EnvironmentMissing(
                 f"cannot write to the work folder {work_dir}: {error.strerror or error}. Choose another with --work-dir."
             ) from error
+
+        if free_bytes < _NEEDED_BYTES:
+            raise EnvironmentMissing(
+                f"{work_dir}: only {free_bytes / 2**30:.1f} GB free on this disk, a run needs about "
+                f"{_NEEDED_BYTES / 2**30:.1f} GB. Free some, or choose another disk with --work-dir."
+            )
 
     def _folder(self, number: int, stage: str, key: str) -> Path:
         return self.work_dir / f"{number:02d}_{stage}-{key}"

@@ -1,10 +1,9 @@
-"""The last step: write the scene bundle (CONTRACT section 2), look at it once, and publish it in the registry."""
+"""The last step: write the scene bundle (`docs/bundle_format.md`) and publish it in the registry."""
 
 import dataclasses
+import json
 import platform
-import shutil
 import subprocess
-import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +13,7 @@ import numpy as np
 
 from reconstruction.assembly import base_slabs
 from reconstruction.assets.gltf import write_glb, write_obj
+from reconstruction.cache import canonical_json
 from reconstruction.preview import render_preview
 from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
 from registry import SceneRecord, SceneRegistry, seal_bundle
@@ -37,7 +37,7 @@ _RECORDED_PACKAGES = (
 
 
 def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require_stable: bool) -> SceneRecord:
-    """Write the bundle of a finished run beside the registry's scenes and publish it atomically.
+    """Write the bundle of a finished run in the work folder, then publish it atomically.
 
     Raises:
         SimReconError: `require_stable` and an object does not stay put.
@@ -48,25 +48,21 @@ def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require
     if require_stable and unstable:
         raise SimReconError(
             f"{scene_id}: not published, because objects {', '.join(unstable)} do not stay put for 10 s "
-            f"(stable rate {report.get('stable_rate', 0):.2f}). Drop or fix them with --overrides, or leave out --require-stable."
+            f"(stable rate {report.get('stable_rate', 0):.2f}). Drop or fix them with --overrides, or leave out "
+            f"--require-stable."
         )
-    try:
-        registry.root.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".staging-{scene_id}-", dir=registry.root))
-    except OSError as error:
-        raise EnvironmentMissing(
-            f"cannot write to the registry {registry.root}: {error.strerror or error}. Choose another with --registry."
-        ) from error
+    staging = run.store.scratch("publish")
     try:
         seal_bundle(staging, write_bundle(run, scene_id, staging))
         return registry.publish(staging, scene_id)
     except OSError as error:
         raise EnvironmentMissing(
             f"{scene_id}: cannot write its bundle to {registry.root}: {error.strerror or error}. "
-            f"The registry is unchanged and finished stages are kept; free some space and run the same command again."
+            f"The registry is unchanged and finished stages are kept; free some space and run the same command "
+            f"again."
         ) from error
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        run.store.discard(staging)
 
 
 def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
@@ -212,7 +208,7 @@ def _report(run: "Run") -> dict:
             "assets": "embedded",
             "relations": "geometry",
         },
-        "config": dataclasses.asdict(run.config),
+        "config": json.loads(canonical_json(run.config)),
         "overrides": run.overrides.entries,
         "notes": run.notes,
         "registration": {

@@ -110,7 +110,9 @@ class DepthMaps:
 class ScaleEstimate:
     """How metres were found."""
 
-    method: str  # "marker" | "user-camera-height" | "user-distance" | "user-object" | "metric-depth" | "camera-height-prior" | "unknown"
+    # "marker" | "user-camera-height" | "user-distance" | "user-object" | "user-factor" | "metric-depth" |
+    # "camera-height-prior" | "table-height-prior" | "subject-distance-prior" | "unknown"
+    method: str
     uncertainty: float  # relative 1-sigma of the scale
     detail: str  # one sentence for people
 

@@ -17,7 +17,7 @@ metric scale, best first:
   --scale camera-height=1.5     you held the camera 1.5 m above the floor on average
   --scale distance:40,100,200,300,210=1.2   pixels (100,200) and (300,210) of video frame 40 are 1.2 m apart
   --scale object:3.height=0.74  object 3 (see `simrecon show`) is 0.74 m high
-  (nothing)                     people hold cameras at 1.45 m, give or take 12 %
+  (nothing)                     people hold cameras about 1.4 m high, give or take 15 %
 
 examples:
   simrecon reconstruct room.mp4
@@ -84,6 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("which video? Give a file or a folder of images: simrecon reconstruct VIDEO")
     if not arguments.video.exists():
         raise UsageError(f"{arguments.video}: no such file or folder")
+    _check_device(arguments.device)
     from reconstruction.commands.reporting import make_listener
     from reconstruction.overrides import Overrides
     from reconstruction.pipeline import reconstruct
@@ -102,6 +103,23 @@ def run(arguments: argparse.Namespace) -> int:
         )
     _print_result(result, arguments)
     return 0
+
+
+def _check_device(device: str) -> None:
+    """Refuse `--device cuda` where there is none. Every embedded stage computes on the CPU either way."""
+    if device != "cuda":
+        return
+    from registry.errors import EnvironmentMissing
+
+    try:
+        import torch
+    except ImportError as error:
+        raise EnvironmentMissing("--device cuda: torch is not installed; see `simrecon doctor`") from error
+    if not torch.cuda.is_available():
+        raise EnvironmentMissing(
+            "--device cuda: torch finds no CUDA device. Leave --device out to compute on the CPU, or install a CUDA "
+            "build of torch; see docs/install.md."
+        )
 
 
 def _config(arguments: argparse.Namespace) -> object:
