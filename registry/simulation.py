@@ -92,9 +92,9 @@ class Physics:
             physx.set_body_config(previous)
         material = physx.PhysxMaterial(spec.friction, spec.friction, spec.restitution)
         for part in spec.parts:
-            body.attach(_convex_shape(physx, part, material, spec))
+            body.attach(convex_shape(physx, part, material, spec))
         if not spec.base:
-            _set_inertial(sapien, body, spec)
+            set_inertial(sapien, body, spec)
             # SAPIEN's default angular damping is 0.05; the contract measures without any.
             body.set_linear_damping(0.0)
             body.set_angular_damping(0.0)
@@ -374,7 +374,7 @@ def _finite(pose: np.ndarray) -> np.ndarray:
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, -_FAR_AWAY_M]))
 
 
-def _convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) -> Any:
+def convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) -> Any:
     """Cook one convex piece; pieces that are flat get a minimal thickness first."""
     points = np.asarray(part, np.float64)
     center = points.mean(0)
@@ -407,7 +407,7 @@ def _most_extreme(points: np.ndarray, count: int) -> np.ndarray:
     return points[keep[:count]]
 
 
-def _set_inertial(sapien: Any, body: Any, spec: BodySpec) -> None:
+def set_inertial(sapien: Any, body: Any, spec: BodySpec) -> None:
     if not spec.mass_kg > 0:
         raise SimReconError(
             f"physics: '{spec.name}' (id {spec.id}) has mass {spec.mass_kg} kg, expected more than 0"

@@ -31,7 +31,7 @@ from registry.geometry import (
 )
 
 # The same shapes and masses as in the report card that the bundle carries.
-from registry.simulation import BodySpec, _convex_shape, _set_inertial
+from registry.simulation import BodySpec, convex_shape, set_inertial
 from simrecon_envs.occupancy import ConvexSolid, base_slab, glb_vertices, read_obj_vertices, slab_corners
 
 BASE_FRICTION = 0.5
@@ -200,11 +200,11 @@ class _BodyBuilder(ActorBuilder):
             root_from_object = invert_rigid(body.world_from_root) @ spec.world_from_object
             material = physx.PhysxMaterial(spec.friction, spec.friction, spec.restitution)
             for part in spec.parts:
-                shape = _convex_shape(physx, transform_points(root_from_object, part), material, spec)
+                shape = convex_shape(physx, transform_points(root_from_object, part), material, spec)
                 shape.set_collision_groups(self.collision_groups)
                 component.attach(shape)
         if body.dynamic:
-            _set_inertial(sapien, component, merged_mass(body))
+            set_inertial(sapien, component, merged_mass(body))
             component.set_linear_damping(0.0)
             component.set_angular_damping(0.0)
         component.name = self.name

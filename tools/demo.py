@@ -34,7 +34,7 @@ def main() -> int:
             render_scene_picture(env_id, picture)
         if not rollout.exists():
             print("recording a rollout (a minute without a GPU) ...", flush=True)
-            record_rollout(env_id, rollout, steps=60, seed=0)
+            record_rollout(env_id, rollout, steps=90, seed=0)
     except EnvironmentMissing as error:
         print(f"no rollout video on this machine: {error}")
         picture = Path(record.path) / "preview.png"
