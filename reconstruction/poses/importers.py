@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.decoding import ImageFolder
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
 from reconstruction.poses.refine import drop_weak_frames, filter_points
@@ -21,7 +22,6 @@ from registry.errors import UsageError
 # nerfstudio's cameras follow OpenGL: +x right, +y up, looking along -z.
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _MIN_COMMON_FRAMES = 8
-_IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,8 @@ def _frame_numbers(names: list[str], frames: FrameSet) -> list[int]:
     """Return the video frame number of each image name (sorted by name)."""
     source = Path(frames.source.file)
     if source.is_dir():
-        listed = sorted(p.name for p in source.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
-        order = {name: number for number, name in enumerate(listed)}
+        # The same reading of the folder as in stage 1, so that order and left-out files agree.
+        order = {path.name: number for number, path in enumerate(ImageFolder(source).files)}
         return [order.get(Path(name).name, -1) for name in names]
     if len(names) == frames.source.frame_count:
         return list(range(len(names)))

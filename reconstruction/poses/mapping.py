@@ -35,6 +35,8 @@ def colmap_log(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        for level in (log.Level.INFO, log.Level.WARNING, log.Level.ERROR):
+            log.set_log_destination(level, "")  # the folder may be deleted from here on
         for name, value in before.items():
             setattr(log, name, value)
 
@@ -97,14 +99,19 @@ def incremental_models(
             done[0] += 1
             progress.advance()
 
+    def first_two() -> None:
+        one_more()
+        one_more()
+
     models = pycolmap.incremental_mapping(
         database,
         work_dir,
         output,
         options,
-        initial_image_pair_callback=one_more,
+        initial_image_pair_callback=first_two,
         next_image_callback=one_more,
     )
+    progress.advance(total - done[0])
     return _by_size(models)
 
 
