@@ -1,12 +1,10 @@
 """Floor, walls and ceiling: rectangles that reach as far as the room was seen, with looks baked from the frames."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.texture import Texels, blend, exposure_gains, look_up, push_pull, textured
+from reconstruction.assets.texture import Texels, collect_colors, prepare_looks, push_pull, textured
 from reconstruction.assets.views import ScenePixels
 from reconstruction.types import BaseAsset, BaseEntity, DepthMaps, InstanceSet, ObjectAsset, PosedFrames
 from registry.geometry import invert_rigid, transform_points
@@ -92,7 +90,7 @@ def _bake_rectangle(
     u, v = np.meshgrid(center, 1 - center)
     flat = np.stack([low[0] + u * size[0], low[1] + v * size[1], np.zeros_like(u)], -1).reshape(-1, 3)
     rows, columns = np.divmod(np.arange(side * side, dtype=np.int32), side)
-    normal = np.broadcast_to(world_from_plane[:3, 2], flat.shape)
+    normal = np.repeat(world_from_plane[None, :3, 2], len(flat), axis=0)
     texels = Texels(rows, columns, transform_points(world_from_plane, flat), normal)
     color, seen = _collect(texels, entity, posed, depth, pixels, config)
     picture = np.zeros((side, side, 3), np.float32)
@@ -100,7 +98,10 @@ def _bake_rectangle(
     picture[filled] = color[seen]
     picture = push_pull(picture, filled) if filled.any() else picture + 180.0
     mesh = textured(
-        transform_points(world_from_plane, vertices), faces, uvs, np.clip(np.round(picture), 0, 255).astype(np.uint8)
+        transform_points(world_from_plane, vertices),
+        faces,
+        uvs,
+        np.clip(np.round(picture), 0, 255).astype(np.uint8),
     )
     plane = entity.surface.plane / np.linalg.norm(entity.surface.plane[:3])
     return BaseAsset(entity.id, entity.label, np.asarray(plane, np.float64), mesh, entity.observed)
@@ -113,40 +114,35 @@ def _grid(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, n
     uvs = np.stack([s, t], -1).reshape(-1, 2)
     vertices = np.column_stack([low + uvs * (high - low), np.zeros(len(uvs))])
     index = np.arange((nx + 1) * (ny + 1)).reshape(nx + 1, ny + 1)
-    a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+    a, b, c, d = (
+        index[:-1, :-1].ravel(),
+        index[1:, :-1].ravel(),
+        index[1:, 1:].ravel(),
+        index[:-1, 1:].ravel(),
+    )
     return vertices, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).astype(np.int32), uvs
 
 
 def _collect(
-    texels: Texels, entity: BaseEntity, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, config: AssetsConfig
+    texels: Texels,
+    entity: BaseEntity,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    pixels: ScenePixels,
+    config: AssetsConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blend colours from frames spread over the video, in chunks that bound memory."""
+    """Blend colours from frames spread over the video."""
     count = (pixels.ids == entity.id).reshape(len(pixels.ids), -1).sum(axis=1)
     able = np.flatnonzero(count > 0.01 * pixels.ids[0].size)
-    frames = able[np.unique(np.linspace(0, len(able) - 1, min(len(able), 2 * config.texture_frames)).round().astype(int))] \
-        if len(able) else able  # fmt: skip
-    color = np.zeros((len(texels.points), 3), np.float32)
-    seen = np.zeros(len(texels.points), bool)
-    prepared = [_base_view(entity, int(f), posed, depth, pixels) for f in frames]
-    gains: np.ndarray | None = None
-    chunk = 1 << 17
-    for start in [0, *range(0, len(texels.points), chunk)]:
-        # The first round only measures exposure, on texels spread over the whole surface.
-        index = np.arange(start, min(start + chunk, len(texels.points)))
-        if gains is None:
-            index = np.arange(0, len(texels.points), max(1, len(texels.points) // 20000))
-        part = replace(
-            texels, rows=texels.rows[index], columns=texels.columns[index], points=texels.points[index],
-            normals=texels.normals[index],
-        )  # fmt: skip
-        colors = np.zeros((len(frames), len(index), 3), np.float32)
-        weights = np.zeros((len(frames), len(index)), np.float32)
-        for row, (frame, (plane_depth, border)) in enumerate(zip(frames, prepared)):
-            colors[row], weights[row] = look_up(part, posed, int(frame), depth.camera, plane_depth, border, 0.02)
-        if gains is None:
-            gains = exposure_gains(colors, weights) if len(frames) else np.ones((0, 1))
-            continue
-        color[index], seen[index] = blend(colors * gains[:, None], weights, equalize=False)
+    if len(able):
+        able = able[
+            np.unique(
+                np.linspace(0, len(able) - 1, min(len(able), 2 * config.texture_frames)).round().astype(int)
+            )
+        ]
+    views = [_base_view(entity, int(f), posed, depth, pixels) for f in able]
+    looks = prepare_looks(posed, depth.camera, able, [v[0] for v in views], [v[1] for v in views])
+    color, seen, _ = collect_colors(texels, looks, 0.02)
     return color, seen
 
 

@@ -65,7 +65,9 @@ def build_object(
     try:
         body, frame, how = object_solid(item, posed, depth, pixels, found, config)
     except (ValueError, IndexError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:
-        progress.note(f"object {item.id} ({item.label}): could not be completed ({type(error).__name__}: {error})")
+        progress.note(
+            f"object {item.id} ({item.label}): could not be completed ({type(error).__name__}: {error})"
+        )
         body, frame = box_fallback(item, np.zeros((0, 3)))
         how = "box-fallback"
     if how == "box-fallback":
@@ -76,7 +78,15 @@ def build_object(
     distance = np.linalg.norm(posed.world_from_camera[:, :3, 3] - world_from_object[:3, 3], axis=1).min()
     tolerance = float(0.006 + 3 * pixels.noise_relative * distance + 0.01 * body.extents.max())
     baked = texture.bake_object(
-        transform_points(world_from_object, vertices), faces, uvs, item.id, posed, depth.camera, pixels, config, tolerance
+        transform_points(world_from_object, vertices),
+        faces,
+        uvs,
+        item.id,
+        posed,
+        depth.camera,
+        pixels,
+        config,
+        tolerance,
     )
     choice = choose_material(item.label, item.label_confidence, baked.mean_rgb, body.extents)
     return ObjectAsset(

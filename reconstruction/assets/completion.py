@@ -29,7 +29,7 @@ def complete(
     volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig, *, furniture: bool
 ) -> CompletedField:
     """Close the unknown part of an object's volume."""
-    volume = _cut_at_support(volume, frame)
+    volume = _settle_on_support(volume, frame)
     names: list[str] = []
     if config.symmetry and frame.wall_y is None:
         volume, names = _apply_symmetries(volume, frame)
@@ -44,15 +44,26 @@ def complete(
     return CompletedField(volume.origin, volume.voxel_m, _blend(field, volume, frame), tuple(names))
 
 
-def _cut_at_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume:
-    """Nothing of the object is below what it stands on."""
+def _settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume:
+    """Nothing of the object is below its support, and it goes straight down where it meets it.
+
+    Just above the support nothing can be told free (noise), so that the layer above is carried down.
+    """
     if frame.wall_y is not None:
         return volume
     distance, known, free = volume.distance.copy(), volume.known.copy(), volume.free.copy()
-    below = volume.centers(2) < 0
-    distance[:, :, below] = volume.trunc_m
-    known[:, :, below] = True
-    free[:, :, below] = True
+    z = volume.centers(2)
+    first = int(np.searchsorted(z, 0.0))
+    top = min(int(np.searchsorted(z, 1.1 * volume.trunc_m)), len(z) - 1)
+    if frame.on_support:
+        for k in range(top - 1, first - 1, -1):
+            carry = ~known[:, :, k] & known[:, :, k + 1]
+            distance[:, :, k][carry] = distance[:, :, k + 1][carry]
+            free[:, :, k][carry] = free[:, :, k + 1][carry]
+            known[:, :, k] |= carry
+    distance[:, :, :first] = volume.trunc_m
+    known[:, :, :first] = True
+    free[:, :, :first] = True
     return replace(volume, distance=distance, known=known, free=free)
 
 
@@ -166,12 +177,19 @@ def _keep_shells(field: np.ndarray, volume: ObjectVolume, config: AssetsConfig) 
 
 
 def _blend(field: np.ndarray, volume: ObjectVolume, frame: ObjectFrame) -> np.ndarray:
-    """Smooth within the noise where seen, and by a voxel where closed, then cut flat at the support."""
+    """Smooth within the noise where seen, and by two voxels where closed, then cut flat at the support."""
     sigma_seen = float(np.clip(0.7 * volume.noise_m / volume.voxel_m, 0.0, 1.2))
     seen = gaussian_filter(field, sigma_seen) if sigma_seen > 0.3 else field
-    closed = gaussian_filter(field, 1.0)
-    known = gaussian_filter(volume.known.astype(np.float32), 0.7)
-    out = known * seen + (1 - known) * closed
+    if frame.wall_y is None:
+        # The cut must not round the bottom edge off: continue the field below it first.
+        first = int(np.searchsorted(volume.centers(2), 0.0))
+        if 0 < first < field.shape[2]:
+            field = field.copy()
+            field[:, :, :first] = field[:, :, first : first + 1]
+            seen = np.concatenate([field[:, :, :first], seen[:, :, first:]], axis=2)
+    closed = gaussian_filter(field, 1.8)
+    weight = np.clip(2.0 * gaussian_filter(volume.seen.astype(np.float32), 0.8), 0.0, 1.0)
+    out = weight * seen + (1 - weight) * closed
     if frame.wall_y is None:
         z = volume.centers(2).astype(np.float32)
         out = np.maximum(out, -z[None, None, :])

@@ -161,3 +161,128 @@ def fuse_object(
                 freed[i, j, k] = n_free
                 behind[i, j, k] = n_behind
     return numerator, denominator, freed, behind
+
+
+@njit(cache=True, inline="always")
+def _sample_pixel(
+    point, normal, m, center, image, depth, border, fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, out
+):  # pragma: no cover - compiled
+    """Colour of a surface point in one frame into `out` (3,); returns its weight, 0 where the frame does not see it."""
+    px, py, pz = point[0], point[1], point[2]
+    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+    if z < 0.05:
+        return 0.0
+    xn = (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]) / z
+    yn = (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]) / z
+    u, v = fx * xn + cx, fy * yn + cy
+    h, w = image.shape[0], image.shape[1]
+    if u < 0.5 or v < 0.5 or u >= w - 0.5 or v >= h - 0.5:
+        return 0.0
+    vx, vy, vz = center[0] - px, center[1] - py, center[2] - pz
+    length = math.sqrt(vx * vx + vy * vy + vz * vz)
+    cos = (vx * normal[0] + vy * normal[1] + vz * normal[2]) / max(length, 1e-9)
+    if cos < 0.08:
+        return 0.0
+    iu = min(max(int(dfx * xn + dcx), 0), depth.shape[1] - 1)
+    iv = min(max(int(dfy * yn + dcy), 0), depth.shape[0] - 1)
+    here = depth[iv, iu]
+    slope = 1.5 * z / dfx / max(cos, 0.1)  # depth changes this much over a pixel
+    if here <= 0 or abs(here - z) > tolerance + slope or border[iv, iu] <= 0:
+        return 0.0
+    x0, y0 = int(u - 0.5), int(v - 0.5)
+    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    tx, ty = u - 0.5 - x0, v - 0.5 - y0
+    for c in range(3):
+        top = image[y0, x0, c] * (1 - tx) + image[y0, x1, c] * tx
+        low = image[y1, x0, c] * (1 - tx) + image[y1, x1, c] * tx
+        out[c] = top * (1 - ty) + low * ty
+    return cos * cos / max(length, 0.1) ** 2 * border[iv, iu]
+
+
+@njit(cache=True, parallel=True)
+def sample_frames(
+    points,
+    normals,
+    camera_from_world,
+    centers,
+    images,
+    depths,
+    borders,
+    intrinsics,
+    depth_intrinsics,
+    tolerance,
+):  # pragma: no cover - compiled
+    """Colours (k, t, 3) and weights (k, t) of surface points in every frame."""
+    count, frames = len(points), len(images)
+    colors = np.zeros((frames, count, 3), np.float32)
+    weights = np.zeros((frames, count), np.float32)
+    fx, fy, cx, cy = intrinsics
+    dfx, dfy, dcx, dcy = depth_intrinsics
+    for t in prange(count):
+        for k in range(frames):
+            weights[k, t] = _sample_pixel(
+                points[t], normals[t], camera_from_world[k], centers[k], images[k], depths[k], borders[k],
+                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, colors[k, t],
+            )  # fmt: skip
+    return colors, weights
+
+
+@njit(cache=True, parallel=True)
+def blend_frames(
+    points,
+    normals,
+    camera_from_world,
+    centers,
+    images,
+    depths,
+    borders,
+    gains,
+    intrinsics,
+    depth_intrinsics,
+    tolerance,
+):  # pragma: no cover - compiled
+    """Blend each surface point's best three colours; returns colours (t, 3) and whether any frame saw it (t,)."""
+    count, frames = len(points), len(images)
+    out = np.zeros((count, 3), np.float32)
+    seen = np.zeros(count, np.bool_)
+    fx, fy, cx, cy = intrinsics
+    dfx, dfy, dcx, dcy = depth_intrinsics
+    for t in prange(count):
+        best = np.zeros((3, 3), np.float32)
+        weight = np.zeros(3)
+        color = np.zeros(3, np.float32)
+        for k in range(frames):
+            w = _sample_pixel(
+                points[t], normals[t], camera_from_world[k], centers[k], images[k], depths[k], borders[k],
+                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, color,
+            )  # fmt: skip
+            for slot in range(3):
+                if w > weight[slot]:
+                    for lower in range(2, slot, -1):
+                        weight[lower] = weight[lower - 1]
+                        best[lower] = best[lower - 1]
+                    weight[slot] = w
+                    for c in range(3):
+                        best[slot, c] = color[c] * gains[k]
+                    break
+        if weight[0] <= 0:
+            continue
+        seen[t] = True
+        total = 0.0
+        for slot in range(3):
+            if weight[slot] <= 0:
+                break
+            # Highlights and stray labels differ from the middle of three colours.
+            off = 0.0
+            if weight[2] > 0:
+                for c in range(3):
+                    a, b, d = best[0, c], best[1, c], best[2, c]
+                    middle = max(min(a, b), min(max(a, b), d))
+                    off = max(off, abs(best[slot, c] - middle) / 40.0)
+            share = weight[slot] ** 2 / (1 + off * off)
+            total += share
+            for c in range(3):
+                out[t, c] += share * best[slot, c]
+        for c in range(3):
+            out[t, c] /= total
+    return out, seen

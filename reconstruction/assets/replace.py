@@ -43,20 +43,26 @@ def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = No
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = vertices - np.array([*(low + high)[:2] / 2, low[2]])
     if not np.isfinite(vertices).all() or (high - low).max() > 20 or (high - low).max() < 1e-3:
-        raise UsageError(f"overrides: {path} of object {item.id} is {(high - low).round(3)} m large; metres are expected")
+        raise UsageError(
+            f"overrides: {path} of object {item.id} is {(high - low).round(3)} m large; metres are expected"
+        )
     faces = np.asarray(loaded.faces, np.int32)
     uvs, texture = _looks(loaded, len(vertices))
     body = to_manifold(Solid(vertices, faces)) or hull_solid(vertices)
     choice = MaterialChoice(item.physics.material, False, 0.0, "user's mesh")
     physics = replace(
-        physical_attributes(body, choice), friction=item.physics.friction, restitution=item.physics.restitution
+        physical_attributes(body, choice),
+        friction=item.physics.friction,
+        restitution=item.physics.restitution,
     )
     return replace(
         item,
         visual=TexturedMesh(vertices.astype(np.float32), faces, uvs, texture),
         collision=collision_parts(body, config),
         physics=physics,
-        provenance=replace(item.provenance, geometry=f"user mesh {path.name}", appearance=f"user mesh {path.name}"),
+        provenance=replace(
+            item.provenance, geometry=f"user mesh {path.name}", appearance=f"user mesh {path.name}"
+        ),
     )
 
 

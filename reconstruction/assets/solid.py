@@ -127,7 +127,8 @@ def from_manifold(body) -> Solid:  # noqa: ANN001 - manifold3d is imported on us
     """Read a manifold3d body."""
     out = body.to_mesh()
     return Solid(
-        np.array(out.vert_properties[:, :3], np.float64, order="C"), np.array(out.tri_verts, np.int32, order="C")
+        np.array(out.vert_properties[:, :3], np.float64, order="C"),
+        np.array(out.tri_verts, np.int32, order="C"),
     )
 
 

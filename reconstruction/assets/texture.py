@@ -14,9 +14,7 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.views import ScenePixels
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import Camera, PosedFrames, TexturedMesh
-from registry.geometry import invert_rigid, transform_points
-
-_BEST = 3  # colours blended per texel
+from registry.geometry import invert_rigid
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,68 @@ def choose_frames(posed: PosedFrames, pixels: ScenePixels, target: int, limit: i
     return np.array(chosen, np.int32)
 
 
+@dataclass(frozen=True)
+class Looks:
+    """Frames prepared to look surface points up in."""
+
+    frames: np.ndarray  # int32 (k,) frame rows
+    camera_from_world: np.ndarray  # float64 (k, 4, 4)
+    centers: np.ndarray  # float64 (k, 3)
+    images: np.ndarray  # uint8 (k, h, w, 3)
+    depths: np.ndarray  # float32 (k, hd, wd) of the surface itself where the frame shows it, else 0
+    borders: np.ndarray  # float32 (k, hd, wd) weight, falling towards the outline
+    intrinsics: tuple[float, float, float, float]
+    depth_intrinsics: tuple[float, float, float, float]
+
+    def arguments(self) -> tuple:
+        """Return what the kernels take, in their order."""
+        return self.camera_from_world, self.centers, self.images, self.depths, self.borders
+
+
+def prepare_looks(
+    posed: PosedFrames,
+    depth_camera: Camera,
+    frames: np.ndarray,
+    depths: list[np.ndarray],
+    borders: list[np.ndarray],
+) -> Looks:
+    """Gather what baking needs of the chosen frames."""
+    shape = (len(frames), depth_camera.height, depth_camera.width)
+    cameras = [posed.camera, depth_camera]
+    poses = posed.world_from_camera[frames].reshape(-1, 4, 4)
+    return Looks(
+        np.asarray(frames, np.int32),
+        np.ascontiguousarray(invert_rigid(poses)),
+        np.ascontiguousarray(poses[:, :3, 3]),
+        np.ascontiguousarray(posed.images[frames]),
+        np.array(depths, np.float32).reshape(shape),
+        np.array(borders, np.float32).reshape(shape),
+        *((float(c.fx), float(c.fy), float(c.cx), float(c.cy)) for c in cameras),
+    )
+
+
+def collect_colors(
+    texels: Texels, looks: Looks, tolerance_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Blend all texels from the frames: colours (t, 3), seen (t,), and each frame's share of the work (k,)."""
+    from reconstruction.assets.kernels import blend_frames, sample_frames
+
+    count = len(texels.points)
+    if len(looks.frames) == 0 or count == 0:
+        return np.zeros((count, 3), np.float32), np.zeros(count, bool), np.zeros(len(looks.frames))
+    some = np.arange(0, count, max(1, count // 12000))
+    colors, weights = sample_frames(
+        texels.points[some], texels.normals[some], *looks.arguments(), looks.intrinsics, looks.depth_intrinsics,
+        tolerance_m,
+    )  # fmt: skip
+    gains = exposure_gains(colors, weights)[:, 0].astype(np.float32)
+    color, seen = blend_frames(
+        np.ascontiguousarray(texels.points), np.ascontiguousarray(texels.normals), *looks.arguments(), gains,
+        looks.intrinsics, looks.depth_intrinsics, tolerance_m,
+    )  # fmt: skip
+    return color, seen, weights.sum(axis=1, dtype=np.float64)
+
+
 def bake_object(
     vertices_world: np.ndarray, faces: np.ndarray, uvs: np.ndarray, target: int, posed: PosedFrames,
     depth_camera: Camera, pixels: ScenePixels, config: AssetsConfig, tolerance_m: float,
@@ -101,17 +161,16 @@ def bake_object(
     frames = choose_frames(posed, pixels, target, config.texture_frames)
     size = _texture_size(vertices_world, faces, uvs, frames, posed, config)
     texels = texels_of(vertices_world, faces, uvs, size)
-    colors = np.zeros((len(frames), len(texels.points), 3), np.float32)
-    weights = np.zeros((len(frames), len(texels.points)), np.float32)
-    for row, frame in enumerate(frames):
-        raster = rasterize_mesh(vertices_world, faces, depth_camera, posed.world_from_camera[frame])
-        mask = cv2.erode((pixels.ids[frame] == target).astype(np.uint8), np.ones((3, 3), np.uint8))
-        border = cv2.distanceTransform(mask, cv2.DIST_L2, 3)
-        colors[row], weights[row] = look_up(
-            texels, posed, int(frame), depth_camera, raster.depth, np.minimum(border, 6.0) / 6.0, tolerance_m
+    depths, borders = [], []
+    for frame in frames:
+        depths.append(
+            rasterize_mesh(vertices_world, faces, depth_camera, posed.world_from_camera[frame]).depth
         )
-    color, seen = blend(colors, weights)
-    return _finish(texels, color, seen, size, frames, weights)
+        mask = cv2.erode((pixels.ids[frame] == target).astype(np.uint8), np.ones((3, 3), np.uint8))
+        borders.append(np.minimum(cv2.distanceTransform(mask, cv2.DIST_L2, 3), 6.0) / 6.0)
+    looks = prepare_looks(posed, depth_camera, frames, depths, borders)
+    color, seen, share = collect_colors(texels, looks, tolerance_m)
+    return _finish(texels, color, seen, size, frames, share)
 
 
 def _texture_size(
@@ -141,66 +200,6 @@ def _texture_size(
     return min(size, config.texture_max_px)
 
 
-def look_up(
-    texels: Texels, posed: PosedFrames, frame: int, depth_camera: Camera, depth: np.ndarray, border: np.ndarray,
-    tolerance_m: float,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Colours (t, 3) and weights (t,) of all texels in one frame; weight 0 where it is not seen."""
-    camera = posed.camera
-    local = transform_points(invert_rigid(posed.world_from_camera[frame]), texels.points)
-    z = np.maximum(local[:, 2], 1e-6)
-    xn, yn = local[:, 0] / z, local[:, 1] / z
-    u, v = camera.fx * xn + camera.cx, camera.fy * yn + camera.cy
-    du, dv = depth_camera.fx * xn + depth_camera.cx, depth_camera.fy * yn + depth_camera.cy
-    inside = (
-        (local[:, 2] > 0.05) & (u > 0.5) & (v > 0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
-    )
-    iu = np.clip(du.astype(np.int32), 0, depth_camera.width - 1)
-    iv = np.clip(dv.astype(np.int32), 0, depth_camera.height - 1)
-    here = depth[iv, iu]
-    view = posed.world_from_camera[frame][:3, 3] - texels.points
-    range_m = np.linalg.norm(view, axis=1)
-    cos = np.einsum("tk,tk->t", view, texels.normals) / np.maximum(range_m, 1e-9)
-    slope = 1.5 * z / depth_camera.fx / np.maximum(cos, 0.1)  # depth changes this much over a pixel
-    seen = inside & (cos > 0.08) & (here > 0) & (np.abs(here - local[:, 2]) < tolerance_m + slope)
-    weight = np.where(seen, cos**2 / np.maximum(range_m, 0.1) ** 2 * border[iv, iu], 0).astype(np.float32)
-    image = np.asarray(posed.images[frame])
-    color = cv2.remap(
-        image, (u - 0.5).astype(np.float32)[None], (v - 0.5).astype(np.float32)[None], cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )[0] if len(u) < 32000 else _remap_long(image, u, v)  # fmt: skip
-    return color.astype(np.float32), weight * float(posed.sharpness[frame] > 0)
-
-
-def _remap_long(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Bilinear look-up of any number of places (OpenCV's remap takes rows below 2^15)."""
-    width = 16384
-    pad = (-len(u)) % width
-    mu = np.pad((u - 0.5).astype(np.float32), (0, pad)).reshape(-1, width)
-    mv = np.pad((v - 0.5).astype(np.float32), (0, pad)).reshape(-1, width)
-    out = cv2.remap(image, mu, mv, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(-1, 3)[: len(u)]
-
-
-def blend(colors: np.ndarray, weights: np.ndarray, *, equalize: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Bring frames (k, t, 3) to one exposure and blend each texel's best few; returns (t, 3) and seen (t,)."""
-    if len(colors) == 0:
-        return np.zeros((colors.shape[1], 3), np.float32), np.zeros(colors.shape[1], bool)
-    if equalize:
-        colors = colors * exposure_gains(colors, weights)[:, None]
-    best = np.argsort(-weights, axis=0, kind="stable")[:_BEST]
-    w = np.take_along_axis(weights, best, axis=0)
-    c = np.take_along_axis(colors, best[..., None], axis=0)
-    middle = np.median(np.where(w[..., None] > 0, c, np.nan), axis=0) if len(w) >= 3 else c[0]
-    middle = np.where(np.isfinite(middle), middle, c[0])
-    # Highlights and stray labels differ from the rest.
-    off = np.abs(c - middle).max(axis=2) / 40.0
-    w = w**2 / (1 + off**2)
-    total = w.sum(axis=0)
-    color = (c * w[..., None]).sum(axis=0) / np.maximum(total, 1e-20)[:, None]
-    return color, weights.max(axis=0) > 0
-
-
 def exposure_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """One gain per frame (k, 1) that makes frames agree where they see the same texels; mean gain 1."""
     gains = np.ones(len(colors))
@@ -218,21 +217,29 @@ def exposure_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _finish(
-    texels: Texels, color: np.ndarray, seen: np.ndarray, size: int, frames: np.ndarray, weights: np.ndarray
+    texels: Texels, color: np.ndarray, seen: np.ndarray, size: int, frames: np.ndarray, share: np.ndarray
 ) -> Baked:
     """Fill unseen texels from the nearest seen surface, write the picture and grow charts over their borders."""
+    known = seen.copy()
     if seen.any() and not seen.all():
-        color[~seen] = _from_neighbours(texels, color, seen)
+        # Every few texels is enough: what lies between is interpolated.
+        step = 1
+        while (~seen).sum() / step**2 > 6000:
+            step += 1
+        coarse = ~seen & (texels.rows % step == 0) & (texels.columns % step == 0)
+        color[coarse] = _from_neighbours(texels, color, seen, coarse)
+        known |= coarse
     elif not seen.any():
         color[:] = 150.0
+        known[:] = True
     mean = color[seen].mean(axis=0) if seen.any() else np.full(3, 150.0)
     picture = np.zeros((size, size, 3), np.float32)
     filled = np.zeros((size, size), bool)
-    picture[texels.rows, texels.columns] = color
-    filled[texels.rows, texels.columns] = True
+    picture[texels.rows[known], texels.columns[known]] = color[known]
+    filled[texels.rows[known], texels.columns[known]] = True
     picture = push_pull(picture, filled)
-    order = np.argsort(-weights.sum(axis=1), kind="stable") if len(frames) else np.zeros(0, int)
-    used = [int(k) for k in order if weights[k].any()]
+    order = np.argsort(-share, kind="stable")
+    used = [int(k) for k in order if share[k] > 0]
     return Baked(
         np.clip(np.round(picture), 0, 255).astype(np.uint8),
         float(seen.mean()) if len(seen) else 0.0,
@@ -241,16 +248,16 @@ def _finish(
     )
 
 
-def _from_neighbours(texels: Texels, color: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _from_neighbours(texels: Texels, color: np.ndarray, seen: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Mean colour of the nearest seen texels, near in place and facing alike."""
     from scipy.spatial import cKDTree
 
     size = max(float(np.ptp(texels.points, axis=0).max()), 1e-6)
     feature = np.concatenate([texels.points, 0.12 * size * texels.normals], axis=1)
     source = np.flatnonzero(seen)
-    source = source[:: max(1, len(source) // 20000)]
-    k = min(12, len(source))
-    distance, index = cKDTree(feature[source]).query(feature[~seen], k=k)
+    source = source[:: max(1, len(source) // 10000)]
+    k = min(8, len(source))
+    distance, index = cKDTree(feature[source]).query(feature[wanted], k=k)
     distance, index = distance.reshape(-1, k), index.reshape(-1, k)
     weight = 1.0 / (distance + 0.01 * size)
     return (color[source][index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)

@@ -25,6 +25,7 @@ class ObjectVolume:
     distance: np.ndarray  # float32 (nx, ny, nz), meaningful where `known`
     known: np.ndarray  # bool (nx, ny, nz)
     free: np.ndarray  # bool (nx, ny, nz) a ray passed through
+    seen: np.ndarray  # bool (nx, ny, nz) close to measured surface of the object
 
     def centers(self, axis: int) -> np.ndarray:
         """Return the coordinates of voxel centres along one axis."""
@@ -252,4 +253,4 @@ def fuse_volume(
     blended = (numerator + vote * trunc) / np.maximum(denominator + vote, 1e-12)
     distance[mixed] = blended[mixed]
     distance[free & ~near] = trunc
-    return ObjectVolume(origin, voxel, trunc, noise, distance, near | free, free & (distance > 0))
+    return ObjectVolume(origin, voxel, trunc, noise, distance, near | free, free & (distance > 0), near)
