@@ -146,6 +146,47 @@ def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarra
     return keep
 
 
+def _fill_regions(label: np.ndarray, cost: np.ndarray, measured: np.ndarray, color: np.ndarray) -> None:
+    """Give blank regions that no label reached the plane that the measured pixels around them lie on, in place.
+
+    The spreading of labels dies where wrong depth surrounds a blank surface, as around things on a plain table. Here
+    the whole rim of a region votes, pixels of the region's own colour first, and the vote must be clear.
+    """
+    import cv2
+
+    gray = np.clip(color.mean(2), 0, 255).astype(np.uint8)
+    edges = cv2.Canny(cv2.GaussianBlur(gray, (0, 0), 1.0), 12, 30) > 0
+    hole = ((label < 0) & ~measured & ~edges).astype(np.uint8)
+    count, pieces, stats, _ = cv2.connectedComponentsWithStats(hole, connectivity=4)
+    ring_kernel = np.ones((9, 9), np.uint8)
+    for piece in range(1, count):
+        x, y, w, h, area = stats[piece]
+        if area < 60:
+            continue
+        box = (slice(max(0, y - 5), y + h + 5), slice(max(0, x - 5), x + w + 5))
+        region = pieces[box] == piece
+        ring = (cv2.dilate(region.astype(np.uint8), ring_kernel) > 0) & measured[box]
+        if ring.sum() < 15:
+            continue
+        tone = np.median(color[box][region], axis=0)
+        weight = np.exp(-0.5 * (np.abs(color[box][ring] - tone).max(1) / 12.0) ** 2)
+        inlier = ((cost[box][ring][:, :-1] < 30) * weight[:, None]).sum(0)
+        objection = (cost[box][region][:, :-1] > 66).mean(0)
+        inlier[objection > 0.1] = 0.0
+        order = np.argsort(-inlier, kind="stable")
+        best = int(order[0])
+        if inlier[best] < max(12.0, 0.2 * weight.sum()):
+            continue
+        # A rival counts only if it is another surface: pixels on both planes vote for both.
+        both = ((cost[box][ring][:, :-1] < 30) & (cost[box][ring][:, best : best + 1] >= 30)) * weight[
+            :, None
+        ]
+        rival = both.sum(0)
+        rival[objection > 0.1] = 0.0
+        if inlier[best] > 1.5 * rival.max():
+            label[box][region] = best
+
+
 def _crooked(planes: np.ndarray) -> np.ndarray:
     """Return 1.0 for each plane that is neither parallel nor square to the room's main direction, else 0.0.
 
@@ -241,6 +282,8 @@ def complete_depth(
         label = np.empty((small.height, small.width), np.int32)
         choose_labels(total, cost, maps[i], label)
         label[~_anchored(label, maps[i] > 0, 40)] = -1
+        color = cv2.resize(np.ascontiguousarray(posed.images[i]), size, interpolation=cv2.INTER_AREA)
+        _fill_regions(label, cost, maps[i] > 0, color.astype(np.float32))
         label = cv2.resize(label.astype(np.int16), (w, h), interpolation=cv2.INTER_NEAREST)
         y, x = np.nonzero((label >= 0) & (out[i] == 0))
         rays = np.stack(
