@@ -160,7 +160,9 @@ def candidates_on(
     above = body[graph.points[body, 2] > support.height_m + base]
     above = np.setdiff1d(above, support.vertices, assume_unique=True)
     pool = [above]
-    for level in (base, 1.8 * base, 3.0 * base, 4.5 * base):
+    levels = (base, 1.8 * base, 3.0 * base, 4.5 * base)
+    large = bool(np.ptp(graph.points[support.vertices, :2], axis=0).max() > 0.5)
+    for level in levels:
         refused = []
         for part in pool:
             high = part[graph.points[part, 2] > support.height_m + level]
@@ -168,7 +170,9 @@ def candidates_on(
                 if len(candidate) < config.min_object_vertices:
                     continue
                 candidate = _without_stain(graph, candidate, support)
-                if stands_on(graph, body, support, candidate, level, config):
+                # What covers most of a large support may be several things joined by noise: look higher first.
+                wide = large and _span_ratio(graph, support, candidate) > 0.55 and level < levels[-1]
+                if not wide and stands_on(graph, body, support, candidate, level, config):
                     out.append(
                         _with_foot(graph, candidate, above, level + support.height_m)
                         if level > base
@@ -191,7 +195,8 @@ def _fall_apart(
     config: InstancesConfig,
 ) -> list[np.ndarray]:
     """Cut neighbors that only touch at their feet: higher up they are separate and of different colors."""
-    for level in (1.8 * base, 3.0 * base, 4.5 * base):
+    height = float(np.ptp(graph.points[whole, 2]))
+    for level in (1.8 * base, 3.0 * base, 4.5 * base, base + 0.3 * height, base + 0.5 * height):
         high = whole[graph.points[whole, 2] > support.height_m + level]
         parts = [p for p in pieces(graph, high) if graph.areas[p].sum() > 0.12 * graph.areas[whole].sum()]
         if len(parts) < 2 or not all(stands_on(graph, body, support, p, level, config) for p in parts):
@@ -202,7 +207,9 @@ def _fall_apart(
             continue
         owner = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
         nearest = cKDTree(graph.points[np.concatenate(parts)]).query(graph.points[whole])[1]
-        return [whole[owner[nearest] == i] for i in range(len(parts))]
+        out = [whole[owner[nearest] == i] for i in range(len(parts))]
+        if max(graph.points[part, 2].min() for part in out) < support.height_m + base + 0.02:
+            return out  # each reaches down to the support: none is a handle
     return [whole]
 
 
@@ -291,9 +298,11 @@ def stands_on(
 
 def _is_bump(graph: MeshGraph, candidate: np.ndarray, rise: float, color_gap: float) -> bool:
     """Tell swellings of a noisy support, low, of its color, wide or without steep sides, from flat things."""
+    extents = np.sort(np.ptp(graph.points[candidate, :2], axis=0))
+    if rise < 0.035 and extents[1] > 0.6:
+        return True  # a sheet of stray surface along an edge
     if rise > 0.055 or color_gap > 10.0:
         return False
-    extents = np.sort(np.ptp(graph.points[candidate, :2], axis=0))
     steep = float((graph.normals[candidate, 2] < 0.5).mean())
     return rise < 0.02 or steep < 0.15 or extents[1] > 0.25 or rise < 0.12 * extents[0]
 
@@ -317,12 +326,14 @@ def _belongs_to_body(
     whole = Footprint.of(graph.points[candidate, :2], cell)
     ratio = foot_print.area_m2 / max(support.footprint.area_m2, 1e-6)
     # Seen support within the foot's outline: a ring (rim, sides), not a thing, which would hide what it stands on.
-    inner = graph.points[support.vertices, :2]
     convex = _convex(foot_print)
-    seen_inside = convex.contains(inner).sum() * cell**2 * (graph.areas[support.vertices].mean() / cell**2)
-    seen_share = seen_inside / max(convex.area_m2, 1e-6)
-    if convex.area_m2 > 0.55 * support.footprint.area_m2 and seen_share > 0.4:
-        return True
+    if convex.area_m2 > 0.55 * support.footprint.area_m2:
+        # A foot hides what it stands on; its outline is drawn in, for things widen above their foot.
+        inset = max(1, round(0.25 * np.sqrt(convex.area_m2 / np.pi) / cell))
+        core = binary_erosion(convex.filled, iterations=inset)
+        inside = Footprint(convex.origin, cell, core, core).contains(graph.points[support.vertices, :2])
+        if graph.areas[support.vertices[inside]].sum() > 0.45 * max(core.sum(), 1) * cell**2:
+            return True
     # Continuation: right below the foot, outside the support, the same side goes on downwards.
     points = graph.points[body]
     below = (points[:, 2] < support.height_m - 0.012) & (points[:, 2] > support.height_m - 0.05)
@@ -334,7 +345,8 @@ def _belongs_to_body(
         if np.isfinite(distance).mean() > 0.4 and color_gap < 30.0:
             return True
     # Posts, arms and rims: the body's color, slim or along the edge of the support.
-    if color_gap < 9.0:
+    gap = min(color_gap, _gap_to_sides(graph, body, support, candidate, foot))
+    if gap < 9.0:
         slim = float(np.sort(np.ptp(graph.points[candidate], axis=0)[:2])[0]) < 0.05
         edge_cells = max(2, round(0.03 / cell))
         core = binary_erosion(support.footprint.filled, iterations=edge_cells)
@@ -351,6 +363,21 @@ def _belongs_to_body(
     ):
         return True
     return ratio > 0.9 and color_gap < 8.0
+
+
+def _gap_to_sides(
+    graph: MeshGraph, body: np.ndarray, support: SupportRegion, candidate: np.ndarray, foot: np.ndarray
+) -> float:
+    """Return the color distance to what of the body lies below the support plane near the foot; inf if nothing."""
+    z = graph.points[body, 2]
+    below = body[(z < support.height_m - 0.012) & (z > support.height_m - 0.15)]
+    if len(below) == 0:
+        return float("inf")
+    distance, _ = cKDTree(foot[:, :2]).query(graph.points[below, :2], distance_upper_bound=0.04)
+    near = below[np.isfinite(distance)]
+    if len(near) < 10:
+        return float("inf")
+    return float(np.linalg.norm(_color(graph, near) - _color(graph, candidate)))
 
 
 def _convex(footprint: Footprint) -> Footprint:
