@@ -131,6 +131,44 @@ def choose_labels(total, cost, depth, label):  # pragma: no cover - compiled
                 label[y, x] = -1
 
 
+@numba.njit(cache=True, nogil=True)
+def confirm_fill(i, neighbors, depth, confidence, relative, k, keep):  # pragma: no cover - compiled
+    """Mark in keep (h, w) the completed pixels of view i that the completed maps of other views bear out.
+
+    The planes are the scene's, so right fills meet in space; what was filled with the wrong one differs from view to
+    view, or other views look through it.
+    """
+    h, w = depth.shape[1:]
+    fx, fy, cx, cy = k
+    for y in range(h):
+        for x in range(w):
+            if confidence[i, y, x] != 1:
+                continue
+            z = depth[i, y, x]
+            xn, yn = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            agree, through = 0, 0
+            for s in range(len(neighbors)):
+                j = neighbors[s]
+                if j < 0:
+                    break
+                m = relative[s]
+                qz = z * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
+                if qz <= 1e-9:
+                    continue
+                u = fx * (z * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
+                v = fy * (z * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
+                if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
+                    continue
+                d = depth[j, int(v), int(u)]
+                if d <= 0.0:
+                    continue
+                if abs(d - qz) < 0.01 * qz:
+                    agree += 1
+                elif d > 1.02 * qz:
+                    through += 2 if confidence[j, int(v), int(u)] == 2 else 1
+            keep[y, x] = agree >= 2 and agree > through
+
+
 def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarray:
     """Return which labelled pixels belong to a piece of one label with enough measured pixels in it."""
     import cv2
@@ -296,4 +334,17 @@ def complete_depth(
         confidence[i, y[good], x[good]] = 1
 
     each(n, complete, "completing planes", progress)
+    filled, trust = out.copy(), confidence.copy()
+    fine = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+
+    def confirm(i: int) -> None:
+        rows = plan.neighbors[i]
+        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
+        keep = np.zeros((h, w), bool)
+        confirm_fill(i, rows, filled, trust, relative, fine, keep)
+        drop = (trust[i] == 1) & ~keep & (gapless[i] == 0)
+        out[i][drop] = 0
+        confidence[i][drop] = 0
+
+    each(n, confirm, "confirming planes", progress)
     return out, confidence
