@@ -181,9 +181,8 @@ def candidates_on(
                 else:
                     refused.append(candidate)
         pool = refused
-    out = _disjoint(out)
-    apart = [part for one in out for part in _fall_apart(graph, body, one, support, base, config)]
-    return _merge_alike(graph, apart)
+    out = _merge_alike(graph, _disjoint(out))
+    return [part for one in out for part in _fall_apart(graph, body, one, support, base, config)]
 
 
 def _fall_apart(
