@@ -214,7 +214,10 @@ def _is_leg_of(graph: MeshGraph, lower: np.ndarray, upper: np.ndarray) -> bool:
     )
     if inside.mean() < 0.8:
         return False
-    slim = bool(np.sort(np.ptp(low, axis=0))[0] < 0.12 and np.ptp(low[:, 2]) > 0.05)
+    thickness = float(np.sort(np.ptp(low, axis=0))[0])
+    slim = thickness < 0.12 and np.ptp(low[:, 2]) > 0.05
+    if slim and thickness < 0.05:
+        return True
     gap = top - top_of_lower
     return gap < 0.15 * top or (slim and gap < 0.85 * top)
 
@@ -232,7 +235,8 @@ def _absorb_fragments(graph: MeshGraph, things: list[Thing], config: InstancesCo
             np.sort(high - low)[1] >= 0.8 * config.min_object_m
             and len(thing.vertices) >= config.min_object_vertices
         )
-        (kept if large else small).append(thing)
+        raised = thing.rests_on is None or high[2] - low[2] > 0.012
+        (kept if large and raised else small).append(thing)
     heirs: dict[int, Thing | None] = {}
     if kept:
         owner = np.concatenate([np.full(len(t.vertices), i) for i, t in enumerate(kept)])

@@ -347,7 +347,8 @@ def _belongs_to_body(
     gap = min(color_gap, _gap_to_sides(graph, body, support, candidate, foot))
     if gap < 9.0:
         slim = float(np.sort(np.ptp(graph.points[candidate], axis=0)[:2])[0]) < 0.05
-        edge_cells = max(2, round(0.03 / cell))
+        short_side = float(np.ptp(graph.points[support.vertices, :2], axis=0).min())
+        edge_cells = max(2, round(min(0.05, 0.2 * short_side) / cell))
         core = binary_erosion(support.footprint.filled, iterations=edge_cells)
         inner_print = Footprint(support.footprint.origin, cell, core, core)
         if slim or inner_print.contains(foot[:, :2]).mean() < 0.5:
