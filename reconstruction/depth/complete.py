@@ -57,7 +57,7 @@ def fill_small_gaps(depth, out):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def label_costs(
-    depth, raw, planes, doubt, neighbors, relative, maps, k, near, far, cost
+    depth, raw, planes, bounds, doubt, neighbors, relative, maps, k, near, far, cost
 ):  # pragma: no cover - compiled
     """Fill cost (h, w, labels + 1): how badly each plane suits a pixel; the last label is "no plane".
 
@@ -65,6 +65,7 @@ def label_costs(
         depth: (h, w) measured depth, 0 = none.
         raw: (h, w) depth before it was checked: a weak hint.
         planes: (labels, 4) in this camera's space: inverse depth = -(n . r) / d.
+        bounds: (labels, sides, 4) within which each plane was measured, in this camera's space.
         doubt: (labels,) what filling with a plane costs more, because few things in a room lie like it.
         neighbors: (m,) rows of `maps`, -1 = none.
         relative: (m, 4, 4) neighbour_from_view.
@@ -93,6 +94,15 @@ def label_costs(
                     continue
                 through, agree = 0, 0
                 q = 1.0 / rho
+                within = True
+                for side in range(bounds.shape[1]):
+                    e = bounds[c, side]
+                    if q * (e[0] * xn + e[1] * yn + e[2]) + e[3] < 0.0:
+                        within = False
+                        break
+                if not within:
+                    cost[y, x, c] = 255
+                    continue
                 for s in range(len(neighbors)):
                     j = neighbors[s]
                     if j < 0:
@@ -209,7 +219,8 @@ def _fill_regions(label: np.ndarray, cost: np.ndarray, measured: np.ndarray, col
         tone = np.median(color[box][region], axis=0)
         weight = np.exp(-0.5 * (np.abs(color[box][ring] - tone).max(1) / 12.0) ** 2)
         inlier = ((cost[box][ring][:, :-1] < 30) * weight[:, None]).sum(0)
-        objection = (cost[box][region][:, :-1] > 66).mean(0)
+        inside = cost[box][region][:, :-1]
+        objection = ((inside > 66) & (inside < 255)).mean(0) + ((inside == 255).mean(0) > 0.5)
         inlier[objection > 0.1] = 0.0
         order = np.argsort(-inlier, kind="stable")
         best = int(order[0])
@@ -222,7 +233,7 @@ def _fill_regions(label: np.ndarray, cost: np.ndarray, measured: np.ndarray, col
         rival = both.sum(0)
         rival[objection > 0.1] = 0.0
         if inlier[best] > 1.5 * rival.max():
-            label[box][region] = best
+            label[box][region & (cost[box][..., best] < 255)] = best
 
 
 def _crooked(planes: np.ndarray) -> np.ndarray:
@@ -264,7 +275,7 @@ def complete_depth(
     """Return completed depth and confidence (n, h, w): 2 measured, 1 completed, 0 unknown."""
     import cv2
 
-    from reconstruction.depth.planes import find_planes, oriented_points
+    from reconstruction.depth.planes import find_planes, oriented_points, plane_extents
     from reconstruction.depth.refine import fit_slopes
     from reconstruction.depth.sgm import aggregate
 
@@ -288,6 +299,7 @@ def complete_depth(
     points, normals, depths = (np.concatenate([c[a] for c in clouds]) for a in range(3))
     planes = find_planes(points, normals, depths, tolerance=0.006, max_planes=48, seed=config.seed)
     progress.note(f"depth: {len(planes)} planes support the completion")
+    bounds = plane_extents(planes, points, normals, depths, tolerance=0.006)
     doubt = 14.0 * _crooked(planes)
     out, confidence = gapless.copy(), np.where(depth > 0, 2, np.where(gapless > 0, 1, 0)).astype(np.uint8)
     k = np.array([small.fx, small.fy, small.cx, small.cy])
@@ -300,19 +312,9 @@ def complete_depth(
         relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
         hint = cv2.resize(raw[i], size, interpolation=cv2.INTER_NEAREST)
         cost = np.empty((small.height, small.width, len(local) + 1), np.uint8)
-        label_costs(
-            maps[i],
-            hint,
-            local,
-            doubt[chosen],
-            rows,
-            relative,
-            maps,
-            k,
-            plan.near[i] * 0.8,
-            plan.far[i],
-            cost,
-        )
+        here = bounds[chosen] @ posed.world_from_camera[i]
+        near, far = plan.near[i] * 0.8, plan.far[i]
+        label_costs(maps[i], hint, local, here, doubt[chosen], rows, relative, maps, k, near, far, cost)
         gray = cv2.cvtColor(np.ascontiguousarray(posed.images[i]), cv2.COLOR_RGB2GRAY)
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         total = np.zeros(cost.shape, np.uint16)

@@ -5,6 +5,7 @@ import numpy as np
 from reconstruction.types import Camera
 
 _STRIDE = 6
+_EXTENT_SIDES = 16
 
 
 def oriented_points(
@@ -122,3 +123,29 @@ def _fit(points: np.ndarray, depths: np.ndarray, like: np.ndarray) -> np.ndarray
     _, vectors = np.linalg.eigh(scaled.T @ scaled)
     normal = vectors[:, 0] * np.sign(vectors[:, 0] @ like[:3] or 1.0)
     return np.append(normal, -normal @ center)
+
+
+def plane_extents(
+    planes: np.ndarray, points: np.ndarray, normals: np.ndarray, depths: np.ndarray, *, tolerance: float
+) -> np.ndarray:
+    """Return for each plane 16 bounds (k, 16, 4): a point x on it is within its measured extent if all e.x + f >= 0.
+
+    A fill may join what was measured, never go beyond it: past the end of a wall there may be nothing.
+    """
+    out = np.zeros((len(planes), _EXTENT_SIDES, 4))
+    angle = np.arange(_EXTENT_SIDES) * 2 * np.pi / _EXTENT_SIDES
+    for row, plane in enumerate(planes):
+        near = np.abs(points @ plane[:3] + plane[3]) < tolerance * depths
+        agreeing = near & (normals @ plane[:3] > 0.9)
+        # A plane known by its rim alone has next to no normals to go by.
+        own = points[agreeing if agreeing.sum() > 0.5 * near.sum() else near]
+        first = np.cross(plane[:3], np.eye(3)[np.argmin(np.abs(plane[:3]))])
+        first /= np.linalg.norm(first)
+        second = np.cross(plane[:3], first)
+        sides = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+        reach = np.percentile(own @ sides.T, 99.9, axis=0)
+        half = _EXTENT_SIDES // 2
+        width = reach + np.roll(reach, half)
+        out[row, :, :3] = -sides
+        out[row, :, 3] = reach + 0.03 * width
+    return out
