@@ -58,7 +58,9 @@ def _decompose(
                 remaining = np.setdiff1d(remaining, neighbor, assume_unique=True)
     own.vertices = remaining
     out: list[Thing] = []
-    parts = split_touching(graph, remaining, config) if depth > 0 or not carried else [remaining]
+    # Furniture has legs and cushions of other colors: only small things are looked at for touching neighbors.
+    small = not carried and float(np.ptp(graph.points[remaining], axis=0).max()) < 0.5
+    parts = split_touching(graph, remaining, config) if depth > 0 or small else [remaining]
     out.append(Thing(parts[0], rests_on, depth))
     for part in parts[1:]:
         out.append(Thing(part, _carrier(graph, part, out[0], rests_on), depth))

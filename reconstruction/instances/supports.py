@@ -333,6 +333,10 @@ def _belongs_to_body(
         inside = Footprint(convex.origin, cell, core, core).contains(graph.points[support.vertices, :2])
         if graph.areas[support.vertices[inside]].sum() > 0.45 * max(core.sum(), 1) * cell**2:
             return True
+    short_side = float(np.ptp(graph.points[support.vertices, :2], axis=0).min())
+    edge_cells = max(2, round(min(0.05, 0.2 * short_side) / cell))
+    core = binary_erosion(support.footprint.filled, iterations=edge_cells)
+    inner_print = Footprint(support.footprint.origin, cell, core, core)
     # Continuation: right below the foot, outside the support, the same side goes on downwards.
     points = graph.points[body]
     below = (points[:, 2] < support.height_m - 0.012) & (points[:, 2] > support.height_m - 0.05)
@@ -341,17 +345,16 @@ def _belongs_to_body(
         distance, _ = cKDTree(points[side, :2]).query(
             foot[:, :2], distance_upper_bound=max(0.018, 1.8 * cell)
         )
-        if np.isfinite(distance).mean() > 0.4 and color_gap < 30.0:
+        at_edge = 1.0 - inner_print.contains(foot[:, :2]).mean()
+        if np.isfinite(distance).mean() > 0.4 and color_gap < 30.0 and at_edge > 0.3:
             return True
     # Posts, arms and rims: the body's color, slim or along the edge of the support.
     gap = min(color_gap, _gap_to_sides(graph, body, support, candidate, foot))
     if gap < 9.0:
         slim = float(np.sort(np.ptp(graph.points[candidate], axis=0)[:2])[0]) < 0.05
-        short_side = float(np.ptp(graph.points[support.vertices, :2], axis=0).min())
-        edge_cells = max(2, round(min(0.05, 0.2 * short_side) / cell))
-        core = binary_erosion(support.footprint.filled, iterations=edge_cells)
-        inner_print = Footprint(support.footprint.origin, cell, core, core)
-        if slim or inner_print.contains(foot[:, :2]).mean() < 0.5:
+        plan = np.sort(np.ptp(graph.points[candidate, :2], axis=0))
+        strip = gap < 6.0 and plan[0] < 0.6 * plan[1]
+        if slim or strip or inner_print.contains(foot[:, :2]).mean() < 0.5:
             return True
     # A back or arm: as long as the support, the same color, and larger than things usually are.
     span = _span_ratio(graph, support, candidate)
