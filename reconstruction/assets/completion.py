@@ -61,10 +61,32 @@ def _settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume
             distance[:, :, k][carry] = distance[:, :, k + 1][carry]
             free[:, :, k][carry] = free[:, :, k + 1][carry]
             known[:, :, k] |= carry
+        _drop_skirts(distance, known, free, volume, frame, first)
     distance[:, :, :first] = volume.trunc_m
     known[:, :, :first] = True
     free[:, :, :first] = True
     return replace(volume, distance=distance, known=known, free=free)
+
+
+def _drop_skirts(
+    distance: np.ndarray, known: np.ndarray, free: np.ndarray, volume: ObjectVolume, frame: ObjectFrame, first: int
+) -> None:
+    """Free what lies flat on the support around the object: support surface that was labelled as the object.
+
+    Depth is uncertain at outlines, so that a rim of the support within the noise counts as object there.
+    """
+    height = max(3.0 * volume.noise_m, 2.0 * volume.voxel_m)
+    if float(np.percentile(frame.points[:, 2], 98)) < 3.0 * height:
+        return
+    last = first + int(np.ceil(height / volume.voxel_m))
+    taller = ((distance[:, :, last:] < 0) & known[:, :, last:]).any(axis=2)
+    # Below unseen space there may still be object.
+    hidden = (~known[:, :, last : last + 2]).any(axis=2)
+    skirt = ~taller & ~hidden
+    for k in range(first, last):
+        distance[:, :, k][skirt] = volume.trunc_m
+        known[:, :, k][skirt] = True
+        free[:, :, k][skirt] = True
 
 
 def _apply_symmetries(volume: ObjectVolume, frame: ObjectFrame) -> tuple[ObjectVolume, list[str]]:

@@ -105,13 +105,13 @@ def fuse_object(
     """Sum the evidence of all frames in every voxel of one object's grid.
 
     Returns (nx, ny, nz) each: soft-maximum numerator and denominator of signed distances to the object's seen
-    surface, number of frames whose ray passed through, number of frames that saw the object's surface before it.
+    surface, number of frames whose ray passed through, number of frames that saw the object's surface there.
     """
     nx, ny, nz = shape
     numerator = np.zeros((nx, ny, nz), np.float32)
     denominator = np.zeros((nx, ny, nz), np.float32)
     freed = np.zeros((nx, ny, nz), np.uint16)
-    behind = np.zeros((nx, ny, nz), np.uint16)
+    support = np.zeros((nx, ny, nz), np.uint16)
     h, w = depth.shape[1:]
     for i in prange(nx):
         gx = origin[0] + (i + 0.5) * voxel
@@ -119,7 +119,7 @@ def fuse_object(
             gy = origin[1] + (j + 0.5) * voxel
             for k in range(nz):
                 gz = origin[2] + (k + 0.5) * voxel
-                num, den, n_free, n_behind = 0.0, 0.0, 0, 0
+                num, den, n_free, n_near = 0.0, 0.0, 0, 0
                 for q in range(len(frames)):
                     f = frames[q]
                     m = camera_from_grid[q]
@@ -142,13 +142,14 @@ def fuse_object(
                         along = (d - z) * ray
                         s = along * max(cos, 0.25)
                         if along < -trunc and s < -0.5 * trunc:
-                            n_behind += 1
                             continue
                         weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
                         if s >= trunc:
                             if cos > 0:
                                 n_free += 1
                             continue
+                        if cos > 0:
+                            n_near += 1
                         soft = weight * math.exp(max(s, -trunc) / tau)
                         num += soft * max(s, -trunc)
                         den += soft
@@ -159,8 +160,8 @@ def fuse_object(
                 numerator[i, j, k] = num
                 denominator[i, j, k] = den
                 freed[i, j, k] = n_free
-                behind[i, j, k] = n_behind
-    return numerator, denominator, freed, behind
+                support[i, j, k] = n_near
+    return numerator, denominator, freed, support
 
 
 @njit(cache=True, inline="always")

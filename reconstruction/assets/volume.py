@@ -95,26 +95,28 @@ def refine_yaw(normals: np.ndarray, yaw_rad: float) -> float:
 
 
 def _without_outliers(seen: SeenPoints) -> tuple[np.ndarray, np.ndarray]:
-    """Drop points in nearly empty cells: flying pixels and stray labels."""
+    """Keep points whose neighbourhood several frames report, and that is not nearly empty.
+
+    Depth errors at outlines fly between surfaces, in every frame elsewhere.
+    """
+    from scipy.ndimage import uniform_filter
+
     points = seen.points
-    size = float(np.percentile(np.ptp(points, axis=0), 100)) if len(points) else 0.0
     robust = np.percentile(points, 97, axis=0) - np.percentile(points, 3, axis=0)
-    cell = max(0.004, 0.06 * float(robust.max()), 3 * float(np.median(seen.pixel_m)))
-    if size <= 0:
-        return points, seen.normals
+    cell = max(0.004, 0.03 * float(robust.max()), 1.5 * float(np.median(seen.pixel_m)))
     keys = np.floor(points / cell).astype(np.int64)
     keys -= keys.min(axis=0)
     dims = keys.max(axis=0) + 3
-    flat = np.ravel_multi_index((keys + 1).T, dims)
-    count = np.bincount(flat, minlength=int(dims.prod())) if dims.prod() < 5e7 else None
-    if count is None:
+    if dims.prod() > 3e7:
         return points, seen.normals
-    from scipy.ndimage import uniform_filter
-
-    around = uniform_filter(count.reshape(dims).astype(np.float32), 3, mode="constant") * 27
-    density = around.ravel()[flat]
-    keep = density > 0.06 * np.median(density)
-    if keep.sum() < 0.8 * len(points):
+    flat = np.ravel_multi_index((keys + 1).T, dims)
+    count = np.bincount(flat, minlength=int(dims.prod())).reshape(dims).astype(np.float32)
+    pairs = np.unique(np.stack([flat, seen.frames.astype(np.int64)]), axis=1)[0]
+    frames = np.bincount(pairs, minlength=int(dims.prod())).reshape(dims).astype(np.float32)
+    density = uniform_filter(count, 3, mode="constant").ravel()[flat] * 27
+    reports = uniform_filter(frames, 3, mode="constant").ravel()[flat] * 27
+    keep = (density > 0.08 * np.median(density)) & (reports > 0.12 * np.median(reports))
+    if keep.sum() < 0.6 * len(points):
         return points, seen.normals
     return points[keep], seen.normals[keep]
 
@@ -239,11 +241,12 @@ def fuse_volume(
     trunc = max(2.5 * voxel, 3.0 * noise)
     tau = max(0.6 * trunc, 2.0 * noise)
     camera = depth.camera
-    numerator, denominator, freed, _ = fuse_object(
+    numerator, denominator, freed, support = fuse_object(
         pixels.depth, pixels.confidence, pixels.ids, pixels.cosine, frames, camera_from_grid, camera.fx, camera.fy,
         camera.cx, camera.cy, target, shape, origin, voxel, trunc, tau,
     )  # fmt: skip
-    near = denominator > 0
+    # Surface that only one or two of many frames report is a depth error at an outline.
+    near = (denominator > 0) & (support >= int(np.clip(len(frames) // 8, 1, 3)))
     distance = np.where(near, numerator / np.maximum(denominator, 1e-12), 0).astype(np.float32)
     # One stray ray does not free a voxel that many frames saw as surface.
     enough = np.minimum(2, max(1, len(frames) // 6))
