@@ -9,7 +9,7 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.mass import physical_attributes
 from reconstruction.assets.materials import choose_material
 from reconstruction.assets.solid import Solid
-from reconstruction.assets.views import ScenePixels, lift_object, prepare_pixels
+from reconstruction.assets.views import ScenePixels, lift_object, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, frame_object, fuse_volume
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import (
@@ -129,7 +129,8 @@ def object_solid(
     if len(seen.points) < config.min_points:
         return *box_fallback(item, seen.points), "box-fallback"
     frame = frame_object(item, seen, posed, depth, pixels, found)
-    volume = fuse_volume(item.id, frame, posed, depth, pixels, config)
+    noise = object_noise(posed, depth, pixels, seen, item.id)
+    volume = fuse_volume(item.id, frame, noise, posed, depth, pixels, config)
     size = np.ptp(frame.points, axis=0)
     furniture = float(size.max()) > config.furniture_m
     field = completion.complete(volume, frame, config, furniture=furniture)

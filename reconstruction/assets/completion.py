@@ -200,7 +200,7 @@ def _keep_shells(field: np.ndarray, volume: ObjectVolume, config: AssetsConfig) 
 
 def _blend(field: np.ndarray, volume: ObjectVolume, frame: ObjectFrame) -> np.ndarray:
     """Smooth within the noise where seen, and by two voxels where closed, then cut flat at the support."""
-    sigma_seen = float(np.clip(0.7 * volume.noise_m / volume.voxel_m, 0.0, 1.2))
+    sigma_seen = float(np.clip(0.7 * volume.noise_m / volume.voxel_m, 0.0, 2.0))
     seen = gaussian_filter(field, sigma_seen) if sigma_seen > 0.3 else field
     if frame.wall_y is None:
         # The cut must not round the bottom edge off: continue the field below it first.

@@ -71,6 +71,35 @@ def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:
     return float(np.clip(sigma, 0.0005, 0.02))
 
 
+def object_noise(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, seen: "SeenPoints", target: int) -> float:
+    """Return the relative 1-sigma of depth on one object: small things are seen worse than the room as a whole."""
+    camera = depth.camera
+    frames = np.unique(seen.frames)
+    thin = slice(None, None, max(1, len(seen.points) // 6000))
+    points, rows = seen.points[thin], np.searchsorted(frames, seen.frames[thin])
+    differences = []
+    for step in (-5, -3, 3, 5):
+        other = rows + step
+        valid = (other >= 0) & (other < len(frames))
+        f = frames[other[valid]]
+        local = np.einsum("nij,nj->ni", invert_rigid(posed.world_from_camera[f])[:, :3, :3], points[valid])
+        local += invert_rigid(posed.world_from_camera[f])[:, :3, 3]
+        z = np.maximum(local[:, 2], 1e-3)
+        u = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(int)
+        v = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(int)
+        inside = (local[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        f, u, v, z = f[inside], u[inside], v[inside], z[inside]
+        there = pixels.depth[f, v, u].astype(np.float64)
+        same = (pixels.ids[f, v, u] == target) & (there > 0) & (pixels.cosine[f, v, u] > 0)
+        relative = (there[same] - z[same]) / z[same]
+        differences.append(relative[np.abs(relative) < 0.04])
+    every = np.abs(np.concatenate(differences))
+    if len(every) < 100:
+        return max(pixels.noise_relative, 0.003)
+    sigma = np.percentile(every, 68) / np.sqrt(2.0)
+    return float(np.clip(sigma, pixels.noise_relative, 0.012))
+
+
 @dataclass(frozen=True)
 class SeenPoints:
     """Depth pixels of one object, lifted."""

@@ -200,6 +200,7 @@ def _support_ring(
 def fuse_volume(
     target: int,
     frame: ObjectFrame,
+    noise_relative: float,
     posed: PosedFrames,
     depth: DepthMaps,
     pixels: ScenePixels,
@@ -237,7 +238,7 @@ def fuse_volume(
         [invert_rigid(posed.world_from_camera[f]) @ frame.world_from_grid for f in frames]
     )
     distance_m = float(np.median(camera_from_grid[:, 2, 3]))
-    noise = pixels.noise_relative * distance_m
+    noise = noise_relative * distance_m
     trunc = max(2.5 * voxel, 3.0 * noise)
     tau = max(0.6 * trunc, 2.0 * noise)
     camera = depth.camera
