@@ -255,7 +255,7 @@ def _crooked(planes: np.ndarray) -> np.ndarray:
 def _view_planes(
     planes: np.ndarray, world_from_camera: np.ndarray, depth, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (rows, planes) that enough of this view's measured pixels lie on, planes in camera space, most supported first."""
+    """Return rows and camera-space planes that enough measured pixels of this view lie on, best first."""
     local = planes @ world_from_camera  # a plane is a row vector: p_camera = p_world @ world_from_camera
     y, x = np.nonzero(depth[1::3, 1::3])
     y, x = y * 3 + 1, x * 3 + 1

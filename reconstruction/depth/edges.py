@@ -5,8 +5,8 @@ import math
 import numba
 import numpy as np
 
-_REACH = 10
-_STRIDE = 2
+_REACH = 9
+_STRIDE = 3
 _MAX_CANDIDATES = 5
 
 

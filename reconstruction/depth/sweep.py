@@ -109,7 +109,9 @@ def _warp(source, h_inf, shift, rho, out, inside):  # pragma: no cover - compile
 
 @numba.njit(cache=True, nogil=True)
 def sweep_costs(reference, sources, h_inf, shift, rhos, noise, out):  # pragma: no cover - compiled
-    """Fill out[plane, y, x] with 127 * (1 - correlation), the mean of the two best sources: occlusion spoils others.
+    """Fill out[plane, y, x] with 127 * (1 - correlation), mean of the two best sources.
+
+    Occlusion spoils the others.
 
     `reference` (h, w) and `sources` (s, h, w) are float32 gray levels minus 128; source pixel ~ h_inf @ p + rho * shift.
     """

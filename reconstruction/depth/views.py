@@ -111,7 +111,7 @@ def _relation(world: np.ndarray, i: int, posed: PosedFrames, camera_from_world: 
 
 
 def _pick(score, offset, out, *, min_overlap, overlap, repulsion) -> None:
-    """Fill `out` greedily; candidates beside a chosen one lose part of their score, so both sides are looked at from."""
+    """Fill `out` greedily; those beside a chosen one lose score, so that both sides are used."""
     score = np.where(overlap >= min_overlap, score, 0.0)
     for k in range(len(out)):
         best = int(np.argmax(score))

@@ -107,6 +107,10 @@ def fuse_surface(
     # A vertex that only completed pixels made needs the same number of views, at their lower weight.
     mesh = extract_mesh(volume, min_views=config.min_views, min_weight=0.02 * config.completed_weight)
     mesh, dropped = drop_small_components(mesh, config.min_component_m2)
+    if dropped:
+        progress.note(
+            f"surface: {dropped} scattered pieces below {config.min_component_m2 * 1e4:.0f} cm2 dropped"
+        )
     fine_vertices = mesh.vertices
     mesh = thin(mesh, config.max_vertices)
     if len(mesh.faces) == 0:
