@@ -4,7 +4,6 @@ from reconstruction.assets.config import ASSETS_PRESETS, AssetsConfig
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, Surface
 
-
 __all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets")
 
 VERSION = 1

@@ -69,7 +69,12 @@ def _settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume
 
 
 def _drop_skirts(
-    distance: np.ndarray, known: np.ndarray, free: np.ndarray, volume: ObjectVolume, frame: ObjectFrame, first: int
+    distance: np.ndarray,
+    known: np.ndarray,
+    free: np.ndarray,
+    volume: ObjectVolume,
+    frame: ObjectFrame,
+    first: int,
 ) -> None:
     """Free what lies flat on the support around the object: support surface that was labelled as the object.
 

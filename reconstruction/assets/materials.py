@@ -59,8 +59,36 @@ _BY_LABEL = {
     "stone": "stone rock sculpture statue trophy",
 }
 _HOLLOW = frozenset(
-    "shelf bookshelf bookcase cabinet drawer dresser nightstand wardrobe fridge oven microwave can tin bottle carton box "
-    "milk package lamp monitor tv container bin kettle moka pot pitcher jar".split()
+    [
+        "shelf",
+        "bookshelf",
+        "bookcase",
+        "cabinet",
+        "drawer",
+        "dresser",
+        "nightstand",
+        "wardrobe",
+        "fridge",
+        "oven",
+        "microwave",
+        "can",
+        "tin",
+        "bottle",
+        "carton",
+        "box",
+        "milk",
+        "package",
+        "lamp",
+        "monitor",
+        "tv",
+        "container",
+        "bin",
+        "kettle",
+        "moka",
+        "pot",
+        "pitcher",
+        "jar",
+    ]
 )
 # What packages hold weighs as much as the package is large: their mean density with contents, kg/m3.
 _FILLED = {

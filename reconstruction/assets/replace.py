@@ -66,7 +66,7 @@ def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = No
     )
 
 
-def _looks(loaded, count: int) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN001 - trimesh is imported on use
+def _looks(loaded, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return uvs (v, 2) and a square texture of a trimesh; a plain colour where it has none."""
     import cv2
 

@@ -123,7 +123,7 @@ def to_manifold(solid: Solid) -> Solid | None:
     return from_manifold(body)
 
 
-def from_manifold(body) -> Solid:  # noqa: ANN001 - manifold3d is imported on use
+def from_manifold(body) -> Solid:
     """Read a manifold3d body."""
     out = body.to_mesh()
     return Solid(

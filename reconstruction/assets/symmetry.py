@@ -100,7 +100,9 @@ def _round_share(volume: ObjectVolume, axis: np.ndarray, points: np.ndarray, nor
     usual = radius[order][middle][group]
     large = float(np.percentile(radius, 90))
     # A box's radius varies by 41 %: a tolerance beyond 7 % could not tell it from a cylinder.
-    tolerance = min(max(volume.voxel_m, 2.0 * volume.noise_m, 0.03 * large), max(volume.voxel_m, 0.07 * large))
+    tolerance = min(
+        max(volume.voxel_m, 2.0 * volume.noise_m, 0.03 * large), max(volume.voxel_m, 0.07 * large)
+    )
     return float((np.abs(radius - usual) < tolerance).mean())
 
 

@@ -71,7 +71,9 @@ def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:
     return float(np.clip(sigma, 0.0005, 0.02))
 
 
-def object_noise(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, seen: "SeenPoints", target: int) -> float:
+def object_noise(
+    posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, seen: "SeenPoints", target: int
+) -> float:
     """Return the relative 1-sigma of depth on one object: small things are seen worse than the room as a whole."""
     camera = depth.camera
     frames = np.unique(seen.frames)
@@ -128,7 +130,7 @@ def lift_object(
     return SeenPoints(points, np.einsum("nij,nj->ni", rotation, normal), rows.astype(np.int32), z * scale_x)
 
 
-def _pixel_normals(pixels: ScenePixels, camera, rows, v, u) -> np.ndarray:  # noqa: ANN001
+def _pixel_normals(pixels: ScenePixels, camera, rows, v, u) -> np.ndarray:
     """Normals in camera space from central differences over two pixels; zero at depth edges."""
     maps = pixels.depth
     height, width = maps.shape[1:]

@@ -1,0 +1,131 @@
+"""The stage on a generated room with true depth and ids: closed, placed, hollow, robust."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reconstruction.assets import AssetsConfig, build_assets
+from reconstruction.assets.solid import Solid, to_manifold
+from reconstruction.progress import NoProgress
+from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
+from registry.geometry import transform_points
+
+CONFIG = AssetsConfig(
+    cells_along_longest=40, max_voxels=150_000, texture_max_px=128, texture_frames=4, base_texel_m=0.05
+)
+EMPTY = Surface(*(np.zeros(0),) * 5, voxel_size_m=0.01, space=None)
+
+
+class Notes(NoProgress):
+    def __init__(self):
+        self.lines = []
+
+    def note(self, message):
+        self.lines.append(message)
+
+
+def instances_of(capture, names):
+    base, objects = [], []
+    for entity in capture.entities:
+        low, high = entity.mesh().bounds
+        if entity.name == "floor":
+            corners = [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
+            base.append(
+                BaseEntity(entity.id, "floor", Plane(np.array([0, 0, 1.0, 0]), np.array(corners)), True)
+            )
+        elif entity.name in names:
+            objects.append(
+                Instance(
+                    entity.id, entity.label, 0.9, (low + high) / 2, 0.0, high - low, entity.parent or 0, False
+                )
+            )
+    return InstanceSet(np.zeros(0, np.int32), tuple(base), tuple(objects), capture.id_maps)
+
+
+@pytest.fixture(scope="module")
+def built(small_capture):
+    found = instances_of(small_capture, ("can", "bowl", "book"))
+    return build_assets(small_capture.posed, small_capture.depth, EMPTY, found, CONFIG), found
+
+
+def test_objects_are_closed_and_where_they_are(built, small_capture):
+    from scipy.spatial import cKDTree
+
+    assets, _ = built
+    for item in assets.objects:
+        entity = next(e for e in small_capture.entities if e.id == item.id)
+        mesh = item.visual
+        _, place = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
+        edges = np.sort(
+            np.concatenate([place.ravel()[mesh.faces[:, [a, b]]] for a, b in ((0, 1), (1, 2), (2, 0))]),
+            axis=1,
+        )
+        _, count = np.unique(edges, axis=0, return_counts=True)
+        assert (count % 2 == 0).all(), f"{entity.name} is not closed"
+        assert mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
+        world = transform_points(item.world_from_object, mesh.vertices)
+        truth = entity.mesh().sample(20000)
+        assert cKDTree(truth).query(world)[0].mean() < 0.012, entity.name
+        assert 0 < item.provenance.observed_fraction <= 1
+        assert set(item.views) <= set(small_capture.posed.indices)
+        np.testing.assert_allclose(
+            item.world_from_object[:3, :3] @ item.world_from_object[:3, :3].T, np.eye(3), atol=1e-9
+        )
+
+
+def test_the_bowl_is_hollow(built, small_capture):
+    assets, _ = built
+    entity = next(e for e in small_capture.entities if e.name == "bowl")
+    item = next(o for o in assets.objects if o.id == entity.id)
+    world = transform_points(item.world_from_object, item.visual.vertices)
+    low, high = entity.mesh().bounds
+    middle = np.linalg.norm(world[:, :2] - (low + high)[:2] / 2, axis=1) < 0.2 * (high - low)[0]
+    assert world[middle, 2].max() < low[2] + 0.6 * (high - low)[2]
+
+
+def test_the_floor_carries_everything_and_faces_up(built):
+    assets, _ = built
+    (floor,) = assets.base
+    corner = floor.visual.vertices[floor.visual.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    assert (normal[:, 2] > 0).all()
+    for item in assets.objects:
+        world = transform_points(item.world_from_object, item.visual.vertices)
+        assert (world[:, :2] >= floor.visual.vertices[:, :2].min(axis=0)).all()
+        assert (world[:, :2] <= floor.visual.vertices[:, :2].max(axis=0)).all()
+
+
+def test_what_was_never_seen_becomes_a_noted_box(built, small_capture):
+    _, found = built
+    ghost = replace(
+        found.objects[0], id=999, center=np.array([0.5, 0.5, 0.5]), extents_m=np.array([0.1, 0.2, 0.3])
+    )
+    notes = Notes()
+    assets = build_assets(
+        small_capture.posed,
+        small_capture.depth,
+        EMPTY,
+        replace(found, objects=(ghost,)),
+        CONFIG,
+        progress=notes,
+    )
+    (item,) = assets.objects
+    assert item.provenance.geometry == "box-fallback"
+    assert any("999" in line for line in notes.lines)
+    np.testing.assert_allclose(np.ptp(item.visual.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-6)
+
+
+def test_same_input_same_bits(built, small_capture):
+    assets, found = built
+    again = build_assets(
+        small_capture.posed, small_capture.depth, EMPTY, replace(found, objects=found.objects[:1]), CONFIG
+    )
+    np.testing.assert_array_equal(again.objects[0].visual.vertices, assets.objects[0].visual.vertices)
+    np.testing.assert_array_equal(again.objects[0].visual.texture, assets.objects[0].visual.texture)
+    assert to_manifold(Solid(*_welded(again.objects[0].visual))) is not None
+
+
+def _welded(mesh):
+    place, inverse = np.unique(np.round(mesh.vertices.astype(float), 6), axis=0, return_inverse=True)
+    return place, inverse.ravel()[mesh.faces].astype(np.int32)

@@ -1,0 +1,113 @@
+"""Mass, materials, collision shapes of analytic solids."""
+
+import numpy as np
+import pytest
+
+from reconstruction.assets.collision import collision_parts
+from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.mass import mass_properties, physical_attributes
+from reconstruction.assets.materials import MATERIALS, choose_material
+from reconstruction.assets.solid import box_solid, from_manifold, lighten, to_manifold
+
+
+def bowl(outer=0.08, wall=0.006, height=0.06):
+    """A cup with a flat floor, standing on z = 0."""
+    manifold3d = pytest.importorskip("manifold3d")
+    outside = manifold3d.Manifold.cylinder(height, outer, outer, 48)
+    inside = manifold3d.Manifold.cylinder(height, outer - wall, outer - wall, 48).translate((0, 0, wall))
+    return from_manifold(outside - inside)
+
+
+def test_mass_of_a_box_is_exact():
+    low, high = np.array([0.1, -0.2, 0.0]), np.array([0.3, 0.2, 0.1])
+    volume, center, inertia = mass_properties(box_solid(low, high))
+    size = high - low
+    assert volume == pytest.approx(size.prod())
+    np.testing.assert_allclose(center, (low + high) / 2, atol=1e-12)
+    np.testing.assert_allclose(inertia, np.diag(size @ size - size**2) * volume / 12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(MATERIALS))
+def test_physics_is_valid_for_every_material(name):
+    choice = choose_material("unknown", 0.0, np.full(3, 128.0), np.array([0.1, 0.1, 0.1]))
+    choice = type(choice)(name, True, 0.0, "test")
+    physics = physical_attributes(box_solid(np.array([-0.05, -0.05, 0]), np.array([0.05, 0.05, 0.2])), choice)
+    assert 0 < physics.mass_kg < 0.002 * physics.density_kg_m3 + 1e-9
+    assert np.linalg.eigvalsh(physics.inertia).min() > 0
+
+
+def test_the_last_word_of_a_label_names_the_thing():
+    extents = np.array([0.1, 0.1, 0.2])
+    assert choose_material("milk carton", 0.9, np.zeros(3), extents).name == "paper"
+    assert choose_material("mug", 0.9, np.zeros(3), extents).name == "ceramic"
+    assert choose_material("mug", 0.1, np.full(3, 200.0), extents).name == "unknown"
+
+
+def test_a_box_collides_as_one_hull_with_its_own_bounds():
+    solid = box_solid(np.array([-0.1, -0.2, 0.0]), np.array([0.1, 0.2, 0.05]))
+    (part,) = collision_parts(solid, AssetsConfig())
+    np.testing.assert_allclose(part.vertices.min(axis=0), [-0.1, -0.2, 0.0], atol=1e-6)
+    np.testing.assert_allclose(part.vertices.max(axis=0), [0.1, 0.2, 0.05], atol=1e-6)
+
+
+def test_a_cup_stays_hollow_and_ends_where_it_is_seen_to():
+    solid = bowl()
+    parts = collision_parts(solid, AssetsConfig())
+    every = np.concatenate([p.vertices for p in parts])
+    np.testing.assert_allclose(every.min(axis=0), solid.vertices.min(axis=0), atol=0.002)
+    np.testing.assert_allclose(every.max(axis=0), solid.vertices.max(axis=0), atol=0.002)
+    assert max(len(p.vertices) for p in parts) <= 64
+    for part in parts:  # no part reaches the middle of the cavity
+        corner = part.vertices[part.faces].astype(float)
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        assert (np.einsum("nk,nk->n", normal, np.array([0, 0, 0.035]) - corner[:, 0]) > 0).any()
+
+
+def test_collision_is_deterministic():
+    a, b = (collision_parts(bowl(), AssetsConfig()) for _ in range(2))
+    assert len(a) == len(b)
+    for one, other in zip(a, b):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+
+
+def test_decimation_keeps_the_solid_closed():
+    manifold3d = pytest.importorskip("manifold3d")
+    ball = from_manifold(manifold3d.Manifold.sphere(0.05, 128))
+    light = lighten(ball, 500, 0.001)
+    assert len(light.faces) <= 500
+    assert to_manifold(light) is not None
+    assert light.volume == pytest.approx(ball.volume, rel=0.03)
+
+
+@pytest.mark.slow
+def test_a_ball_dropped_into_a_cup_stays_there():
+    sapien = pytest.importorskip("sapien")
+    import tempfile
+    from pathlib import Path
+
+    from reconstruction.assets.gltf import write_obj
+
+    scene = sapien.physx.PhysxCpuSystem()
+    scene.timestep = 1 / 240
+    cup = sapien.Entity()
+    body = sapien.physx.PhysxRigidStaticComponent()
+    material = sapien.physx.PhysxMaterial(0.4, 0.4, 0.1)
+    with tempfile.TemporaryDirectory() as folder:
+        for number, part in enumerate(collision_parts(bowl(), AssetsConfig())):
+            path = Path(folder) / f"{number}.obj"
+            write_obj(part, path)
+            body.attach(sapien.physx.PhysxCollisionShapeConvexMesh(str(path), np.ones(3), material))
+    cup.add_component(body)
+    ball = sapien.Entity()
+    moving = sapien.physx.PhysxRigidDynamicComponent()
+    moving.attach(sapien.physx.PhysxCollisionShapeSphere(0.0125, material))
+    ball.add_component(moving)
+    ball.set_pose(sapien.Pose([0.01, 0, 0.12]))
+    world = sapien.Scene([scene])
+    world.add_entity(cup)
+    world.add_entity(ball)
+    for _ in range(720):
+        world.step()
+    x, y, z = ball.pose.p
+    assert np.hypot(x, y) < 0.08
+    assert 0.01 < z < 0.04, "the ball rests on the cup's floor, not on a filled cavity"
