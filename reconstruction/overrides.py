@@ -14,7 +14,15 @@ import numpy as np
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.types import AssetSet, InstanceSet, ObjectAsset, SceneGraph, Surface
+    from reconstruction.types import (
+        AssetSet,
+        DepthMaps,
+        InstanceSet,
+        ObjectAsset,
+        PosedFrames,
+        SceneGraph,
+        Surface,
+    )
 
 # What an entry may do, by the stage that does it.
 ACTIONS: dict[str, tuple[str, ...]] = {
@@ -63,14 +71,16 @@ class Overrides:
         actions = ACTIONS.get(stage, ())
         return [entry for entry in self.entries if any(action in entry for action in actions)]
 
-    def apply_to_instances(self, found: "InstanceSet", surface: "Surface") -> "InstanceSet":
-        """Relabel, drop, merge, split, make base."""
+    def apply_to_instances(
+        self, found: "InstanceSet", surface: "Surface", posed: "PosedFrames", depth: "DepthMaps"
+    ) -> "InstanceSet":
+        """Relabel, drop, merge, split, make base; the cameras tell how a split shows in the instance maps."""
         entries = self.of_stage("instances")
         if not entries:
             return found
         from reconstruction.instances import apply_overrides
 
-        return apply_overrides(found, surface, entries)
+        return apply_overrides(found, surface, entries, posed=posed, depth=depth)
 
     def apply_to_assets(self, assets: "AssetSet") -> "AssetSet":
         """Set mass, material or friction, or replace a mesh."""

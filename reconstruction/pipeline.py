@@ -136,7 +136,7 @@ class Run:
             return module.fuse_surface(posed, depth, config, progress=progress)
         if stage.name == "instances":
             found = module.find_instances(posed, depth, done["surface"], config, progress=progress)
-            return self.overrides.apply_to_instances(found, done["surface"])
+            return self.overrides.apply_to_instances(found, done["surface"], posed, depth)
         assets = module.build_assets(
             posed, depth, done["surface"], done["instances"], config, progress=progress
         )

@@ -85,13 +85,13 @@ def test_killed_in_every_stage_and_resumed_gives_the_same_bundle(video, undistur
 def test_a_second_run_costs_nothing_and_a_changed_option_redoes_what_depends_on_it(video, undisturbed):
     done = run(video, undisturbed, "--scene", "room")
     assert done.stderr.count("already done") == len(STAGE_NAMES), done.stderr
-    done = run(video, undisturbed, "--scene", "other", "--set", "assembly.seed=5")
+    done = run(video, undisturbed, "--scene", "other", "--set", "assembly.settle_s=2.1")
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("already done") == len(STAGE_NAMES) - 1, done.stderr
 
 
 def test_two_runs_of_the_same_scene_at_once(video, undisturbed):
-    line, environment = command(video, undisturbed, "--scene", "race", "--set", "assembly.seed=7")
+    line, environment = command(video, undisturbed, "--scene", "race", "--set", "assembly.settle_s=2.2")
     runs = [
         subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment)
         for _ in range(2)
