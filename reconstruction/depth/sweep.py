@@ -113,7 +113,7 @@ def sweep_costs(reference, sources, h_inf, shift, rhos, noise, out):  # pragma: 
 
     Occlusion spoils the others.
 
-    `reference` (h, w) and `sources` (s, h, w) are float32 gray levels minus 128; source pixel ~ h_inf @ p + rho * shift.
+    `reference` (h, w) and `sources` (s, h, w) are float32 gray minus 128; source pixel ~ h_inf @ p + rho * shift.
     """
     h, w = reference.shape
     s = sources.shape[0]
