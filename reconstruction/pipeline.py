@@ -108,7 +108,9 @@ class Run:
         # Always continue from what is on disk: a resumed run then computes with the very same values.
         self.results[stage.name] = self.store.load(stage.produces, number, stage.name, key)
         self.usage[stage.name] = Usage(**manifest["usage"])
-        self.notes.extend(f"{stage.name}: {note}" for note in manifest["notes"])
+        self.notes.extend(
+            note if note.startswith(f"{stage.name}:") else f"{stage.name}: {note}" for note in manifest["notes"]
+        )
         self.listener.end_stage(stage.name, None if cached else self.usage[stage.name])
 
     def _compute(self, stage: Stage, config: Any, progress: Progress) -> Any:
