@@ -32,7 +32,11 @@ def test_import_loads_nothing_heavy(statement, forbidden):
 
 @pytest.mark.parametrize(
     ("package", "forbidden"),
-    [("registry", {"reconstruction", "simrecon_envs"}), ("simrecon_envs", {"reconstruction"}), ("reconstruction", {"simrecon_envs"})],
+    [
+        ("registry", {"reconstruction", "simrecon_envs"}),
+        ("simrecon_envs", {"reconstruction"}),
+        ("reconstruction", {"simrecon_envs"}),
+    ],
 )
 def test_no_file_imports_against_the_direction(package, forbidden):
     for file in (ROOT / package).rglob("*.py"):

@@ -20,7 +20,9 @@ def test_relative_links_lead_somewhere(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_paths_of_the_project_exist(page):
-    for path in re.findall(r"`((?:reconstruction|registry|simrecon_envs|tests|tools|examples|docs)/[\w./*-]+)`", page.read_text()):
+    for path in re.findall(
+        r"`((?:reconstruction|registry|simrecon_envs|tests|tools|examples|docs)/[\w./*-]+)`", page.read_text()
+    ):
         assert list(ROOT.glob(path.rstrip("/"))), f"{page.name} names {path}"
 
 

@@ -85,7 +85,9 @@ def test_device_cuda_is_refused_where_there_is_none(tmp_path, demo_video):
     torch = pytest.importorskip("torch")
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
-    message = assert_refused(simrecon("reconstruct", demo_video, "--device", "cuda", home=tmp_path), 4, tmp_path)
+    message = assert_refused(
+        simrecon("reconstruct", demo_video, "--device", "cuda", home=tmp_path), 4, tmp_path
+    )
     assert "CUDA" in message
 
 

@@ -22,7 +22,16 @@ pytestmark = pytest.mark.slow
 
 def command(video: Path, home: Path, *flags: object) -> tuple[list[str], dict[str, str]]:
     """Return the command line and the environment of a run with its own home."""
-    line = [sys.executable, "-m", "reconstruction.cli", "reconstruct", str(video), "--preset", "fast", *map(str, flags)]
+    line = [
+        sys.executable,
+        "-m",
+        "reconstruction.cli",
+        "reconstruct",
+        str(video),
+        "--preset",
+        "fast",
+        *map(str, flags),
+    ]
     environment = {**os.environ, "SIMRECON_HOME": str(home)}
     environment.pop("SIMRECON_DEBUG", None)
     return line, environment
@@ -93,7 +102,9 @@ def test_a_second_run_costs_nothing_and_a_changed_option_redoes_what_depends_on_
 def test_two_runs_of_the_same_scene_at_once(video, undisturbed):
     line, environment = command(video, undisturbed, "--scene", "race", "--set", "assembly.settle_s=2.2")
     runs = [
-        subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment)
+        subprocess.Popen(
+            line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+        )
         for _ in range(2)
     ]
     results = [(r.communicate(timeout=600)[1], r.returncode) for r in runs]
@@ -120,7 +131,9 @@ def test_the_environment_steps_in_a_fresh_process(undisturbed):
         "print('stepped')\n"
     )
     environment = {**os.environ, "SIMRECON_HOME": str(undisturbed)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment
+    )
     assert "stepped" in done.stdout, done.stderr
 
 
@@ -137,7 +150,10 @@ def test_hard_input_works_through_the_poses(name, tmp_path):
         "print(len(posed.images) / posed.chosen_frames, run.results['world'].floor_observed)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(path), str(tmp_path / "work")], capture_output=True, text=True, cwd=ROOT
+        [sys.executable, "-c", code, str(path), str(tmp_path / "work")],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr
     share, floor = done.stdout.split()
