@@ -171,7 +171,8 @@ def _bounds_the_room(graph, plane, inliers, area, candidates, config: InstancesC
         if other @ np.append(plane[:3], 0) < 0.95 or other_area < 0.7 * area:
             continue
         gap = -float(np.median(distance[other_inliers]))
-        if 0.08 < gap < 1.0:
+        # A smaller one just before it is a board, a panel or a row of frames on the wall.
+        if 0.08 < gap < 1.0 or (0.03 < gap <= 0.08 and other_area > area):
             return False
     return True
 

@@ -13,6 +13,12 @@ class InstancesConfig:
     min_object_vertices: int = 25
     """Things with fewer surface vertices than this are fragments."""
 
+    min_object_area_m2: float = 0.003
+    """Things of which less surface than this was seen are scraps."""
+
+    min_floating_m: float = 0.45
+    """Things in mid-air, on nothing and on no wall, whose longest side is below this are scraps."""
+
     contact_height_m: float = 0.008
     """What rises above a support plane by more than this (or by the plane's own noise) stands on it."""
 

@@ -53,6 +53,7 @@ def find_instances(
     for vertices, number in crumbs:
         owner[vertices] = number
     things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
+    things = _without_fragments(graph, things, base[0].observed, config, progress)
     for thing in things:
         if thing.attached:
             owner[thing.vertices] = 0
@@ -128,6 +129,29 @@ def _behind_base(graph: MeshGraph, planes: list[FittedPlane]) -> np.ndarray:
             beyond &= (along > low - 0.05) & (along < high + 0.05)
         out |= beyond
     return out
+
+
+def _without_fragments(
+    graph: MeshGraph, things: list[Thing], floor_seen: bool, config: InstancesConfig, progress: Progress
+) -> list[Thing]:
+    """Leave out scraps of surface that are no things: tiny ones, and small ones in mid-air or flat on a wall."""
+    carriers = {id(thing.rests_on) for thing in things}
+    kept = []
+    for thing in things:
+        points = graph.points[thing.vertices]
+        extents = np.sort(np.ptp(points, axis=0))
+        in_air = floor_seen and not thing.attached and thing.rests_on is None and points[:, 2].min() > 0.1
+        tiny = graph.areas[thing.vertices].sum() < config.min_object_area_m2
+        scrap = (in_air and extents[2] < config.min_floating_m) or (
+            thing.attached and extents[1] < config.min_picture_m
+        )
+        if id(thing) in carriers or not (tiny or scrap):
+            kept.append(thing)
+    if len(kept) < len(things):
+        progress.note(
+            f"{len(things) - len(kept)} scraps of surface, tiny or in mid-air, are not kept as things"
+        )
+    return kept
 
 
 def _without_base_crumbs(

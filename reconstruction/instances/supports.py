@@ -169,14 +169,16 @@ def stands_on(
         return False
     color_gap = float(np.linalg.norm(median_color(graph, candidate) - median_color(graph, support.vertices)))
     rise = float(np.percentile(points[:, 2], 95)) - support.height_m
-    if rise < max(0.015, support.noise_m) or _is_bump(graph, candidate, rise, color_gap):
+    if rise < max(0.015, support.noise_m) or _is_bump(graph, candidate, rise, color_gap, support.noise_m):
         return False  # a bump of the support itself
     return not _belongs_to_body(graph, body, support, candidate, foot, color_gap)
 
 
-def _is_bump(graph: MeshGraph, candidate: np.ndarray, rise: float, color_gap: float) -> bool:
+def _is_bump(graph: MeshGraph, candidate: np.ndarray, rise: float, color_gap: float, noise_m: float) -> bool:
     """Tell swellings of a noisy support, low, of its color, wide or without steep sides, from flat things."""
     extents = np.sort(np.ptp(graph.points[candidate, :2], axis=0))
+    if rise > max(0.025, 12.0 * noise_m) and extents[1] < 0.25 and rise > 0.2 * extents[1]:
+        return False  # far above what this support's noise could raise, and compact
     if rise < 0.035 and extents[1] > 0.6:
         return True  # a sheet of stray surface along an edge
     if rise > 0.055 or color_gap > 10.0:

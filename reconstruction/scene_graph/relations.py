@@ -247,10 +247,13 @@ class GeometryRelations:
         bridged, distant = [], []
         for gap, parent, name in below:
             near = gap < self.config.bridge_gap_m
-            evidence = f"nothing touches it; {name} is the next surface, {gap * 100:.0f} cm below"
-            (bridged if near else distant).append(
-                _Candidate("supported_by", parent, 0.3 if near else 0.1, evidence)
-            )
+            if near:
+                evidence = f"nothing touches it; {name} is the next surface, {gap * 100:.0f} cm below"
+                bridged.append(_Candidate("supported_by", parent, 0.3, evidence))
+            else:
+                # Something that no camera saw carries it: letting it fall would be the one wrong answer.
+                evidence = f"what carries it was not seen; held where it is, {gap * 100:.0f} cm above {name}"
+                distant.append(_Candidate("attached_to", parent, 0.1, evidence))
         beside = []
         for other in others:
             if np.any(other.low > child.high + 0.1) or np.any(other.high < child.low - 0.1):
@@ -259,7 +262,26 @@ class GeometryRelations:
             if gap < self.config.near_object_m and other.footprint_m2 > child.footprint_m2:
                 evidence = f"nothing below it; {gap * 100:.1f} cm beside {other.name}"
                 beside.append(_Candidate("attached_to", other.id, 0.25, evidence))
-        return bridged + sorted(beside, key=lambda c: (-c.score, c.parent)) + distant
+        beside.sort(key=lambda c: (-c.score, c.parent))
+        return (
+            bridged
+            + beside
+            + self._held_by_wall(child, min((gap for gap, *_ in below), default=np.inf))
+            + distant
+        )
+
+    def _held_by_wall(self, child: SampledObject, gap_below_m: float) -> list[_Candidate]:
+        """Rank walls that a thing in mid-air must hang from: they are nearer than anything below it."""
+        out = []
+        for base in self._base.values():
+            if base.label != "wall":
+                continue
+            near = float(np.percentile(base.distance(child.points), 3))
+            beside = np.all(child.center > base.low - 0.6) and np.all(child.center < base.high + 0.6)
+            if beside and near < min(gap_below_m, float(np.max(child.high - child.low))):
+                evidence = f"nothing carries it; {base.label} {base.id} is {near * 100:.0f} cm behind it"
+                out.append(_Candidate("attached_to", base.id, 0.2 - 0.01 * max(near, 0.0), evidence))
+        return sorted(out, key=lambda c: (-c.score, c.parent))
 
 
 def _closeness(gap: np.ndarray, config: RelationConfig, deep: bool) -> np.ndarray:
