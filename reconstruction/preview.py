@@ -52,7 +52,7 @@ def scene_meshes(assets: AssetSet, assembled: AssembledScene) -> list[tuple[Text
 def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFrames) -> np.ndarray:
     """Draw the scene from the keyframe that sees the most of its objects, beside that frame: uint8 (h, 2w, 3)."""
     camera = posed.camera.resized(640, round(640 * posed.camera.height / posed.camera.width))
-    best = _best_view(assets, assembled, posed, camera)
+    best = best_view(assembled, posed, camera)
     picture, _ = render_textured(scene_meshes(assets, assembled), camera, posed.world_from_camera[best])
     frame = cv2.resize(
         np.asarray(posed.images[best]), (camera.width, camera.height), interpolation=cv2.INTER_AREA
@@ -60,8 +60,8 @@ def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFram
     return np.hstack([frame, picture])
 
 
-def _best_view(assets: AssetSet, assembled: AssembledScene, posed: PosedFrames, camera: Camera) -> int:
-    """The frame whose image holds the most object centres, the nearest of equals."""
+def best_view(assembled: AssembledScene, posed: PosedFrames, camera: Camera) -> int:
+    """Return the row of the frame whose image holds the most object centers, the nearest of equals."""
     centers = np.array([item.world_from_object[:3, 3] for item in assembled.placed]).reshape(-1, 3)
     scores = []
     for pose in posed.world_from_camera:
