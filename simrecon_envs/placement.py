@@ -100,6 +100,7 @@ def candidate_targets(
 ) -> list[Target]:
     """Return the movable objects, best to pick up first; those with a problem come last."""
     scored = []
+    entries = {entry["id"]: entry for entry in bundle.scene["objects"]}
     for item in bundle.objects:
         if item.id not in movable:
             continue
@@ -117,8 +118,11 @@ def candidate_targets(
         buried = _buried_share(target, solids)
         if buried > 0.25:
             problems.append("other things are close above or beside it")
-        # Prefer what fits well into the gripper, stands free, and is not too light to be gripped.
+        if not entries[item.id].get("assembly", {}).get("stable", True):
+            problems.append("does not stand by itself")
+        # Prefer what fits well into the gripper, stands free, and was well seen.
         score = abs(target.grip_width_m - 0.55 * traits.gripper_opening_m) / traits.gripper_opening_m + buried
+        score += 1.0 - float(entries[item.id]["provenance"].get("observed_fraction", 1.0))
         described = Target(**{**vars(target), "problem": "; ".join(problems)})
         scored.append((len(problems), score, item.id, described))
     return [entry[-1] for entry in sorted(scored, key=lambda entry: entry[:3])]
