@@ -9,7 +9,8 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.mass import physical_attributes
 from reconstruction.assets.materials import choose_material
 from reconstruction.assets.solid import Solid
-from reconstruction.assets.views import ScenePixels, lift_object, object_noise, prepare_pixels
+from reconstruction.assets.standing import Stands, find_stands, without_children
+from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, frame_object, fuse_volume
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import (
@@ -47,10 +48,11 @@ def build_assets(
     """
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
     pixels = prepare_pixels(posed, depth, instances.id_maps)
+    stands = find_stands(posed, depth, pixels, instances)
     progress.advance()
     objects = []
     for item in instances.objects:
-        objects.append(build_object(item, posed, depth, pixels, instances, config, progress))
+        objects.append(build_object(item, posed, depth, pixels, instances, stands, config, progress))
         progress.advance()
     base = build_base(posed, depth, instances, tuple(objects), pixels, config)
     progress.advance(len(instances.base))
@@ -59,20 +61,32 @@ def build_assets(
 
 def build_object(
     item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet,
-    config: AssetsConfig, progress: Progress,
+    stands: Stands, config: AssetsConfig, progress: Progress,
 ) -> ObjectAsset:  # fmt: skip
-    """Build one asset: shape, looks, collision, physics."""
+    """Build one asset: shape, looks, collision, physics. What fails on one shape is done again with a box."""
+    name = f"object {item.id} ({item.label})"
     try:
-        body, frame, how = object_solid(item, posed, depth, pixels, found, config)
-    except (ValueError, IndexError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:
-        progress.note(
-            f"object {item.id} ({item.label}): could not be completed ({type(error).__name__}: {error})"
-        )
-        body, frame = box_fallback(item, np.zeros((0, 3)))
-        how = "box-fallback"
-    if how == "box-fallback":
-        progress.note(f"object {item.id} ({item.label}): too little was seen of it, it became a box")
+        body, frame, how = object_solid(item, posed, depth, pixels, found, stands, config)
+        if how == "box-fallback":
+            progress.note(f"{name}: too little was seen of it, it became a box")
+        return _finish_object(item, body, frame, how, posed, depth, pixels, stands, config)
+    # Compiled geometry libraries raise whatever they like on a degenerate shape, and one object must not cost the
+    # scene; running out of memory is no property of the object.
+    except MemoryError:
+        raise
+    except Exception as error:
+        progress.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
+    body, frame = box_fallback(item, np.zeros((0, 3)))
+    return _finish_object(item, body, frame, "box-fallback", posed, depth, pixels, stands, config)
+
+
+def _finish_object(
+    item: Instance, body: Solid, frame: ObjectFrame, how: str, posed: PosedFrames, depth: DepthMaps,
+    pixels: ScenePixels, stands: Stands, config: AssetsConfig,
+) -> ObjectAsset:  # fmt: skip
+    """Give a solid its looks, collision shape and mass."""
     body, world_from_object = to_object_space(body, frame)
+    levels = [s.level_m - float(world_from_object[2, 3]) for s in stands.on(item.id) if s.known]
     mapping, faces, uvs = texture.unwrap(body.vertices, body.faces)
     vertices = body.vertices[mapping]
     distance = np.linalg.norm(posed.world_from_camera[:, :3, 3] - world_from_object[:3, 3], axis=1).min()
@@ -95,7 +109,7 @@ def build_object(
         label_confidence=float(item.label_confidence),
         world_from_object=world_from_object,
         visual=texture.textured(vertices, faces, uvs, baked.texture),
-        collision=collision_parts(body, config),
+        collision=collision_parts(body, config, levels=tuple(levels)),
         physics=physical_attributes(body, choice),
         provenance=AssetProvenance(
             geometry=how,
@@ -122,17 +136,21 @@ def object_solid(
     depth: DepthMaps,
     pixels: ScenePixels,
     found: InstanceSet,
+    stands: Stands,
     config: AssetsConfig,
 ) -> tuple[Solid, ObjectFrame, str]:
     """Return an object's closed shape in its grid frame, that frame, and how the shape was made."""
-    seen = lift_object(posed, depth, pixels, item.id)
+    seen = stands.seen[item.id]
     if len(seen.points) < config.min_points:
         return *box_fallback(item, seen.points), "box-fallback"
-    frame = frame_object(item, seen, posed, depth, pixels, found)
+    frame = frame_object(item, seen, stands.level(item.id), found)
     noise = object_noise(posed, depth, pixels, seen, item.id)
     volume = fuse_volume(item.id, frame, noise, posed, depth, pixels, config)
     size = np.ptp(frame.points, axis=0)
     furniture = float(size.max()) > config.furniture_m
+    # A container's rim may be close to what it holds; a table has none.
+    grow = max(2.0 * volume.noise_m, volume.voxel_m, 0.012 if furniture else 0.004)
+    volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))
     field = completion.complete(volume, frame, config, furniture=furniture)
     body = solid.extract(field)
     if body is None or body.volume < 1e-7:

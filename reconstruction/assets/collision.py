@@ -3,27 +3,105 @@
 import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.solid import Solid, box_solid, hull_solid, lighten
+from reconstruction.assets.solid import Solid, box_solid, from_manifold, hull_solid, lighten
 from reconstruction.types import ConvexPart
 
 
-def collision_parts(solid: Solid, config: AssetsConfig) -> tuple[ConvexPart, ...]:
-    """Approximate a closed mesh in object space (bottom at z = 0) by convex parts within its bounds."""
+def collision_parts(
+    solid: Solid, config: AssetsConfig, *, levels: tuple[float, ...] = ()
+) -> tuple[ConvexPart, ...]:
+    """Approximate a closed mesh in object space (bottom at z = 0) by convex parts within its bounds.
+
+    Args:
+        solid: the closed mesh.
+        config: budgets and limits.
+        levels: heights at which other things stand on it. No part passes through them, so that tops come out level.
+    """
     low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
-    hull = hull_solid(solid.vertices)
-    filled = solid.volume / max(hull.volume, 1e-12)
-    if filled > config.convex_enough:
-        return (_limited(hull.vertices, config, low, high),)
     furniture = float((high - low).max()) > config.furniture_m
-    # Thin walls show as a low filled share: the hollower, the finer the cuts.
-    threshold = config.coacd_threshold * (0.6 if filled < 0.5 else 1.0)
-    parts = _decompose(solid, threshold, config.hulls_furniture if furniture else config.hulls_small, config)
-    parts = _to_bounds(parts, low, high)
+    budget = config.hulls_furniture if furniture else config.hulls_small
+    pieces = _sliced(solid, levels)
+    if len(pieces) == 1 and (hull := _nearly_convex(solid, config)) is not None:
+        return (_limited(hull.vertices, config, low, high),)
+    total = sum(p.volume for p in pieces)
+    parts: list[np.ndarray] = []
+    for piece in pieces:
+        hull = _nearly_convex(piece, config)
+        if hull is not None or piece.volume < 0.03 * total:
+            hull = hull or hull_solid(piece.vertices)
+            parts.append(_limited(hull.vertices, config, *_bounds(piece)).vertices.astype(np.float64))
+            continue
+        share = max(4, round(budget * piece.volume / total))
+        # Thin walls show as a low filled share: the hollower, the finer the cuts.
+        filled = piece.volume / max(hull_solid(piece.vertices).volume, 1e-12)
+        threshold = config.coacd_threshold * (0.6 if filled < 0.5 and not furniture else 1.0)
+        made = _to_bounds(_decompose(piece, threshold, share, config, furniture=furniture), *_bounds(piece))
+        parts += made
     parts = [fixed for part in parts if (fixed := _deflate(part, low, high, config)) is not None]
-    return tuple(parts) if parts else (_limited(hull.vertices, config, low, high),)
+    return tuple(parts) if parts else (_limited(hull_solid(solid.vertices).vertices, config, low, high),)
 
 
-def _decompose(solid: Solid, threshold: float, budget: int, config: AssetsConfig) -> list[np.ndarray]:
+def _bounds(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
+    return solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+
+
+def _nearly_convex(solid: Solid, config: AssetsConfig) -> Solid | None:
+    """Return the convex hull where the surface nowhere lies deeper inside it than reconstruction noise."""
+    hull = hull_solid(solid.vertices)
+    if solid.volume > config.convex_enough * hull.volume:
+        return hull
+    corner = hull.vertices[hull.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    offset = np.einsum("nk,nk->n", normal, corner[:, 0])
+    face = solid.vertices[solid.faces]
+    area = np.linalg.norm(np.cross(face[:, 1] - face[:, 0], face[:, 2] - face[:, 0]), axis=1)
+    depth = (offset[None] - face.mean(axis=1) @ normal.T).min(axis=1)
+    order = np.argsort(depth, kind="stable")
+    share = np.cumsum(area[order]) / area.sum()
+    dent = float(depth[order][np.searchsorted(share, 0.96)])
+    allowed = np.clip(config.dent_share * float(np.median(solid.extents)), 0.003, config.dent_limit_m)
+    filled = solid.volume > 0.6 * hull.volume
+    return hull if filled and dent < allowed else None
+
+
+def _sliced(solid: Solid, levels: tuple[float, ...]) -> list[Solid]:
+    """Cut a solid at heights; layers above the lowest fall into their separate bodies, crumbs left out."""
+    import manifold3d
+
+    top = float(solid.vertices[:, 2].max())
+    heights: list[float] = []
+    for level in sorted(levels):
+        if level > 0.008 and (not heights or level - heights[-1] > 0.02):
+            heights.append(level)
+    heights = [h for h in heights if h < top - 0.001][:4]
+    if not heights:
+        return [solid]
+    mesh = manifold3d.Mesh(
+        vert_properties=np.ascontiguousarray(solid.vertices, np.float32),
+        tri_verts=np.ascontiguousarray(solid.faces, np.uint32),
+    )
+    mesh.merge()
+    body = manifold3d.Manifold(mesh)
+    if body.status() != manifold3d.Error.NoError or body.is_empty():
+        return [solid]
+    out, whole = [], solid.volume
+    for height in heights:
+        above, below = body.split_by_plane((0.0, 0.0, 1.0), height)
+        if not below.is_empty():
+            out.append(from_manifold(below))
+        body = above
+    for piece in body.decompose() if not body.is_empty() else []:
+        made = from_manifold(piece)
+        # Lower things than this above a plane that carries others are noise of its surface.
+        if made.extents[2] > 0.012 and made.volume > 0.002 * whole:
+            out.append(made)
+    return out or [solid]
+
+
+def _decompose(
+    solid: Solid, threshold: float, budget: int, config: AssetsConfig, *, furniture: bool
+) -> list[np.ndarray]:
     """Run CoACD on the normalised, decimated mesh; return the vertices of each part."""
     import coacd
 
@@ -39,9 +117,9 @@ def _decompose(solid: Solid, threshold: float, budget: int, config: AssetsConfig
         threshold=threshold,
         max_convex_hull=budget,
         preprocess_mode="off",  # the mesh is manifold already; the voxel remesh would inflate it
-        resolution=500,
+        resolution=100 if furniture else 200,
         mcts_nodes=8,
-        mcts_iterations=20,
+        mcts_iterations=8 if furniture else 12,
         mcts_max_depth=2,
         max_ch_vertex=config.hull_vertices,
         decimate=True,

@@ -43,6 +43,10 @@ class AssetsConfig:
     """Most convex pieces of furniture."""
     convex_enough: float = 0.93
     """Solids that fill this share of their convex hull collide as that hull."""
+    dent_share: float = 0.08
+    """So are solids whose dents are shallower than this share of their middle extent (noise), …"""
+    dent_limit_m: float = 0.01
+    """… and than this."""
     collision_faces: int = 800
     """Faces of the decimated mesh that is decomposed."""
     coacd_threshold: float = 0.08

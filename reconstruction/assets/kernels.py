@@ -101,17 +101,22 @@ def fuse_object(
     voxel,
     trunc,
     tau,
+    shell,
 ):  # pragma: no cover - compiled
     """Sum the evidence of all frames in every voxel of one object's grid.
 
     Returns (nx, ny, nz) each: soft-maximum numerator and denominator of signed distances to the object's seen
-    surface, number of frames whose ray passed through, number of frames that saw the object's surface there.
+    surface, number of frames whose ray passed through, number of frames that saw the object's surface there,
+    number of frames that see something else there that does not hide the voxel, and number of frames that saw the
+    object's surface less than `shell` in front of it.
     """
     nx, ny, nz = shape
     numerator = np.zeros((nx, ny, nz), np.float32)
     denominator = np.zeros((nx, ny, nz), np.float32)
     freed = np.zeros((nx, ny, nz), np.uint16)
     support = np.zeros((nx, ny, nz), np.uint16)
+    outside = np.zeros((nx, ny, nz), np.uint16)
+    behind = np.zeros((nx, ny, nz), np.uint16)
     h, w = depth.shape[1:]
     for i in prange(nx):
         gx = origin[0] + (i + 0.5) * voxel
@@ -119,7 +124,7 @@ def fuse_object(
             gy = origin[1] + (j + 0.5) * voxel
             for k in range(nz):
                 gz = origin[2] + (k + 0.5) * voxel
-                num, den, n_free, n_near = 0.0, 0.0, 0, 0
+                num, den, n_free, n_near, n_outside, n_behind = 0.0, 0.0, 0, 0, 0, 0
                 for q in range(len(frames)):
                     f = frames[q]
                     m = camera_from_grid[q]
@@ -150,18 +155,24 @@ def fuse_object(
                             continue
                         if cos > 0:
                             n_near += 1
+                            if s < 0 and s > -shell:
+                                n_behind += 1
                         soft = weight * math.exp(max(s, -trunc) / tau)
                         num += soft * max(s, -trunc)
                         den += soft
                     elif cos > 0:
                         s = (d - z) * ray * max(cos, 0.1)
-                        if s > 0.6 * trunc and not _beside_own(ids, f, target, iu, iv, w, h):
-                            n_free += 1
+                        if s > 0.0 and not _beside_own(ids, f, target, iu, iv, w, h):
+                            n_outside += 1
+                            if s > 0.6 * trunc:
+                                n_free += 1
                 numerator[i, j, k] = num
                 denominator[i, j, k] = den
                 freed[i, j, k] = n_free
                 support[i, j, k] = n_near
-    return numerator, denominator, freed, support
+                outside[i, j, k] = n_outside
+                behind[i, j, k] = n_behind
+    return numerator, denominator, freed, support, outside, behind
 
 
 @njit(cache=True, inline="always")

@@ -130,6 +130,44 @@ def lift_object(
     return SeenPoints(points, np.einsum("nij,nj->ni", rotation, normal), rows.astype(np.int32), z * scale_x)
 
 
+def within_outlines(
+    seen: SeenPoints, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, target: int, votes: int = 20
+) -> SeenPoints:
+    """Drop points that frames see past: they project beside the object's outline and nothing there hides them.
+
+    Outlines follow the picture's edges, depth does not: what it says beyond them are skirts.
+    """
+    camera = depth.camera
+    shown = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8)
+    if len(seen.points) == 0 or len(shown) < 4:
+        return seen
+    shown = shown[np.unique(np.linspace(0, len(shown) - 1, votes).round().astype(int))]
+    inside, outside = np.zeros(len(seen.points), np.int32), np.zeros(len(seen.points), np.int32)
+    for f in shown:
+        local = transform_points(invert_rigid(posed.world_from_camera[f]), seen.points)
+        z = np.maximum(local[:, 2], 1e-3)
+        u = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(int)
+        v = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(int)
+        valid = (local[:, 2] > 0.05) & (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
+        row = np.flatnonzero(valid)
+        u, v, z = u[valid], v[valid], z[valid]
+        own = pixels.ids[f] == target
+        beside = own.copy()
+        beside[1:] |= own[:-1]
+        beside[:-1] |= own[1:]
+        beside[:, 1:] |= own[:, :-1]
+        beside[:, :-1] |= own[:, 1:]
+        there = pixels.depth[f, v, u]
+        agrees = own[v, u] & (np.abs(there - z) < 0.015 * z)
+        passed = ~beside[v, u] & (there > z) & (pixels.cosine[f, v, u] > 0)
+        inside[row[agrees]] += 1
+        outside[row[passed]] += 1
+    keep = (outside < 2) | (outside < 0.5 * inside)
+    if keep.mean() < 0.5:
+        return seen
+    return SeenPoints(seen.points[keep], seen.normals[keep], seen.frames[keep], seen.pixel_m[keep])
+
+
 def _pixel_normals(pixels: ScenePixels, camera, rows, v, u) -> np.ndarray:
     """Normals in camera space from central differences over two pixels; zero at depth edges."""
     maps = pixels.depth

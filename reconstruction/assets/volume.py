@@ -43,16 +43,9 @@ class ObjectFrame:
     wall_y: float | None  # the wall plane is at this y of the grid frame (things that hang)
 
 
-def frame_object(
-    item: Instance,
-    seen: SeenPoints,
-    posed: PosedFrames,
-    depth: DepthMaps,
-    pixels: ScenePixels,
-    found: InstanceSet,
-) -> ObjectFrame:
-    """Choose an upright frame: yaw from vertical faces, bottom at the support below."""
-    points, normals = _without_outliers(seen)
+def frame_object(item: Instance, seen: SeenPoints, support: float | None, found: InstanceSet) -> ObjectFrame:
+    """Choose an upright frame: yaw from vertical faces, bottom at the height of the support, where known."""
+    points, normals = without_outliers(seen)
     wall = _wall_of(item, found)
     if wall is not None:
         yaw = float(np.arctan2(wall[1], wall[0]) + np.pi / 2)  # grid +y looks into the wall, x along it
@@ -62,7 +55,7 @@ def frame_object(
     rotation = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
     local = points @ rotation
     low, high = np.percentile(local, 0.5, axis=0), np.percentile(local, 99.5, axis=0)
-    support = None if wall is not None else support_height(item, points, posed, depth, pixels, found)
+    support = None if wall is not None else support
     bottom = float(low[2]) if support is None else support
     center = rotation @ np.array([*((low + high) / 2)[:2], 0.0])
     world_from_grid = rigid(rotation, np.array([center[0], center[1], bottom]))
@@ -94,7 +87,7 @@ def refine_yaw(normals: np.ndarray, yaw_rad: float) -> float:
     return float(best + turns * np.pi / 2)
 
 
-def _without_outliers(seen: SeenPoints) -> tuple[np.ndarray, np.ndarray]:
+def without_outliers(seen: SeenPoints) -> tuple[np.ndarray, np.ndarray]:
     """Keep points whose neighbourhood several frames report, and that is not nearly empty.
 
     Depth errors at outlines fly between surfaces, in every frame elsewhere.
@@ -138,16 +131,11 @@ def _wall_of(item: Instance, found: InstanceSet) -> np.ndarray | None:
 
 
 def support_height(
-    item: Instance,
-    points: np.ndarray,
-    posed: PosedFrames,
-    depth: DepthMaps,
-    pixels: ScenePixels,
-    found: InstanceSet,
+    item: Instance, points: np.ndarray, carrier: SeenPoints | None, found: InstanceSet
 ) -> float | None:
     """Return the height of what the object stands on, just below it, or None where that is not known.
 
-    Floors are planes. Other supports are measured: their pixels in a ring around the object's footprint.
+    Floors are planes. Other supports are measured: their points (`carrier`) in a ring around the footprint.
     """
     lowest = float(np.percentile(points[:, 2], 0.5))
     height = float(np.percentile(points[:, 2], 99.5)) - lowest
@@ -157,9 +145,9 @@ def support_height(
             center = np.median(points[:, :2], axis=0)
             level = float(-(d + n[:2] @ center) / n[2]) if abs(n[2]) > 0.5 else 0.0
             return level if level < lowest + 0.05 else None
-    if item.support_hint == 0:
+    if carrier is None:
         return None
-    ring = _support_ring(item, points, posed, depth, pixels)
+    ring = _support_ring(points, carrier)
     if len(ring) < 30:
         return None
     level = float(np.percentile(ring, 30))
@@ -171,15 +159,10 @@ def support_height(
     return min(level, lowest + 0.004)
 
 
-def _support_ring(
-    item: Instance, points: np.ndarray, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels
-) -> np.ndarray:
+def _support_ring(points: np.ndarray, support: SeenPoints) -> np.ndarray:
     """Heights of the support's surface in a ring of a few centimetres around the object."""
     from scipy.spatial import cKDTree
 
-    from reconstruction.assets.views import lift_object
-
-    support = lift_object(posed, depth, pixels, item.support_hint, 150_000)
     if len(support.points) == 0:
         return np.zeros(0)
     low, high = points[:, :2].min(axis=0) - 0.04, points[:, :2].max(axis=0) + 0.04
@@ -220,7 +203,16 @@ def fuse_volume(
     else:
         low[2] = min(low[2], 0.0)
     span = high - low + 2 * margin
-    voxel = max(config.voxel_min_m, float(span.max()) / config.cells_along_longest)
+    # Flat and thin things have few voxels along their short sides: they can afford finer ones, down to the noise.
+    frames = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8).astype(
+        np.int32
+    )
+    depths = invert_rigid(frame.world_from_grid)[None] @ posed.world_from_camera[frames]
+    distance_m = float(np.median(np.linalg.norm(depths[:, :3, 3], axis=1))) if len(frames) else 1.0
+    noise = noise_relative * distance_m
+    finest = max(config.voxel_min_m, 0.7 * noise, 0.7 * distance_m / depth.camera.fx)
+    cubic = float((span.prod() / (0.7 * config.cells_along_longest**3)) ** (1 / 3))
+    voxel = max(min(float(span.max()) / config.cells_along_longest, max(cubic, finest)), config.voxel_min_m)
     if size.max() > config.furniture_m:
         voxel = float((span.prod() / config.max_voxels) ** (1 / 3))
         voxel = float(np.clip(voxel, 0.004, 0.02))
@@ -231,30 +223,35 @@ def fuse_volume(
         # z = 0 lies between two layers, so that bottoms come out flat on the support.
         origin[2] = -np.ceil(max(-(low[2] - margin[2]), 0.0) / voxel) * voxel - pad * voxel
     shape = tuple(int(np.ceil((high[a] + margin[a] - origin[a]) / voxel)) + pad for a in range(3))
-    frames = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8).astype(
-        np.int32
-    )
     camera_from_grid = np.stack(
         [invert_rigid(posed.world_from_camera[f]) @ frame.world_from_grid for f in frames]
     )
-    distance_m = float(np.median(camera_from_grid[:, 2, 3]))
-    noise = noise_relative * distance_m
     trunc = max(2.5 * voxel, 3.0 * noise)
     tau = max(0.6 * trunc, 2.0 * noise)
     camera = depth.camera
-    numerator, denominator, freed, support = fuse_object(
+    shell = max(2.2 * voxel, config.min_thickness_m)
+    numerator, denominator, freed, support, outside, behind = fuse_object(
         pixels.depth, pixels.confidence, pixels.ids, pixels.cosine, frames, camera_from_grid, camera.fx, camera.fy,
-        camera.cx, camera.cy, target, shape, origin, voxel, trunc, tau,
+        camera.cx, camera.cy, target, shape, origin, voxel, trunc, tau, shell,
     )  # fmt: skip
     # Surface that only one or two of many frames report is a depth error at an outline.
     near = (denominator > 0) & (support >= int(np.clip(len(frames) // 8, 1, 3)))
+    # What lies outside the outline in many frames that see past it is skirt: outlines are sharper than depth.
+    skirt = (outside >= 2) & (outside > 0.35 * support)
+    near &= ~skirt
+    if size.max() <= config.furniture_m and near.any():
+        near &= support >= 0.12 * np.percentile(support[near], 75)
     distance = np.where(near, numerator / np.maximum(denominator, 1e-12), 0).astype(np.float32)
     # One stray ray does not free a voxel that many frames saw as surface.
     enough = np.minimum(2, max(1, len(frames) // 6))
-    free = freed >= enough
+    free = (freed >= enough) | skirt
     vote = freed.astype(np.float32) * np.exp(1.0) * 0.7
     mixed = near & free
     blended = (numerator + vote * trunc) / np.maximum(denominator + vote, 1e-12)
     distance[mixed] = blended[mixed]
     distance[free & ~near] = trunc
+    # A wall thinner than the noise is freed from its other side; what many frames saw just before it keeps it.
+    usual = np.percentile(behind[near], 85) if near.any() else 0.0
+    wall = mixed & (behind >= max(3.0, 0.35 * usual)) & (behind > 0.7 * freed) & (distance > -1.5 * voxel)
+    distance[wall] = -1.5 * voxel
     return ObjectVolume(origin, voxel, trunc, noise, distance, near | free, free & (distance > 0), near)

@@ -1,0 +1,136 @@
+"""Where things stand: at which height each object meets what carries it, and what thereby is not its carrier's.
+
+Depth is fat at outlines, so that a fused table top carries rims of whatever stands on it. The carrier is built
+without the space that its children fill, and its collision shape is cut level where they stand.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reconstruction.assets.views import ScenePixels, SeenPoints, lift_object, within_outlines
+from reconstruction.assets.volume import ObjectFrame, ObjectVolume, support_height, without_outliers
+from reconstruction.types import DepthMaps, InstanceSet, PosedFrames
+from registry.geometry import invert_rigid, transform_points
+
+_SAME_LEVEL_M = 0.015
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One object on what carries it."""
+
+    child: int
+    parent: int
+    level_m: float  # world height of the contact
+    known: bool  # the carrier's surface was measured there
+    outline: np.ndarray  # float64 (k, 2) convex footprint of the child, world, counter-clockwise
+    top_m: float
+
+
+@dataclass(frozen=True)
+class Stands:
+    """All contacts of a scene, and the points that they were found from."""
+
+    seen: dict[int, SeenPoints]
+    by_child: dict[int, Standing]
+
+    def level(self, child: int) -> float | None:
+        """Return the height that a child stands at, if it was measured."""
+        found = self.by_child.get(child)
+        return found.level_m if found is not None and found.known else None
+
+    def on(self, parent: int) -> tuple[Standing, ...]:
+        """Return what stands on a parent."""
+        return tuple(s for s in self.by_child.values() if s.parent == parent)
+
+
+def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet) -> Stands:
+    """Measure the contacts of all objects with what `support_hint` says that they rest on."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    seen = {
+        o.id: within_outlines(lift_object(posed, depth, pixels, o.id), posed, depth, pixels, o.id)
+        for o in found.objects
+    }
+    by_child: dict[int, Standing] = {}
+    carriers: dict[int, SeenPoints] = {}
+    for item in found.objects:
+        if item.attached_hint or item.support_hint == 0 or len(seen[item.id].points) < 30:
+            continue
+        points, _ = without_outliers(seen[item.id])
+        parent = item.support_hint
+        if parent not in carriers:
+            carriers[parent] = lift_object(posed, depth, pixels, parent, 150_000)
+        level = support_height(item, points, carriers.get(parent), found)
+        low, high = np.percentile(points[:, 2], [0.5, 99.5])
+        middle = np.median(points[:, :2], axis=0)
+        # The outermost points are depth errors at the outline: drop them before the hull.
+        flat = points[:: max(1, len(points) // 20_000), :2]
+        far = np.linalg.norm(flat - middle, axis=1)
+        flat = flat[far <= np.percentile(far, 99.5)]
+        try:
+            outline = flat[ConvexHull(flat).vertices]
+        except (QhullError, ValueError):
+            continue
+        by_child[item.id] = Standing(
+            item.id, parent, float(low if level is None else level), level is not None, outline, float(high)
+        )
+    return Stands(seen, _agreed(by_child))
+
+
+def _agreed(by_child: dict[int, Standing]) -> dict[int, Standing]:
+    """Give children of one parent whose levels differ by noise only the same level: they stand on one board."""
+    out = dict(by_child)
+    for parent in {s.parent for s in by_child.values()}:
+        rest = sorted((s.level_m, s.child) for s in by_child.values() if s.parent == parent and s.known)
+        while rest:
+            group = [x for x in rest if x[0] - rest[0][0] < 2 * _SAME_LEVEL_M]
+            level = float(np.median([x[0] for x in group]))
+            group = [x for x in group if abs(x[0] - level) < _SAME_LEVEL_M] or group[:1]
+            for own, child in group:
+                out[child] = replace(out[child], level_m=level if len(group) > 1 else own)
+            rest = [x for x in rest if x not in group]
+    return out
+
+
+def without_children(
+    volume: ObjectVolume, frame: ObjectFrame, standing: tuple[Standing, ...], grow_m: float
+) -> ObjectVolume:
+    """Free the space that children fill: above their contact, within their footprint grown by `grow_m`."""
+    if not standing:
+        return volume
+    distance, known = volume.distance.copy(), volume.known.copy()
+    free, seen = volume.free.copy(), volume.seen.copy()
+    grid_from_world = invert_rigid(frame.world_from_grid)
+    x, y, z = (volume.centers(axis) for axis in range(3))
+    plane = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    for s in standing:
+        corners = transform_points(
+            grid_from_world, np.column_stack([s.outline, np.full(len(s.outline), s.level_m)])
+        )
+        inside = _within(plane, corners[:, :2], grow_m).reshape(len(x), len(y))
+        above = z - corners[0, 2]
+        # Exactly at the contact the carrier's surface comes out, so that the field stays smooth there.
+        wanted = np.clip(above, 0.0, volume.trunc_m).astype(np.float32)
+        layers = np.flatnonzero((above > 0) & (z < corners[0, 2] + (s.top_m - s.level_m) + grow_m))
+        for k in layers:
+            distance[:, :, k][inside] = np.maximum(
+                np.where(known[:, :, k][inside], distance[:, :, k][inside], -np.inf), wanted[k]
+            )
+            known[:, :, k][inside] = True
+            free[:, :, k][inside] = True
+            seen[:, :, k][inside] = above[k] < volume.trunc_m
+    return replace(volume, distance=distance, known=known, free=free, seen=seen)
+
+
+def _within(points: np.ndarray, outline: np.ndarray, grow_m: float) -> np.ndarray:
+    """Tell which points (n, 2) lie in a counter-clockwise convex outline moved outwards by `grow_m`."""
+    inside = np.ones(len(points), bool)
+    for a, b in zip(outline, np.roll(outline, -1, axis=0)):
+        edge = b - a
+        length = np.linalg.norm(edge)
+        if length > 1e-9:
+            normal = np.array([edge[1], -edge[0]]) / length
+            inside &= (points - a) @ normal < grow_m
+    return inside
