@@ -1,5 +1,7 @@
 """The stage itself: base planes, pictures, things, boxes and labels, id maps."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -64,7 +66,33 @@ def find_instances(
     if not objects:
         progress.note("No separate things were found: the scene is an empty room.")
     id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, progress=progress)
-    return InstanceSet(vertex_instance, base, objects, id_maps)
+    return _without_unseen(InstanceSet(vertex_instance, base, objects, id_maps), config, progress)
+
+
+def _without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progress) -> InstanceSet:
+    """Leave out what shows in no keyframe once depth and image edges had their say: surface without a thing."""
+    count = max((o.id for o in found.objects), default=0) + 1
+    best = np.zeros(count, np.int64)
+    for id_map in found.id_maps:
+        seen = np.bincount(id_map.ravel(), minlength=count)[:count]
+        best = np.maximum(best, seen)
+    gone = {o.id: o.support_hint for o in found.objects if best[o.id] < config.min_object_pixels}
+    if not gone:
+        return found
+    progress.note(f"{len(gone)} scraps that show in no keyframe are not kept as things")
+
+    def carrier(hint: int) -> int:
+        while hint in gone:
+            hint = gone[hint]
+        return hint
+
+    erased = np.array(sorted(gone))
+    return InstanceSet(
+        np.where(np.isin(found.vertex_instance, erased), 0, found.vertex_instance).astype(np.int32),
+        found.base,
+        tuple(replace(o, support_hint=carrier(o.support_hint)) for o in found.objects if o.id not in gone),
+        np.where(np.isin(found.id_maps, erased), 0, found.id_maps).astype(np.uint16),
+    )
 
 
 def _fit_base(graph: MeshGraph, config: InstancesConfig) -> tuple[list[FittedPlane], np.ndarray]:
