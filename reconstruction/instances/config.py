@@ -16,8 +16,8 @@ class InstancesConfig:
     min_object_area_m2: float = 0.003
     """Things of which less surface than this was seen are scraps."""
 
-    min_object_pixels: int = 40
-    """Things that cover fewer pixels than this in every keyframe, at depth resolution, are scraps."""
+    min_object_image_share: float = 2.5e-4
+    """Things that cover less of every keyframe than this are scraps."""
 
     min_floating_m: float = 0.45
     """Things in mid-air, on nothing and on no wall, whose longest side is below this are scraps."""

@@ -76,7 +76,8 @@ def _without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progr
     for id_map in found.id_maps:
         seen = np.bincount(id_map.ravel(), minlength=count)[:count]
         best = np.maximum(best, seen)
-    gone = {o.id: o.support_hint for o in found.objects if best[o.id] < config.min_object_pixels}
+    fewest = config.min_object_image_share * found.id_maps[0].size
+    gone = {o.id: o.support_hint for o in found.objects if best[o.id] < fewest}
     if not gone:
         return found
     progress.note(f"{len(gone)} scraps that show in no keyframe are not kept as things")
