@@ -6,13 +6,13 @@ import pytest
 from reconstruction import artifacts
 from reconstruction.types import (
     AssembledScene,
-    DepthMaps,
     Camera,
+    DepthMaps,
     Edge,
     PlacedObject,
     SceneGraph,
-    Surface,
     SpaceGrid,
+    Surface,
 )
 
 

@@ -1,4 +1,4 @@
-"""The whole pipeline on a small filmed room: killed and resumed, repeated, raced, changed, and used as an environment."""
+"""The whole pipeline on a small filmed room: killed and resumed, repeated, raced, and used as an environment."""
 
 import json
 import os
