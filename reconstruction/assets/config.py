@@ -43,13 +43,13 @@ class AssetsConfig:
     """Most convex pieces of furniture."""
     convex_enough: float = 0.93
     """Solids that fill this share of their convex hull collide as that hull."""
-    dent_share: float = 0.08
+    dent_share: float = 0.12
     """So are solids whose dents are shallower than this share of their middle extent (noise), …"""
-    dent_limit_m: float = 0.01
+    dent_limit_m: float = 0.012
     """… and than this."""
-    collision_faces: int = 800
+    collision_faces: int = 600
     """Faces of the decimated mesh that is decomposed."""
-    coacd_threshold: float = 0.08
+    coacd_threshold: float = 0.1
     """Concavity at which CoACD stops cutting; hollow things use 0.6 of it."""
     hull_vertices: int = 48
     """Most vertices of one convex piece (PhysX allows 255)."""
