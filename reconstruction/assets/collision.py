@@ -63,7 +63,7 @@ def _nearly_convex(solid: Solid, config: AssetsConfig) -> Solid | None:
     probes = np.einsum("nk,nkc->nc", weight, corner[chosen])
     gap, _ = cKDTree(np.concatenate([solid.vertices, solid.vertices[solid.faces].mean(axis=1)])).query(probes)
     allowed = np.clip(config.dent_share * float(np.median(solid.extents)), 0.003, config.dent_limit_m)
-    return hull if float(np.percentile(gap, 90)) < allowed else None
+    return hull if float(np.percentile(gap, 95)) < allowed else None
 
 
 def _sliced(solid: Solid, levels: tuple[float, ...]) -> list[Solid]:
