@@ -90,7 +90,8 @@ class StageStore:
             free_bytes = shutil.disk_usage(work_dir).free
         except OSError as error:
             raise EnvironmentMissing(
-                f"cannot write to the work folder {work_dir}: {error.strerror or error}. Choose another with --work-dir."
+                f"cannot write to the work folder {work_dir}: {error.strerror or error}. "
+                f"Choose another with --work-dir."
             ) from error
 
         if free_bytes < _NEEDED_BYTES:

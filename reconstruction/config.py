@@ -6,6 +6,7 @@ prints them all with their meaning.
 
 import dataclasses
 import inspect
+import itertools
 import types
 import typing
 from dataclasses import dataclass, field
@@ -137,7 +138,7 @@ def _field_docs(cls: type) -> dict[str, str]:
 
     body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
     docs = {}
-    for node, after in zip(body, body[1:]):
+    for node, after in itertools.pairwise(body):
         if (
             isinstance(node, ast.AnnAssign)
             and isinstance(after, ast.Expr)

@@ -109,7 +109,8 @@ class Run:
         self.results[stage.name] = self.store.load(stage.produces, number, stage.name, key)
         self.usage[stage.name] = Usage(**manifest["usage"])
         self.notes.extend(
-            note if note.startswith(f"{stage.name}:") else f"{stage.name}: {note}" for note in manifest["notes"]
+            note if note.startswith(f"{stage.name}:") else f"{stage.name}: {note}"
+            for note in manifest["notes"]
         )
         self.listener.end_stage(stage.name, None if cached else self.usage[stage.name])
 

@@ -18,7 +18,9 @@ sys.path.insert(0, str(ROOT))
 
 def main() -> None:
     """Reconstruct, draw, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--video", type=Path, default=ROOT / "examples" / "data" / "demo_room.mp4")
     parser.add_argument("--scene", default="demo_room")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "demo.png")
@@ -27,7 +29,7 @@ def main() -> None:
     from reconstruction.preview import best_view, render_textured, scene_meshes
 
     run = reconstruct(arguments.video, scene_id=arguments.scene).run
-    posed, depth = run.in_world()
+    posed, _ = run.in_world()
     assets, assembled, instances = (run.results[name] for name in ("assets", "assembly", "instances"))
     camera = posed.camera.resized(480, round(480 * posed.camera.height / posed.camera.width))
     row = best_view(assembled, posed, camera)
@@ -36,9 +38,13 @@ def main() -> None:
     ids = cv2.resize(np.asarray(instances.id_maps[row]), size, interpolation=cv2.INTER_NEAREST)
     scene, _ = render_textured(scene_meshes(assets, assembled), camera, posed.world_from_camera[row])
     gap = np.full((camera.height, 8, 3), 255, np.uint8)
-    picture = np.hstack([frame, gap, draw_instances(frame, ids, {o.id for o in instances.objects}), gap, scene])
+    picture = np.hstack(
+        [frame, gap, draw_instances(frame, ids, {o.id for o in instances.objects}), gap, scene]
+    )
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(arguments.out), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    cv2.imwrite(
+        str(arguments.out), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 9]
+    )
     print(arguments.out)
 
 
@@ -55,7 +61,9 @@ def draw_instances(frame: np.ndarray, ids: np.ndarray, objects: set[int]) -> np.
         rows, columns = np.nonzero(mask)
         place = (int(np.median(columns)) - 6, int(np.median(rows)) + 5)
         cv2.putText(picture, str(thing), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.putText(picture, str(thing), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+        cv2.putText(
+            picture, str(thing), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
+        )
     return picture
 
 

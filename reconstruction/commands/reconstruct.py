@@ -168,13 +168,7 @@ def _print_result(result: object, arguments: argparse.Namespace) -> None:
     at = f" --registry {arguments.registry}" if arguments.registry else ""
     print(f"\n{result.env_id} is registered. Next:")
     print(f"  simrecon show {result.record.scene_id}{at}")
-    if arguments.registry:
-        print(
-            f'  python -c \'import gymnasium as gym, simrecon_envs; simrecon_envs.register_scenes("{arguments.registry}"); '
-            f'env = gym.make("{result.env_id}"); print(env.reset())\''
-        )
-    else:
-        print(
-            f"  python -c 'import gymnasium as gym, simrecon_envs; env = gym.make(\"{result.env_id}\"); print(env.reset())'"
-        )
+    found = f'simrecon_envs.register_scenes("{arguments.registry}"); ' if arguments.registry else ""
+    code = f'import gymnasium as gym, simrecon_envs; {found}env = gym.make("{result.env_id}"); print(env.reset())'
+    print(f"  python -c '{code}'")
     sys.stdout.flush()

@@ -118,8 +118,8 @@ def run_verify(arguments: argparse.Namespace) -> int:
         if "physics" in result:
             physics = result["physics"]
             print(
-                f"physics: stable {physics['stable_rate']:.0%}, deepest overlap {physics['spawn_penetration_mm']:.2f} mm, "
-                f"floating {physics['floating_rate']:.0%}"
+                f"physics: stable {physics['stable_rate']:.0%}, "
+                f"deepest overlap {physics['spawn_penetration_mm']:.2f} mm, floating {physics['floating_rate']:.0%}"
             )
     return 0 if report.ok else 1
 
