@@ -14,6 +14,9 @@ from reconstruction.types import DepthMaps, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _SAME_LEVEL_M = 0.015
+# No camera sees the board below a thing, but something carries it: at least this much is there.
+_BOARD_M = 0.02
+_FOOTPRINT_SHRINK_M = 0.006
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,11 @@ def _agreed(by_child: dict[int, Standing]) -> dict[int, Standing]:
 def without_children(
     volume: ObjectVolume, frame: ObjectFrame, standing: tuple[Standing, ...], grow_m: float
 ) -> ObjectVolume:
-    """Free the space that children fill: above their contact, within their footprint grown by `grow_m`."""
+    """Free the space that children fill, and fill in what they stand on.
+
+    Free is what lies above their contact, within their footprint grown by `grow_m`. Solid is a board right below the
+    contact, within the footprint: it was hidden by the child.
+    """
     if not standing:
         return volume
     distance, known = volume.distance.copy(), volume.known.copy()
@@ -121,6 +128,14 @@ def without_children(
             known[:, :, k][inside] = True
             free[:, :, k][inside] = True
             seen[:, :, k][inside] = above[k] < volume.trunc_m
+        core = _within(plane, corners[:, :2], -_FOOTPRINT_SHRINK_M).reshape(len(x), len(y))
+        for k in np.flatnonzero((above <= 0) & (above > -max(_BOARD_M, 2.5 * volume.voxel_m))):
+            depth_below = max(float(above[k]), -volume.trunc_m)
+            distance[:, :, k][core] = np.minimum(
+                np.where(known[:, :, k][core], distance[:, :, k][core], np.inf), depth_below
+            )
+            known[:, :, k][core] = True
+            free[:, :, k][core] = False
     return replace(volume, distance=distance, known=known, free=free, seen=seen)
 
 
