@@ -20,7 +20,7 @@ def scene():
             solid_box((0.1, 0.0, 0.5), (0.22, 0.1, 0.62), (30, 60, 200)),
         )
     )
-    posed, depth = frames_of(surface)
+    posed, depth = frames_of(surface, 320, 240)
     found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
     assert len(found.objects) == 3
     return surface, posed, depth, found
