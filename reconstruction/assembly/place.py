@@ -165,9 +165,14 @@ class Placer:
             item = item.noted(
                 f"its lowest part is {gap * 100:.0f} cm above the {floor.label}; left where it was seen"
             )
+        item = self._out_of_walls(item)
+        return self._keep_clear(item, lift=0.0)
+
+    def _out_of_walls(self, item: Placement) -> Placement:
+        """Move a thing that reaches into a wall out of it a little, and cut its shape off where that is not enough."""
         for wall in self.base.values():
             depth = -float(_distance(wall, world_points(item.parts, item.pose)).min())
-            if wall.id == floor.id or depth <= 0 or not _beside(wall, item):
+            if wall.label == "floor" or depth <= 0 or not _beside(wall, item):
                 continue
             push = min(depth + _TOUCH_GAP_M, self.config.max_snap_m)
             item = _moved(item, push * _normal(wall))
@@ -176,7 +181,7 @@ class Placer:
                 item = item.noted(
                     f"its collision shape was cut off {depth * 100:.1f} cm inside {wall.label} {wall.id}"
                 )
-        return self._keep_clear(item, lift=0.0)
+        return item
 
     def _hang(self, item: Placement) -> Placement:
         parent = self.base.get(item.edge.parent)
@@ -205,8 +210,9 @@ class Placer:
     def _cut_behind(self, item: Placement, base: BaseAsset) -> Placement:
         normal = _normal(base)
         offset = float(_distance(base, item.pose[:3, 3][None])[0]) - _TOUCH_GAP_M
-        parts = cut(item.parts, item.pose[:3, :3].T @ normal, offset)
-        return replace(item, parts=parts) if parts else item
+        inward = item.pose[:3, :3].T @ normal
+        parts, unflattened = cut(item.parts, inward, offset), cut(item.unflattened, inward, offset)
+        return replace(item, parts=parts, unflattened=unflattened) if parts and unflattened else item
 
     def _keep_clear(self, item: Placement, lift: float) -> Placement:
         """Shift a thing that will not be let go out of its neighbors."""
@@ -229,6 +235,7 @@ class Placer:
     # Everything else: cleared, let go, repaired where it does not stand.
 
     def _let_settle(self, item: Placement) -> Placement:
+        item = self._out_of_walls(item)
         best = self._try(item, item.pose)
         for band in self.config.foot_bands_mm:
             if best[0] < 1.0:
