@@ -92,9 +92,10 @@ def _settle_together(
             note = "made immovable: it does not stay where it was seen"
             placer.placed[i] = placer.placed[i].noted(note, dynamic=False)
         report = physics_report(scene_specs(list(placer.placed.values()), base))
+    done = "it was made immovable" if config.freeze_unstable else "it was left as it is"
     for i in unstable:
         progress.note(
-            f"assembly: {placer.placed[i].asset.label} {i} does not stay put for {report['duration_s']:g} s"
+            f"assembly: {placer.placed[i].asset.label} {i} does not stay put for {report['duration_s']:g} s; {done}"
         )
     return report
 

@@ -43,7 +43,7 @@ class AssemblyConfig:
     """Time all objects together are given to come to rest."""
     joint_rounds: int = 4
     """How often the whole scene is settled, measured and repaired."""
-    freeze_unstable: bool = False
+    freeze_unstable: bool = True
     """Make what cannot be made to stand immovable (said in its `repair`), instead of leaving it unstable."""
 
 
