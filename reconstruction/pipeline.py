@@ -72,10 +72,11 @@ class Run:
     keys: dict[str, str] = field(default_factory=dict)
     usage: dict[str, Usage] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    input_digest: str = ""  # of the video; computed where it is not given
 
     def __post_init__(self) -> None:
         """Digest the input once."""
-        self.input_digest = digest_input(self.video)
+        self.input_digest = self.input_digest or digest_input(self.video)
 
     def execute(self, until: str = STAGE_NAMES[-1]) -> None:
         """Run or load every stage up to and including `until`."""
@@ -218,7 +219,14 @@ def reconstruct(
         scene_id = scene_id or held_id
         digest = digest_input(video)
         folder = Path(work_dir) if work_dir else registry.root.parent / "work" / digest[:16]
-        run = Run(video, config or PipelineConfig(), StageStore(folder), overrides or Overrides(), listener)
+        run = Run(
+            video,
+            config or PipelineConfig(),
+            StageStore(folder),
+            overrides or Overrides(),
+            listener,
+            input_digest=digest,
+        )
         run.execute()
         run = _with_object_scale(run)
         record = publish_scene(run, registry, scene_id, require_stable=require_stable)
