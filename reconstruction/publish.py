@@ -201,6 +201,8 @@ def _report(run: "Run") -> dict:
             "machine": f"{platform.machine()} {platform.system()}",
             "versions": _versions(),
             "commit": _commit(),
+            # Where `simrecon evaluate` and `report` find what the stages made, while the work folder is kept.
+            "work": {"input_digest": run.input_digest, "stage_keys": dict(run.keys)},
         },
         "backends": {
             "poses": "pycolmap",
