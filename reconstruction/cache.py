@@ -3,7 +3,7 @@
 A stage's fingerprint is the SHA-256 over its name, VERSION and source, its config, and the fingerprints of the stages
 before it (the first one has the input's digest). On disk a stage is `<work>/<NN>_<stage>-<fingerprint>/`, written as a
 temporary sibling and renamed when complete, so a killed run leaves nothing that looks finished. Two fingerprints of
-each stage are kept, so going back and forth between two options costs nothing.
+each stage are kept unless more are asked for, so going back and forth between two options costs nothing.
 """
 
 import dataclasses
@@ -81,9 +81,10 @@ def digest_input(path: Path) -> str:
 class StageStore:
     """Finished stages of one input on disk."""
 
-    def __init__(self, work_dir: Path) -> None:
+    def __init__(self, work_dir: Path, kept_per_stage: int = KEPT_PER_STAGE) -> None:
         """Open or create the store; leftovers of dead processes are removed."""
         self.work_dir = work_dir
+        self.kept_per_stage = kept_per_stage
         try:
             work_dir.mkdir(parents=True, exist_ok=True)
             self._sweep()
@@ -151,7 +152,7 @@ class StageStore:
     def _prune(self, number: int, stage: str, keep: Path) -> None:
         siblings = [p for p in self.work_dir.glob(f"{number:02d}_{stage}-*") if p != keep]
         siblings.sort(key=lambda p: p.stat().st_mtime, reverse=True)
-        for old in siblings[KEPT_PER_STAGE - 1 :]:
+        for old in siblings[self.kept_per_stage - 1 :]:
             shutil.rmtree(old, ignore_errors=True)
 
     def _sweep(self) -> None:

@@ -9,11 +9,12 @@ the world frame because the depth maps' normals are what tells gravity; from `su
 
 import importlib
 import logging
+import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from reconstruction.cache import StageStore, digest_input, fingerprint
+from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, fingerprint
 from reconstruction.config import PipelineConfig
 from reconstruction.overrides import Overrides
 from reconstruction.profiling import Usage, UsageMeter
@@ -73,6 +74,8 @@ class Run:
     usage: dict[str, Usage] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     input_digest: str = ""  # of the video; computed where it is not given
+    computed: set[str] = field(default_factory=set)  # stages that this run did itself; the others were kept
+    started: float = field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
         """Digest the input once."""
@@ -104,6 +107,7 @@ class Run:
                 "config": config,
             }
             self.store.save(result, number, stage.name, key, record)
+            self.computed.add(stage.name)
             del result
         manifest = self.store.manifest(number, stage.name, key)
         # Always continue from what is on disk: a resumed run then computes with the very same values.
@@ -187,6 +191,7 @@ def reconstruct(
     config: PipelineConfig | None = None,
     overrides: Overrides | None = None,
     require_stable: bool = False,
+    keep_results: int = KEPT_PER_STAGE,
     listener: StageListener = NO_PROGRESS,
 ) -> Reconstruction:
     """Turn a video (or a folder of images) into a registered scene.
@@ -200,6 +205,8 @@ def reconstruct(
         config: options of every stage.
         overrides: the user's corrections.
         require_stable: refuse to publish a scene in which an object does not stay put.
+        keep_results: how many results of each stage stay in the work folder; more of them make going back and forth
+            between several configs cheap.
         listener: told of stages, progress and notes.
 
     Raises:
@@ -210,6 +217,7 @@ def reconstruct(
     """
     from reconstruction.publish import publish_scene
 
+    started = time.perf_counter()
     video = Path(video)
     if not video.exists():
         raise UsageError(f"{video}: no such file or folder")
@@ -222,10 +230,11 @@ def reconstruct(
         run = Run(
             video,
             config or PipelineConfig(),
-            StageStore(folder),
+            StageStore(folder, keep_results),
             overrides or Overrides(),
             listener,
             input_digest=digest,
+            started=started,
         )
         run.execute()
         run = _with_object_scale(run)

@@ -1,12 +1,17 @@
-"""Wall time, CPU time and peak memory of the process tree, per stage."""
+"""Wall time, CPU time and peak memory of the process tree, per stage, and the table that shows them."""
 
+import re
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import psutil
 
-_INTERVAL_S = 0.1
+PUBLISH = "publish"  # writing the bundle
+OTHER = "other"  # the rest of the run: digesting the input, saving and loading what stages made
+_INTERVAL_S = 0.05
+_STATUS = Path("/proc/self/status")
 
 
 @dataclass(frozen=True)
@@ -19,13 +24,20 @@ class Usage:
 
 
 class UsageMeter:
-    """Context manager that samples the memory of this process and its children while the body runs."""
+    """Context manager that measures this process and everything that it starts while the body runs.
+
+    Memory is what the whole tree occupied at once: this process's resident set plus what each descendant has for
+    itself (pages that a fork shares with its parent count once). It is sampled every 50 ms; where the kernel keeps a
+    high-water mark, a peak of this process that falls between two samples is still seen. CPU time covers descendants
+    that ended as well as those that still run.
+    """
 
     def __enter__(self) -> "UsageMeter":
         """Start measuring."""
         self._process = psutil.Process()
         self._stop = threading.Event()
         self._peak = 0
+        self._high_water_start = _high_water_bytes()
         self._start, self._cpu_start = time.perf_counter(), self._cpu()
         self._thread = threading.Thread(target=self._sample, daemon=True)
         self._thread.start()
@@ -35,26 +47,122 @@ class UsageMeter:
         """Stop measuring; `usage` is then final."""
         self._stop.set()
         self._thread.join()
+        high_water = _high_water_bytes()
+        if high_water > self._high_water_start:  # The mark is of the process's life; it rose within the body.
+            self._peak = max(self._peak, high_water)
         self.usage = Usage(
             wall_s=time.perf_counter() - self._start,
-            cpu_s=self._cpu() - self._cpu_start,
+            cpu_s=max(0.0, self._cpu() - self._cpu_start),
             peak_memory_mb=self._peak / 2**20,
         )
 
     def _cpu(self) -> float:
-        times = self._process.cpu_times()
-        return times.user + times.system + times.children_user + times.children_system
+        """Return the CPU seconds of the tree so far: its own, of children that were waited for, of living ones."""
+        total = 0.0
+        for process in self._tree():
+            try:
+                times = process.cpu_times()
+            except (psutil.NoSuchProcess, psutil.AccessDenied):
+                continue
+            total += times.user + times.system + times.children_user + times.children_system
+        return total
 
     def _sample(self) -> None:
         while True:
-            total = 0
-            for process in [self._process, *self._process.children(recursive=True)]:
-                try:
-                    # Shared pages (libraries, memory-mapped arrays) of a child count once: its unique part only.
-                    memory = process.memory_info()
-                    total += memory.rss if process == self._process else max(0, memory.rss - memory.shared)
-                except (psutil.NoSuchProcess, psutil.AccessDenied):
-                    continue
-            self._peak = max(self._peak, total)
+            self._peak = max(self._peak, sum(self._memory(process) for process in self._tree()))
             if self._stop.wait(_INTERVAL_S):
                 return
+
+    def _tree(self) -> list[psutil.Process]:
+        return [self._process, *self._process.children(recursive=True)]
+
+    def _memory(self, process: psutil.Process) -> int:
+        try:
+            return process.memory_info().rss if process == self._process else process.memory_full_info().uss
+        except (psutil.NoSuchProcess, psutil.AccessDenied):
+            return 0
+
+
+def _high_water_bytes() -> int:
+    """Return the largest resident set that this process ever had, 0 where the kernel does not tell."""
+    try:
+        found = re.search(r"^VmHWM:\s*(\d+) kB", _STATUS.read_text(), re.MULTILINE)
+    except OSError:
+        return 0
+    return int(found[1]) * 1024 if found else 0
+
+
+@dataclass(frozen=True)
+class CostRow:
+    """What one step of a run cost; None where it was not measured."""
+
+    name: str
+    wall_s: float
+    cpu_s: float | None
+    peak_memory_mb: float | None
+    cached: bool
+
+    @property
+    def cores(self) -> float | None:
+        """How many cores were busy on average."""
+        return None if self.cpu_s is None or self.wall_s < 0.05 else self.cpu_s / self.wall_s
+
+
+def cost_rows(report: dict) -> list[CostRow]:
+    """Read what each step cost from a bundle's `report`, in the order in which the steps ran.
+
+    Args:
+        report: the `report` of a `scene.json`, also of one that was written by an earlier version.
+    """
+    from reconstruction.pipeline import STAGE_NAMES
+
+    times, volatile = report["timings_s"], report.get("volatile", {})
+    order = [*STAGE_NAMES, PUBLISH, OTHER]
+    names = sorted(times, key=lambda name: order.index(name) if name in order else len(order))
+    return [
+        CostRow(
+            name,
+            times[name],
+            volatile.get("cpu_s", {}).get(name),
+            volatile.get("stage_peak_memory_mb", {}).get(name),
+            name in volatile.get("cached", ()),
+        )
+        for name in names
+    ]
+
+
+def describe_costs(report: dict) -> str:
+    """Lay out what each step cost as a table for people, with the total below."""
+    rows = cost_rows(report)
+    total = CostRow(
+        "total",
+        sum(row.wall_s for row in rows),
+        sum(row.cpu_s for row in rows if row.cpu_s is not None) if any(row.cpu_s for row in rows) else None,
+        report.get("peak_memory_mb"),
+        False,
+    )
+    lines = [f"{'stage':<12}{'wall s':>9}{'CPU s':>9}{'cores':>7}{'peak GB':>9}"]
+    for row in [*rows, total]:
+        peak = None if row.peak_memory_mb is None else row.peak_memory_mb / 1024
+        lines.append(
+            f"{row.name:<12}{row.wall_s:>9.1f}{_shown(row.cpu_s):>9}{_shown(row.cores):>7}{_shown(peak, 2):>9}"
+            f"{'  from the cache' if row.cached else ''}"
+        )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def costs_json(report: dict) -> dict[str, dict]:
+    """Return the same figures for programs: step -> wall_s, cpu_s, peak_memory_mb, cached."""
+    return {
+        row.name: {
+            "wall_s": row.wall_s,
+            "cpu_s": row.cpu_s,
+            "peak_memory_mb": row.peak_memory_mb,
+            "cached": row.cached,
+        }
+        for row in cost_rows(report)
+    }
+
+
+def _shown(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

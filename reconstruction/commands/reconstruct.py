@@ -44,6 +44,13 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         "--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)"
     )
     parser.add_argument("--work-dir", type=Path, metavar="DIR", help="where finished stages are kept")
+    parser.add_argument(
+        "--keep-results",
+        type=int,
+        default=2,
+        metavar="N",
+        help="of each stage, in the work folder (default 2)",
+    )
     parser.add_argument("--preset", choices=("fast", "default", "quality"), default="default")
     parser.add_argument(
         "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where stages compute"
@@ -84,6 +91,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("which video? Give a file or a folder of images: simrecon reconstruct VIDEO")
     if not arguments.video.exists():
         raise UsageError(f"{arguments.video}: no such file or folder")
+    if arguments.keep_results < 1:
+        raise UsageError(
+            f"--keep-results {arguments.keep_results}: at least 1 result of each stage is needed"
+        )
     _check_device(arguments.device)
     from reconstruction.commands.reporting import make_listener
     from reconstruction.overrides import Overrides
@@ -99,6 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
             config=_config(arguments),
             overrides=Overrides.load(arguments.overrides) if arguments.overrides else None,
             require_stable=arguments.require_stable,
+            keep_results=arguments.keep_results,
             listener=listener,
         )
     _print_result(result, arguments)
@@ -140,6 +152,7 @@ def _config(arguments: argparse.Namespace) -> object:
 
 def _print_result(result: object, arguments: argparse.Namespace) -> None:
     from reconstruction.commands.scenes import describe_scene
+    from reconstruction.profiling import costs_json
     from registry import SceneRegistry
 
     registry = SceneRegistry(arguments.registry)
@@ -155,16 +168,13 @@ def _print_result(result: object, arguments: argparse.Namespace) -> None:
             "physics": bundle.scene["report"]["physics"],
             "timings_s": bundle.scene["report"]["timings_s"],
             "peak_memory_mb": bundle.scene["report"]["peak_memory_mb"],
+            "costs": costs_json(bundle.scene["report"]),
             "notes": bundle.scene["report"].get("notes", []),
         }
         print(json.dumps(summary, indent=2))
         return
-    report = bundle.scene["report"]
-    times = ", ".join(f"{name} {seconds:.0f}" for name, seconds in report["timings_s"].items())
-    total = sum(report["timings_s"].values())
     print(f"\n{describe_scene(result.record, bundle)}")
     print(f"picture: {Path(result.record.path) / 'preview.png'}")
-    print(f"time: {total:.0f} s ({times}); peak memory {report['peak_memory_mb'] / 1024:.1f} GB")
     at = f" --registry {arguments.registry}" if arguments.registry else ""
     print(f"\n{result.env_id} is registered. Next:")
     print(f"  simrecon show {result.record.scene_id}{at}")

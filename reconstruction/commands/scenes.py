@@ -57,14 +57,19 @@ def run_show(arguments: argparse.Namespace) -> int:
     record = registry.get(arguments.scene)
     bundle = registry.load(arguments.scene)
     if arguments.json:
-        print(json.dumps({"record": _record_json(record), "scene": bundle.scene}, indent=2))
+        from reconstruction.profiling import costs_json
+
+        costs = costs_json(bundle.scene["report"])
+        print(json.dumps({"record": _record_json(record), "costs": costs, "scene": bundle.scene}, indent=2))
     else:
         print(describe_scene(record, bundle))
     return 0
 
 
 def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
-    """Say what was found, how sure it is, and where the files are."""
+    """Say what was found, how sure it is, what it cost, and where the files are."""
+    from reconstruction.profiling import describe_costs
+
     scene = bundle.scene
     names = {b["id"]: b["label"] for b in scene["base"]} | {o["id"]: o["label"] for o in scene["objects"]}
     parents = {e["child"]: e for e in scene["graph"]["edges"]}
@@ -94,6 +99,8 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
         )
     for note in scene["report"].get("notes", []):
         lines.append(f"note: {note}")
+    if scene["report"]["timings_s"]:
+        lines.append(describe_costs(scene["report"]))
     lines.append(f"files: {record.path}")
     return "\n".join(lines)
 
