@@ -76,7 +76,7 @@ class GroundTruth:
             if inside.is_dir():
                 return cls.load(inside)
             raise UsageError(
-                f"ground truth {folder}: holds neither scene.json (cameras and entities) nor cameras.json (cameras only)"
+                f"ground truth {folder}: holds neither scene.json (cameras, entities) nor cameras.json"
             )
         path = folder / names[0]
         try:

@@ -1,0 +1,347 @@
+"""Measure a scene: every metric of CONTRACT section 4, and every stage whose result is still at hand."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reconstruction.evaluation.alignment import Alignment, align
+from reconstruction.evaluation.ground_truth import GroundTruth, TrueEntity
+from reconstruction.evaluation.matching import box_iou, graph_f1, match, match_base
+from reconstruction.evaluation.perceptual import perceptual_scores
+from reconstruction.evaluation.rendering import render_views, score_pictures, video_frames
+from reconstruction.evaluation.scene import (
+    PlacedMesh,
+    bundle_camera,
+    bundle_poses,
+    joined,
+    placed_meshes,
+)
+from reconstruction.evaluation.stage_results import StageResults
+from reconstruction.evaluation.surfaces import OBJECT_POINTS, compare, sample, sample_seen
+from reconstruction.progress import NO_PROGRESS, Progress
+from registry import SceneBundle
+from registry.errors import UsageError
+
+SCHEMA = "simrecon.evaluation/1"
+COMPOSITION_BOUND_M, OBJECT_BOUND_M = 0.05, 0.01
+IOU_BOUNDS = (0.25, 0.5)
+_MATCH_BOUND = IOU_BOUNDS[0]
+_PHYSICS_KEYS = (
+    "stable_rate",
+    "stable_rate_10cm_0.1rad",
+    "stable_rate_5cm_drop_5deg",
+    "spawn_penetration_mm",
+    "floating_rate",
+)
+
+
+@dataclass
+class Evaluation:
+    """What was measured of one scene. `metrics` has the names of CONTRACT section 4; None is in `left_out`."""
+
+    scene: str
+    revision: str
+    ground_truth: str | None
+    metrics: dict[str, float | None] = field(default_factory=dict)
+    objects: list[dict[str, Any]] = field(default_factory=list)  # one per evaluated true object
+    extra: list[dict[str, Any]] = field(default_factory=list)  # found objects that match none of them
+    stages: dict[str, dict[str, Any]] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)  # metric or stage -> why
+
+    def to_json(self) -> dict[str, Any]:
+        """Return strict JSON values: what is not finite becomes null."""
+        return json.loads(json.dumps({"schema": SCHEMA, **asdict(self)}, default=float), parse_constant=_null)
+
+
+def _null(_: str) -> None:
+    return None
+
+
+def evaluate_scene(
+    bundle: SceneBundle,
+    ground_truth: Path | None,
+    *,
+    stages: StageResults | None = None,
+    video: Path | None = None,
+    progress: Progress = NO_PROGRESS,
+) -> Evaluation:
+    """Evaluate a scene against the truth, or without it only what needs none (physics, rendering, registration).
+
+    Args:
+        bundle: the scene.
+        ground_truth: folder of CONTRACT section 3, or of cameras and depth only; None where there is no truth.
+        stages: the results of the scene's stages, for the figures per stage; None leaves them out.
+        video: the video, for kept-out frames, where the stages' results are gone; None: the one beside the truth.
+        progress: told of each part.
+
+    Raises:
+        UsageError: the truth is malformed, or not of this video.
+    """
+    truth = None if ground_truth is None else GroundTruth.load(ground_truth)
+    out = Evaluation(bundle.scene["id"], bundle.revision, None if ground_truth is None else str(ground_truth))
+    stages = stages or StageResults({}, {})
+    scene = placed_meshes(bundle)
+    parts: list[Callable[[], None]] = [
+        lambda: _cost(bundle, out),
+        lambda: _physics(bundle, out),
+        lambda: _rendering(bundle, scene, stages, _video_of(video, ground_truth), out),
+    ]
+    if truth is not None:
+        alignment = align(bundle_poses(bundle), truth.world_from_camera, truth.up)
+        moved = [mesh.moved(alignment.true_from_estimated) for mesh in scene]
+        _cameras(alignment, truth, out)
+        parts += [
+            lambda: _composition(moved, truth, stages, alignment, out),
+            lambda: _objects(bundle, moved, truth, out),
+            lambda: _stage_figures(truth, stages, alignment, out),
+        ]
+    else:
+        out.left_out["cameras, geometry, objects, graph"] = "no ground truth was given"
+    progress.start(len(parts), "measuring")
+    for part in parts:
+        part()
+        progress.advance()
+    out.left_out.update({f"stage {name}": reason for name, reason in stages.missing.items()})
+    return out
+
+
+def _video_of(video: Path | None, ground_truth: Path | None) -> Path | None:
+    if video is not None:
+        if not video.exists():
+            raise UsageError(f"{video}: no such video or folder")
+        return video
+    if ground_truth is None:
+        return None
+    beside = [folder / "video.mp4" for folder in (Path(ground_truth).parent, Path(ground_truth))]
+    return next((path for path in beside if path.is_file()), None)
+
+
+def _cost(bundle: SceneBundle, out: Evaluation) -> None:
+    report = bundle.scene["report"]
+    out.metrics["time_s"] = float(sum(report["timings_s"].values()))
+    out.metrics["peak_memory_mb"] = float(report["peak_memory_mb"])
+    out.metrics["objects"] = len(bundle.scene["objects"])
+    registration = report.get("registration")
+    if registration:
+        out.metrics["frames_chosen"] = registration["keyframes"]
+        out.metrics["frames_registered"] = registration["registered"]
+
+
+def _physics(bundle: SceneBundle, out: Evaluation) -> None:
+    from registry.simulation import physics_report, specs_from_bundle
+
+    report = physics_report(specs_from_bundle(bundle))
+    out.metrics.update({key: report[key] for key in _PHYSICS_KEYS})
+    out.metrics["dynamic_objects"] = report["dynamic_objects"]
+    assembled = [o["assembly"] for o in bundle.scene["objects"] if "assembly" in o]
+    moved_cm = [100 * item["moved_m"] for item in assembled]
+    out.stages["assembly"] = {
+        "median_moved_cm": float(np.median(moved_cm)) if moved_cm else 0.0,
+        "max_moved_cm": max(moved_cm, default=0.0),
+        "repaired": sum(bool(item["repair"]) for item in assembled),
+        "fixed_objects": report["fixed_objects"],
+        "physics": report["objects"],
+    }
+
+
+def _rendering(
+    bundle: SceneBundle, scene: list[PlacedMesh], stages: StageResults, video: Path | None, out: Evaluation
+) -> None:
+    camera = bundle_camera(bundle)
+    poses = {i: pose for i, pose in bundle_poses(bundle).items() if i % 10 == 0}
+    posed = stages.get("poses")
+    if posed is not None:
+        frames = {int(i): np.asarray(x) for i, x in zip(posed.held_out_indices, posed.held_out_images)}
+        source = "undistorted by the poses stage"
+    elif video is not None:
+        frames, source = video_frames(video, sorted(poses), camera), "as decoded from the video"
+    else:
+        reason = "the kept-out frames are gone; give --video, or reconstruct again"
+        out.left_out.update({"psnr_db": reason, "ssim": reason, "coverage": reason})
+        return
+    indices = sorted(set(poses) & set(frames))
+    if not indices:
+        reason = "no kept-out frame could be registered (a small folder of images has none)"
+        out.left_out.update({"psnr_db": reason, "ssim": reason, "coverage": reason})
+        return
+    pictures, covered = render_views(
+        [(m.visual, m.world_from_mesh) for m in scene], camera, [poses[i] for i in indices]
+    )
+    true = [frames[i] for i in indices]
+    score = score_pictures(pictures, covered, true)
+    if score is None:
+        out.left_out["psnr_db"] = out.left_out["ssim"] = "the scene covers no pixel of the kept-out frames"
+        out.metrics["coverage"] = 0.0
+        return
+    out.metrics.update(psnr_db=score.psnr_db, ssim=score.ssim, coverage=score.coverage)
+    out.stages["rendering"] = {"frames": score.frames, "frames_from": source}
+    perceptual, missing = perceptual_scores(pictures, true)
+    out.metrics.update(perceptual)
+    out.left_out.update(missing)
+
+
+def _cameras(alignment: Alignment, truth: GroundTruth, out: Evaluation) -> None:
+    out.metrics.update(
+        ate_cm=alignment.ate_cm,
+        scale_error=abs(alignment.scale - 1),
+        tilt_deg=alignment.tilt_deg,
+        rotation_median_deg=float(np.median(alignment.rotation_errors_deg)),
+        cameras_compared=len(alignment.indices),
+    )
+
+
+def _composition(
+    scene: list[PlacedMesh], truth: GroundTruth, stages: StageResults, alignment: Alignment, out: Evaluation
+) -> None:
+    from reconstruction.evaluation.stages import sensor_surface, surface_figures
+
+    poses = list(truth.world_from_camera.values())
+    if truth.entities:
+        true_seen = sample_seen(*joined([e.mesh for e in truth.entities]), truth.camera, poses)
+    else:
+        # What a depth sensor measured stands for the surface; it tells of no normals worth comparing.
+        true_seen = sensor_surface(truth)
+        out.left_out["nc"] = "the truth is a depth sensor's points, without normals"
+    if not len(true_seen.points):
+        reason = "the truth has neither meshes nor depth"
+        out.left_out.update({"cd_cm": reason, "f_5cm": reason, "nc": reason})
+        return
+    estimated = sample_seen(*joined(scene), truth.camera, poses)
+    score = compare(estimated, true_seen, COMPOSITION_BOUND_M)
+    if score is None:
+        reason = "no part of the scene is where the true cameras look"
+        out.left_out.update({"cd_cm": reason, "f_5cm": reason, "nc": reason})
+    else:
+        out.metrics.update(cd_cm=score.cd_cm, f_5cm=score.f)
+        out.metrics.update(accuracy_cm=score.accuracy_cm, completeness_cm=score.completeness_cm)
+        if truth.entities:
+            out.metrics["nc"] = score.nc
+    surface = stages.get("surface")
+    if surface is not None:
+        figures = surface_figures(surface, alignment, truth, true_seen, COMPOSITION_BOUND_M)
+        if not truth.entities:
+            figures.pop("nc", None)
+        out.stages["surface"] = figures
+
+
+def _objects(bundle: SceneBundle, scene: list[PlacedMesh], truth: GroundTruth, out: Evaluation) -> None:
+    if not truth.entities:
+        for name in ("object_recall_25", "object_precision_25", "object_cd_cm", "object_f_1cm", "graph_f1"):
+            out.left_out[name] = "the truth has no entities"
+        return
+    found = [m for m in scene if not m.base]
+    wanted = list(truth.evaluated)
+    iou = box_iou(np.array([e.mesh.bounds for e in wanted]), np.array([m.bounds for m in found]))
+    for bound in IOU_BOUNDS:
+        pairs = match(iou, bound)
+        name = f"{round(100 * bound)}"
+        out.metrics[f"object_recall_{name}"] = len(pairs) / len(wanted) if wanted else 1.0
+        out.metrics[f"object_precision_{name}"] = len(pairs) / len(found) if found else float(not wanted)
+    pairs = dict(match(iou, _MATCH_BOUND))
+    scores = [
+        _object_score(entity, found[pairs[row]] if row in pairs else None)
+        for row, entity in enumerate(wanted)
+    ]
+    out.metrics["object_cd_cm"] = float(np.mean([s["cd_cm"] for s in scores])) if scores else 0.0
+    out.metrics["object_f_1cm"] = float(np.mean([s["f_1cm"] for s in scores])) if scores else 100.0
+    out.metrics["matched_object_cd_cm"] = _mean_or_none(
+        [s["cd_cm"] for s in scores if s["match"] is not None]
+    )
+    out.metrics["matched_object_f_1cm"] = _mean_or_none(
+        [s["f_1cm"] for s in scores if s["match"] is not None]
+    )
+    _graph(bundle, scene, truth, {found[c].id: wanted[r].id for r, c in pairs.items()}, scores, out)
+    for row, score in enumerate(scores):
+        score["box_iou"] = float(iou[row, pairs[row]]) if row in pairs else float(iou[row].max(initial=0.0))
+    out.objects = scores
+    used = set(pairs.values())
+    out.extra = [{"id": m.id, "label": m.label} for c, m in enumerate(found) if c not in used]
+
+
+def _mean_or_none(values: list[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _object_score(entity: TrueEntity, found: PlacedMesh | None) -> dict[str, Any]:
+    """Compare complete surfaces; a miss counts as the object's diagonal and as 0."""
+    out = {"true_id": entity.id, "name": entity.name, "label": entity.label, "match": None}
+    score = None
+    if found is not None:
+        out.update(match=found.id, found_label=found.label)
+        true = sample(entity.mesh.vertices, entity.mesh.faces, OBJECT_POINTS)
+        score = compare(sample(found.vertices, found.faces, OBJECT_POINTS), true, OBJECT_BOUND_M)
+    if score is None:
+        diagonal = float(np.linalg.norm(entity.mesh.bounds[1] - entity.mesh.bounds[0]))
+        return {**out, "cd_cm": 100 * diagonal, "f_1cm": 0.0}
+    center = found.bounds.mean(axis=0) - entity.mesh.bounds.mean(axis=0)
+    return {
+        **out,
+        "cd_cm": score.cd_cm,
+        "f_1cm": score.f,
+        "center_error_cm": float(100 * np.linalg.norm(center)),
+    }
+
+
+def _graph(
+    bundle: SceneBundle,
+    scene: list[PlacedMesh],
+    truth: GroundTruth,
+    true_of: dict[int, int],
+    scores: list[dict[str, Any]],
+    out: Evaluation,
+) -> None:
+    """F1 of the edges over everything evaluated, and over matched children only."""
+    base = match_base([m for m in scene if m.base], truth.base)
+
+    def name(item: int) -> tuple[str, int]:
+        if item in base:
+            return "true", base[item]
+        return ("true", true_of[item]) if item in true_of else ("found", item)
+
+    estimated = {(name(e["child"]), e["relation"], name(e["parent"])) for e in bundle.scene["graph"]["edges"]}
+    true = {(("true", e.id), e.relation, ("true", e.parent)) for e in truth.evaluated}
+    matched = {("true", i) for i in true_of.values()}
+    out.metrics["graph_f1"] = graph_f1(estimated, true)
+    out.metrics["graph_f1_matched"] = graph_f1(
+        {e for e in estimated if e[0] in matched}, {e for e in true if e[0] in matched}
+    )
+    edge_of = {e[0]: e for e in estimated}
+    for score in scores:
+        child = ("true", score["true_id"])
+        if child in edge_of:
+            score["relation_right"] = edge_of[child] in true
+
+
+def _stage_figures(truth: GroundTruth, stages: StageResults, alignment: Alignment, out: Evaluation) -> None:
+    from reconstruction.evaluation import stages as figures
+
+    posed, depth = stages.in_world()
+    surface, instances = stages.get("surface"), stages.get("instances")
+    if posed is None:
+        return
+    out.stages["poses"] = figures.poses_figures(posed, alignment, truth)
+    if depth is not None:
+        _keep(out, "depth", figures.depth_figures(posed, depth, alignment, truth), "the truth has no meshes")
+    if surface is not None:
+        shown = figures.surface_depth_figures(posed, surface, alignment, truth)
+        out.stages.setdefault("surface", {}).update(
+            {f"depth_{key}": value for key, value in (shown or {}).items()}
+        )
+    if surface is not None and instances is not None:
+        if truth.entities:
+            on_surface = figures.instance_figures_3d(surface, instances, alignment, truth)
+            per_view = figures.instance_figures_2d(posed, surface, instances, truth)
+            out.stages["instances"] = {"surface": on_surface, "per_view": per_view}
+        else:
+            out.left_out["stage instances"] = "the truth has no entities"
+
+
+def _keep(out: Evaluation, stage: str, figures: dict | None, reason: str) -> None:
+    if figures is None:
+        out.left_out[f"stage {stage}"] = reason
+    else:
+        out.stages[stage] = figures
