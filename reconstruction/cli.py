@@ -25,7 +25,7 @@ a first run:
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the parser of all verbs."""
-    from reconstruction.commands import doctor, reconstruct, scenes
+    from reconstruction.commands import doctor, evaluate, reconstruct, scenes
 
     parser = argparse.ArgumentParser(
         prog="simrecon",
@@ -37,6 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     reconstruct.add_parser(verbs)
     scenes.add_parsers(verbs)
+    evaluate.add_parser(verbs)
     doctor.add_parser(verbs)
     return parser
 

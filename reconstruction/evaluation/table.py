@@ -1,0 +1,101 @@
+"""An evaluation as text for people: recall stands first, because leaving out what is hard must not pay."""
+
+from reconstruction.evaluation.evaluate import Evaluation
+
+# (metric, how it is shown, what it means); `better` is said in words where it is not plain.
+_ROWS: tuple[tuple[str, str, str], ...] = (
+    ("object_recall_25", "{:.2f}", "objects found, box IoU >= 0.25"),
+    ("object_recall_50", "{:.2f}", "objects found, box IoU >= 0.5"),
+    ("object_precision_25", "{:.2f}", "found objects that are real, IoU >= 0.25"),
+    ("object_precision_50", "{:.2f}", "found objects that are real, IoU >= 0.5"),
+    ("ate_cm", "{:.2f} cm", "camera error after alignment"),
+    ("rotation_median_deg", "{:.2f} deg", "camera rotation error, median"),
+    ("scale_error", "{:.1%}", "error of the metric scale"),
+    ("tilt_deg", "{:.2f} deg", "error of up"),
+    ("cd_cm", "{:.2f} cm", "Chamfer distance of the whole, visible part"),
+    ("f_5cm", "{:.1f} %", "F-score at 5 cm"),
+    ("nc", "{:.1f} %", "normal consistency"),
+    ("object_cd_cm", "{:.2f} cm", "Chamfer distance of complete objects, misses included"),
+    ("object_f_1cm", "{:.1f} %", "F-score at 1 cm of complete objects, misses included"),
+    ("matched_object_cd_cm", "{:.2f} cm", "the same without the misses"),
+    ("matched_object_f_1cm", "{:.1f} %", "the same without the misses"),
+    ("graph_f1", "{:.2f}", "relations, all objects"),
+    ("graph_f1_matched", "{:.2f}", "relations of the objects found"),
+    ("psnr_db", "{:.2f} dB", "assembled scene on kept-out frames"),
+    ("ssim", "{:.3f}", "the same"),
+    ("lpips", "{:.3f}", "the same, lower is better"),
+    ("musiq", "{:.1f}", "quality of its pictures without reference"),
+    ("coverage", "{:.1%}", "share of those frames that the scene covers"),
+    ("stable_rate", "{:.0%}", "movable objects that stay: < 2 cm and < 5 deg in 10 s"),
+    ("stable_rate_10cm_0.1rad", "{:.0%}", "... < 0.1 m and < 0.1 rad"),
+    ("stable_rate_5cm_drop_5deg", "{:.0%}", "... < 5 cm drop and < 5 deg"),
+    ("spawn_penetration_mm", "{:.2f} mm", "deepest overlap at the start"),
+    ("floating_rate", "{:.0%}", "movable objects that fall > 5 mm in the first 0.5 s"),
+    ("time_s", "{:.0f} s", "reconstruction"),
+    ("peak_memory_mb", "{:.0f} MB", "peak memory of its process tree"),
+)
+
+_STAGE_ROWS: tuple[tuple[str, str, str, str], ...] = (
+    ("poses", "registered_share", "{:.0%}", "frames registered"),
+    ("poses", "focal_error_percent", "{:.2f} %", "focal length error"),
+    ("depth", "median_rel", "{:.2%}", "median relative error"),
+    ("depth", "share_over_5_percent", "{:.1%}", "pixels off by more than 5 %"),
+    ("depth", "known_share", "{:.0%}", "pixels that have depth"),
+    ("depth", "measured_share", "{:.0%}", "... that is measured rather than completed"),
+    ("surface", "cd_cm", "{:.2f} cm", "Chamfer distance before objects are cut out"),
+    ("surface", "f_5cm", "{:.1f} %", "F-score at 5 cm"),
+    ("surface", "nc", "{:.1f} %", "normal consistency"),
+    ("surface", "depth_median_rel", "{:.2%}", "median relative depth error on kept-out frames"),
+    ("surface", "depth_share_over_5_percent", "{:.1%}", "pixels off by more than 5 %"),
+    ("gaussians", "psnr_db", "{:.2f} dB", "kept-out frames"),
+    ("gaussians", "depth_median_rel", "{:.2%}", "median relative depth error"),
+    ("assembly", "median_moved_cm", "{:.2f} cm", "objects moved by, median"),
+    ("assembly", "max_moved_cm", "{:.2f} cm", "objects moved by, at most"),
+)
+
+
+def as_table(evaluation: Evaluation) -> str:
+    """Lay an evaluation out as aligned text."""
+    lines = [f"{evaluation.scene}, revision {evaluation.revision}"]
+    for name, form, meaning in _ROWS:
+        value = evaluation.metrics.get(name)
+        if value is not None:
+            lines.append(f"  {name:<26} {form.format(value):>10}   {meaning}")
+        elif name in evaluation.left_out:
+            lines.append(f"  {name:<26} {'left out':>10}   {evaluation.left_out[name]}")
+    lines += _objects(evaluation) + _stages(evaluation)
+    known = {name for name, _, _ in _ROWS}
+    lines += [f"left out: {name}: {why}" for name, why in evaluation.left_out.items() if name not in known]
+    return "\n".join(lines)
+
+
+def _objects(evaluation: Evaluation) -> list[str]:
+    if not evaluation.objects:
+        return []
+    lines = ["objects"]
+    for item in evaluation.objects:
+        if item["match"] is None:
+            verdict = f"missed (best box IoU {item['box_iou']:.2f})"
+        else:
+            relation = {True: "right", False: "wrong", None: "none"}[item.get("relation_right")]
+            verdict = (
+                f"is {item['match']} ({item['found_label']}), box IoU {item['box_iou']:.2f}, "
+                f"cd {item['cd_cm']:.2f} cm, f {item['f_1cm']:.0f} %, relation {relation}"
+            )
+        lines.append(f"  {item['name']:<16} {verdict}")
+    lines += [f"  {'(not real)':<16} {item['id']} ({item['label']})" for item in evaluation.extra]
+    return lines
+
+
+def _stages(evaluation: Evaluation) -> list[str]:
+    lines = []
+    for stage, name, form, meaning in _STAGE_ROWS:
+        value = evaluation.stages.get(stage, {}).get(name)
+        if value is not None:
+            lines.append(f"  {stage:<10} {name:<26} {form.format(value):>10}   {meaning}")
+    for part, figures in (evaluation.stages.get("instances") or {}).items():
+        if figures:
+            lines.append(
+                f"  instances  {part:<26} {figures['mean_iou']:>10.2f}   mean IoU; found at 0.5: {figures['recall_50']:.2f}"
+            )
+    return ["stages", *lines] if lines else []
