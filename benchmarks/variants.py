@@ -1,0 +1,94 @@
+"""Variants: named sets of arguments for `simrecon reconstruct`. To add one, add it to VARIANTS."""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.captures import TRUTH_ORDER, Capture, Truth
+from registry.errors import UsageError
+
+GROUND_TRUTH = "{ground_truth}"  # stands for the capture's ground-truth folder in a variant's arguments
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to reconstruct a capture."""
+
+    name: str
+    arguments: tuple[str, ...]
+    meaning: str
+    needs: Truth = "none"  # the least truth that a capture must have for the variant to make sense
+
+    def applies_to(self, capture: Capture) -> bool:
+        """Tell whether the capture has the truth that the variant needs."""
+        return TRUTH_ORDER.index(capture.truth) >= TRUTH_ORDER.index(self.needs)
+
+    def arguments_for(self, capture: Capture) -> list[str]:
+        """Return the arguments with the capture's own paths in them."""
+        return [text.replace(GROUND_TRUTH, str(capture.ground_truth)) for text in self.arguments]
+
+
+def _oracle(stage: str, needs: Truth) -> Variant:
+    return Variant(
+        f"oracle-{stage}",
+        ("--oracle", stage, "--ground-truth", GROUND_TRUTH),
+        f"the truth in place of what the stage `{stage}` finds",
+        needs,
+    )
+
+
+VARIANTS: tuple[Variant, ...] = (
+    Variant("default", (), "the preset `default`"),
+    Variant("fast", ("--preset", "fast"), "the preset `fast`"),
+    Variant("quality", ("--preset", "quality"), "the preset `quality`"),
+    _oracle("poses", "cameras"),
+    _oracle("depth", "cameras"),
+    _oracle("world", "scene"),
+    _oracle("instances", "scene"),
+)
+BASELINE = "default"  # what the tables compare the other variants with
+
+
+def is_oracle(name: str) -> bool:
+    """Tell whether a variant of this name is given some of the truth."""
+    return name.startswith("oracle-")
+
+
+def choose_variants(names: Sequence[str], extra: Sequence[str]) -> list[Variant]:
+    """Return the named variants, then the ad hoc ones.
+
+    Args:
+        names: of VARIANTS.
+        extra: `name=arguments` each, for example `sharp=--set depth.side_px=640`.
+
+    Raises:
+        UsageError: a name is unknown, malformed or taken.
+    """
+    known = {variant.name: variant for variant in VARIANTS}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise UsageError(f"--variants {' '.join(unknown)}: not known; there are {', '.join(known)}")
+    chosen = {name: known[name] for name in names}
+    for text in extra:
+        name, equals, arguments = text.partition("=")
+        if not equals or not name.replace("-", "").replace("_", "").isalnum():
+            raise UsageError(
+                f'--variant {text}: expected name="arguments", for example sharp="--set depth.side_px=640"'
+            )
+        if name in known or name in chosen:
+            raise UsageError(f"--variant {name}: this name is taken; choose another")
+        words = tuple(shlex.split(arguments))
+        needs: Truth = "cameras" if any(GROUND_TRUTH in word for word in words) else "none"
+        chosen[name] = Variant(name, words, f"`{arguments.strip()}`", needs)
+    return list(chosen.values())
+
+
+def scene_id(variant: Variant) -> str:
+    """Return the id under which the variant's scene is registered."""
+    return variant.name.lower().replace("-", "_")
+
+
+def home_of(out: Path, capture: Capture) -> Path:
+    """Return the home of a capture's runs: one registry, and one work folder that all variants share."""
+    return out / capture.name / "home"
