@@ -12,7 +12,7 @@ import logging
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, fingerprint
 from reconstruction.config import PipelineConfig
@@ -32,6 +32,9 @@ from reconstruction.types import (
 )
 from registry import SceneRecord, SceneRegistry
 from registry.errors import UsageError
+
+if TYPE_CHECKING:
+    from reconstruction.oracle import Oracle
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +71,7 @@ class Run:
     config: PipelineConfig
     store: StageStore
     overrides: Overrides = field(default_factory=Overrides)
+    oracle: "Oracle | None" = None  # stages whose output the truth replaces, for measuring
     listener: StageListener = NO_PROGRESS
     results: dict[str, Any] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)
@@ -91,7 +95,10 @@ class Run:
     def _execute_stage(self, number: int, stage: Stage) -> None:
         config = getattr(self.config, stage.name)
         upstream = tuple(self.keys[name] for name in stage.needs) or (self.input_digest,)
-        key = fingerprint(stage.name, stage.module, (config, self.overrides.of_stage(stage.name)), upstream)
+        options = (config, self.overrides.of_stage(stage.name))
+        if self.oracle is not None and self.oracle.of_stage(stage.name):
+            options += (self.oracle.of_stage(stage.name),)
+        key = fingerprint(stage.name, stage.module, options, upstream)
         self.keys[stage.name] = key
         cached = self.store.has(number, stage.name, key)
         self.listener.begin_stage(stage.name, number, len(STAGES), cached)
@@ -122,6 +129,8 @@ class Run:
     def _compute(self, stage: Stage, config: Any, progress: Progress) -> Any:
         module = importlib.import_module(stage.module)
         done = self.results
+        if self.oracle is not None and stage.name in self.oracle.stages:
+            return self._ask_oracle(stage, config, progress)
         if stage.name == "frames":
             return module.load_frames(self.video, config, progress=progress)
         if stage.name == "poses":
@@ -149,6 +158,23 @@ class Run:
             posed, depth, done["surface"], done["instances"], config, progress=progress
         )
         return self.overrides.apply_to_assets(assets)
+
+    def _ask_oracle(self, stage: Stage, config: Any, progress: Progress) -> Any:
+        progress.note(f"{stage.name}: taken from the ground truth")
+        done = self.results
+        if stage.name == "poses":
+            scratch = self.store.scratch(stage.name)
+            try:
+                return self.oracle.poses(done["frames"], config, work_dir=scratch, progress=progress)
+            finally:
+                self.store.discard(scratch)
+        if stage.name == "depth":
+            from reconstruction.depth.estimate import sized_camera
+
+            return self.oracle.depth(done["poses"], sized_camera(done["poses"].camera, config.depth_side_px))
+        if stage.name == "world":
+            return self.oracle.world(done["poses"])
+        return self.oracle.instances(*self.in_world(), done["surface"])
 
     def in_world(self) -> tuple[PosedFrames, DepthMaps]:
         """Return the posed frames and depth maps in world space, in metres."""
@@ -204,6 +230,7 @@ def reconstruct(
             input's digest.
         config: options of every stage.
         overrides: the user's corrections.
+        oracle: stages that the ground truth replaces, to measure what they cost.
         require_stable: refuse to publish a scene in which an object does not stay put.
         keep_results: how many results of each stage stay in the work folder; more of them make going back and forth
             between several configs cheap.
@@ -232,6 +259,7 @@ def reconstruct(
             config or PipelineConfig(),
             StageStore(folder, keep_results),
             overrides or Overrides(),
+            oracle,
             listener,
             input_digest=digest,
             started=started,

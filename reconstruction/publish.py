@@ -224,12 +224,7 @@ def _report(run: "Run") -> dict:
             # Where `simrecon evaluate` and `report` find what the stages made, while the work folder is kept.
             "work": {"input_digest": run.input_digest, "stage_keys": dict(run.keys)},
         },
-        "backends": {
-            "poses": "pycolmap",
-            "depth": "plane-sweep",
-            "assets": "embedded",
-            "relations": "geometry",
-        },
+        "backends": _backends(run),
         "config": json.loads(canonical_json(run.config)),
         "overrides": run.overrides.entries,
         "notes": run.notes,
@@ -239,6 +234,19 @@ def _report(run: "Run") -> dict:
             "reprojection_error_px": float(posed.reprojection_error_px),
         },
     }
+
+
+def _backends(run: "Run") -> dict[str, str]:
+    """Say what computed each stage; a stage that the truth stood in for says so."""
+    backends = {
+        "poses": "pycolmap",
+        "depth": "plane-sweep",
+        "assets": "embedded",
+        "relations": "geometry",
+    }
+    if run.oracle is not None:
+        backends |= dict.fromkeys(run.oracle.stages, "ground-truth")
+    return backends
 
 
 def _versions() -> dict[str, str]:

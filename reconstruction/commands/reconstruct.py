@@ -73,6 +73,12 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--require-stable", action="store_true", help="refuse to publish a scene that does not rest"
     )
+    parser.add_argument(
+        "--oracle",
+        metavar="STAGES",
+        help="for measuring: take poses, depth, world, instances (comma separated) from the ground truth",
+    )
+    parser.add_argument("--ground-truth", type=Path, metavar="DIR", help="the folder that --oracle reads")
     parser.add_argument("--quiet", action="store_true", help="no progress, only the result")
     add_common(parser)
     parser.set_defaults(run=run)
@@ -109,12 +115,29 @@ def run(arguments: argparse.Namespace) -> int:
             work_dir=arguments.work_dir,
             config=_config(arguments),
             overrides=Overrides.load(arguments.overrides) if arguments.overrides else None,
+            oracle=_oracle(arguments),
             require_stable=arguments.require_stable,
             keep_results=arguments.keep_results,
             listener=listener,
         )
     _print_result(result, arguments)
     return 0
+
+
+def _oracle(arguments: argparse.Namespace) -> object | None:
+    """Read the truth that stands in for stages; without --oracle the truth is never touched."""
+    from registry.errors import UsageError
+
+    if not arguments.oracle:
+        if arguments.ground_truth:
+            raise UsageError(
+                "--ground-truth is read by --oracle only; to measure a scene use: simrecon evaluate"
+            )
+        return None
+    from reconstruction.oracle import Oracle
+
+    stages = [name.strip() for name in arguments.oracle.split(",") if name.strip()]
+    return Oracle.load(stages, arguments.ground_truth)
 
 
 def _check_device(device: str) -> None:

@@ -13,7 +13,8 @@ from registry.errors import InputError
 from registry.geometry import invert_rigid
 
 
-def _sized(camera: Camera, side: int) -> Camera:
+def sized_camera(camera: Camera, side: int) -> Camera:
+    """Return the camera at a resolution whose longer side is at most `side` pixels."""
     scale = min(1.0, side / max(camera.width, camera.height))
     return camera.resized(max(16, round(camera.width * scale)), max(16, round(camera.height * scale)))
 
@@ -72,7 +73,7 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
     from reconstruction.depth.sgm import aggregate, winner
     from reconstruction.depth.sweep import sweep_costs
 
-    small = _sized(camera, config.sweep_side_px)
+    small = sized_camera(camera, config.sweep_side_px)
     fine_gray, small_gray = _gray(posed.images, camera), _gray(posed.images, small)
     shape = (camera.height, camera.width)
     rho_all = np.zeros((len(fine_gray), *shape), np.float32)
@@ -152,7 +153,7 @@ def estimate_depth(posed: PosedFrames, config: DepthConfig, *, progress: Progres
         config: Settings.
         progress: Where steps and decisions are reported.
     """
-    camera = _sized(posed.camera, config.depth_side_px)
+    camera = sized_camera(posed.camera, config.depth_side_px)
     plan = plan_views(posed, config)
     workers = _Workers(config.threads)
     rho, score = _measure(posed, camera, plan, config, workers, progress)
