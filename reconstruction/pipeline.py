@@ -216,6 +216,7 @@ def reconstruct(
     work_dir: Path | None = None,
     config: PipelineConfig | None = None,
     overrides: Overrides | None = None,
+    oracle: "Oracle | None" = None,
     require_stable: bool = False,
     keep_results: int = KEPT_PER_STAGE,
     listener: StageListener = NO_PROGRESS,
