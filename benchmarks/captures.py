@@ -27,10 +27,14 @@ class Capture:
     def digest(self) -> str:
         """Digest what goes into the figures: the input, and the cameras and entities of the truth."""
         digest = hashlib.sha256(digest_input(self.source).encode())
-        for name in ("scene.json", "cameras.json"):
-            file = self.ground_truth / name if self.ground_truth else None
-            if file is not None and file.is_file():
-                digest.update(name.encode() + b"\0" + file.read_bytes())
+        if self.ground_truth:
+            for name in ("scene.json", "cameras.json"):
+                file = self.ground_truth / name
+                if file.is_file():
+                    digest.update(name.encode() + b"\0" + file.read_bytes())
+            # Meshes and images of the truth by name and size: reading them all takes long.
+            for file in sorted(p for p in self.ground_truth.rglob("*") if p.is_file()):
+                digest.update(f"{file.relative_to(self.ground_truth)} {file.stat().st_size}\n".encode())
         return digest.hexdigest()[:16]
 
 

@@ -9,6 +9,12 @@ from typing import Literal
 from registry.errors import UsageError
 
 SCHEMA = "simrecon.benchmark/1"
+_GROUPS = {  # as `left_out` of an evaluation names them
+    "cameras": ("ate_cm", "scale_error", "tilt_deg"),
+    "geometry": ("cd_cm", "f_5cm", "nc"),
+    "objects": ("object_",),
+    "graph": ("graph_",),
+}
 Status = Literal["done", "reconstruct failed", "evaluate failed"]
 
 
@@ -44,7 +50,9 @@ class Result:
     @property
     def metrics(self) -> dict[str, float | None]:
         """The figures by name; time and memory are the bundle's own where the evaluation does not repeat them."""
-        found = dict(self.evaluation.get("metrics", {}))
+        found = dict(self.evaluation.get("metrics", {})) | _flat_numbers(
+            "stages", self.evaluation.get("stages", {})
+        )
         timings = self.report.get("timings_s", {})
         # What the stages cost when they were computed, also where this run took them from the cache.
         if timings:
@@ -63,7 +71,24 @@ class Result:
         if self.failed:
             return f"{self.status}, exit code {self.exit_code}: {last_line(self.error)}"
         left_out = self.evaluation.get("left_out", {})
-        return str(left_out.get(metric, f"the evaluation has no {metric}"))
+        # The evaluation names the figure, its stage, or the whole group that it belongs to.
+        stage = f"stage {metric.split('.')[1]}" if metric.startswith("stages.") else ""
+        group = next((name for name, keys in _GROUPS.items() if metric.startswith(keys)), "")
+        for key, reason in left_out.items():
+            if key in (metric, stage) or (group and group in key.split(", ")):
+                return str(reason)
+        return f"the evaluation has no {metric}"
+
+
+def _flat_numbers(prefix: str, tree: dict) -> dict[str, float | None]:
+    """Return the numbers of nested dictionaries by dotted name."""
+    found: dict[str, float | None] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            found |= _flat_numbers(f"{prefix}.{key}", value)
+        elif isinstance(value, (int, float)):
+            found[f"{prefix}.{key}"] = value
+    return found
 
 
 def last_line(text: str) -> str:

@@ -29,23 +29,21 @@ class Variant:
         return [text.replace(GROUND_TRUTH, str(capture.ground_truth)) for text in self.arguments]
 
 
-def _oracle(stage: str, needs: Truth) -> Variant:
-    return Variant(
-        f"oracle-{stage}",
-        ("--oracle", stage, "--ground-truth", GROUND_TRUTH),
-        f"the truth in place of what the stage `{stage}` finds",
-        needs,
-    )
+def _oracle(name: str, needs: Truth, *stages: str) -> Variant:
+    found = f"stage `{stages[0]}` finds" if len(stages) == 1 else f"stages {', '.join(stages)} find"
+    arguments = ("--oracle", ",".join(stages), "--ground-truth", GROUND_TRUTH)
+    return Variant(f"oracle-{name}", arguments, f"the truth in place of what the {found}", needs)
 
 
 VARIANTS: tuple[Variant, ...] = (
     Variant("default", (), "the preset `default`"),
     Variant("fast", ("--preset", "fast"), "the preset `fast`"),
     Variant("quality", ("--preset", "quality"), "the preset `quality`"),
-    _oracle("poses", "cameras"),
-    _oracle("depth", "cameras"),
-    _oracle("world", "scene"),
-    _oracle("instances", "scene"),
+    _oracle("poses", "cameras", "poses"),
+    _oracle("depth", "scene", "depth"),
+    _oracle("world", "scene", "world"),
+    _oracle("instances", "scene", "instances"),
+    _oracle("all", "scene", "poses", "depth", "world", "instances"),
 )
 BASELINE = "default"  # what the tables compare the other variants with
 

@@ -15,10 +15,10 @@ METRICS = {
     "object_recall_50": 0.5,
     "object_precision_50": 0.4,
     "cd_cm": 3.21,
-    "f_5cm": 0.654,
-    "nc": 0.876,
+    "f_5cm": 65.4,
+    "nc": 87.6,
     "object_cd_cm": 5.4,
-    "object_f_1cm": 0.21,
+    "object_f_1cm": 21.0,
     "graph_f1": 0.7,
     "psnr_db": 20.5,
     "ssim": 0.75,
@@ -96,10 +96,10 @@ def test_means_are_over_captures_and_show_every_figure():
         "0.50",
         "0.40",
         "2.21",
-        "0.654",
-        "0.876",
+        "65.4",
+        "87.6",
         "5.40",
-        "0.210",
+        "21.0",
         "0.70",
     ]
     cost = rows(page, "### Rendering, cameras, cost", "default")[0]
@@ -154,7 +154,7 @@ def test_oracles_are_differences_to_the_default_on_the_same_captures():
     page = render_page(results, CODE)
     section = "## What each stage costs"
     row = rows(page, section, "oracle-poses")[0]
-    assert row[1:6] == ["1", "+0.10", "+0.00", "-1.00", "+0.000"]
+    assert row[1:6] == ["1", "+0.10", "+0.00", "-1.00", "+0.0"]
     absolute = rows(page, section, "default (absolute)")[0]
     assert absolute[4] == "3.00"
 
@@ -182,7 +182,7 @@ def test_every_row_leads_to_machine_commit_and_date_and_old_code_is_marked():
 def test_the_papers_rows_are_marked_as_other_data_and_hardware():
     page = render_page([made("a")], CODE)
     row = rows(page, "### The paper's figures", "SimRecon (the paper)")[0]
-    assert row == ["SimRecon (the paper)", "4.34", "0.626", "0.874", "24.43", "0.924", "0.153", "1260"]
+    assert row == ["SimRecon (the paper)", "4.34", "62.65", "87.37", "24.43", "0.924", "0.153", "1260"]
     part = page[page.index("### The paper's figures") : page.index("## What each stage")]
     assert "other data" in part
     assert "other hardware" in part
