@@ -1,0 +1,54 @@
+"""`simrecon report`: one HTML page about a scene, to look at and to send."""
+
+import argparse
+from pathlib import Path
+
+
+def add_parser(verbs: argparse._SubParsersAction) -> None:
+    """Register the verb."""
+    from reconstruction.cli import add_common
+
+    parser = verbs.add_parser(
+        "report",
+        help="one HTML page that shows what every stage made, what it cost and where it is wrong",
+        description="Write one self-contained HTML page about a scene: frames, depth, surface, instances, objects, "
+        "scene graph, assembly, physics and timings; with --ground-truth also what is wrong, and by how much.",
+    )
+    parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.html", help="where to write it (default: SCENE.html)"
+    )
+    parser.add_argument(
+        "--ground-truth",
+        type=Path,
+        metavar="DIR",
+        help="the truth of the video (docs/evaluation.md); adds error maps",
+    )
+    parser.add_argument(
+        "--work-dir",
+        type=Path,
+        metavar="DIR",
+        help="the folder that `simrecon reconstruct --work-dir` was given, if it was",
+    )
+    add_common(parser, json=False)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the page."""
+    from reconstruction.evaluation.stage_results import StageResults
+    from reconstruction.report.page import build_page
+    from registry import SceneRegistry
+    from registry.errors import UsageError
+
+    out = arguments.out or Path(f"{arguments.scene}.html")
+    if out.is_dir() or not out.parent.is_dir():
+        raise UsageError(f"--out {out}: give the name of a file in a folder that exists")
+    registry = SceneRegistry(arguments.registry)
+    bundle = registry.load(arguments.scene)
+    stages = StageResults.find(bundle, registry.root, arguments.work_dir)
+    out.write_text(build_page(bundle, stages, arguments.ground_truth), encoding="utf-8")
+    for stage, reason in stages.missing.items():
+        print(f"left out: {stage}: {reason}")
+    print(f"{out} ({out.stat().st_size / 1e6:.1f} MB)")
+    return 0

@@ -1,0 +1,88 @@
+"""The evaluation as a section of the report."""
+
+from typing import Any
+
+from reconstruction.report.blocks import Block, Cell, Details, Section, Table, Text, Tile, Tiles
+from reconstruction.report.collect import Gathered
+
+# Metric, name, unit, factor, digits: what a reader looks at first.
+_HEADLINE = (
+    ("ate_cm", "camera error", "cm", 1, 1),
+    ("scale_error", "scale error", "%", 100, 1),
+    ("cd_cm", "Chamfer", "cm", 1, 1),
+    ("f_5cm", "F-score, 5 cm", "%", 1, 0),
+    ("object_recall_25", "objects found, IoU 0.25", "%", 100, 0),
+    ("object_precision_25", "object precision", "%", 100, 0),
+    ("object_cd_cm", "object Chamfer", "cm", 1, 1),
+    ("object_f_1cm", "object F-score, 1 cm", "%", 1, 0),
+    ("graph_f1", "graph F1", "", 1, 2),
+    ("psnr_db", "PSNR", "dB", 1, 1),
+)
+
+
+def truth_section(g: Gathered) -> Section | None:
+    """Return the metrics of CONTRACT section 4 for this scene; None where there is no truth."""
+    if g.evaluation is None:
+        return None
+    metrics = g.evaluation["metrics"]
+    tiles = [
+        Tile(f"{factor * metrics[key]:.{digits}f} {unit}".strip(), name)
+        for key, name, unit, factor, digits in _HEADLINE
+        if metrics.get(key) is not None
+    ]
+    blocks: list[Block] = [Tiles(tiles)]
+    if g.evaluation["objects"]:
+        blocks.append(_objects_table(g))
+    extra = [f"{item['label']} {item['id']}" for item in g.evaluation["extra"]]
+    if extra:
+        blocks.append(Text(f"Found, but no match of an evaluated object: {', '.join(extra)}."))
+    blocks.append(_stages_table(g.evaluation["stages"]))
+    lines = [f"{key} = {_number(value)}" for key, value in metrics.items() if value is not None]
+    blocks.append(Details("All metrics", "\n".join(lines)))
+    left = g.evaluation["left_out"]
+    if left:
+        blocks += [Text(f"{name} left out: {why}.", left_out=True) for name, why in sorted(left.items())]
+    return Section("truth", "Against the truth", blocks, "After aligning the cameras with the true ones.")
+
+
+def _objects_table(g: Gathered) -> Table:
+    rows = []
+    for item in g.evaluation["objects"]:
+        match, right = item["match"], item.get("relation_right")
+        rows.append(
+            [
+                Cell(item["name"].replace("_", " ")),
+                Cell("missed", "bad") if match is None else Cell(g.names[match]),
+                Cell(f"{item['box_iou']:.2f}", "" if item["box_iou"] >= 0.5 else "warn"),
+                Cell(f"{item['cd_cm']:.1f} cm"),
+                Cell(f"{item['f_1cm']:.0f} %"),
+                Cell("–")
+                if right is None
+                else Cell("right" if right else "wrong", "good" if right else "bad"),
+            ]
+        )
+    columns = ["true object", "found as", "box IoU", "Chamfer", "F 1 cm", "relation"]
+    return Table(columns, rows, numeric=[2, 3, 4])
+
+
+def _stages_table(stages: dict[str, Any]) -> Table:
+    rows = []
+    for stage, figures in stages.items():
+        for name, value in _flat(figures):
+            rows.append([Cell(stage), Cell(name.replace("_", " ")), Cell(value)])
+            stage = ""  # named once
+    return Table(["stage", "figure", "value"], rows, numeric=[2])
+
+
+def _flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    out = []
+    for name, value in figures.items():
+        if isinstance(value, dict):
+            out += _flat(value, f"{prefix}{name}: ")
+        elif isinstance(value, bool | int | float | str):
+            out.append((f"{prefix}{name}", _number(value)))
+    return out
+
+
+def _number(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,150 @@
+"""What a report page is made of. The template has one macro for each kind of block."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture, inline."""
+
+    src: str  # data URI
+    width: int
+    height: int
+    alt: str
+    caption: str = ""
+    overlay: str = ""  # SVG that is drawn over it, edge to edge
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures side by side; `columns` on a wide screen, fewer on a phone."""
+
+    kind: ClassVar[str] = "pictures"
+    items: list[Picture]
+    columns: int
+    heads: list[str] = field(default_factory=list)  # over the columns
+    phone_columns: int = 2
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Legend:
+    """What the colors of a picture mean."""
+
+    kind: ClassVar[str] = "legend"
+    gradient: str  # CSS
+    low: str
+    high: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table; `status` is "", "good", "bad" or "warn"."""
+
+    text: str
+    status: str = ""
+    swatch: str = ""  # CSS color
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; the columns named in `numeric` are set flush right."""
+
+    kind: ClassVar[str] = "table"
+    columns: list[str]
+    rows: list[list[Cell]]
+    numeric: list[int] = field(default_factory=list)
+    caption: str = ""
+    helps: dict[int, str] = field(default_factory=dict)  # column -> what it means
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One figure that is seen at a glance."""
+
+    value: str
+    label: str
+    status: str = ""
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Figures side by side."""
+
+    kind: ClassVar[str] = "tiles"
+    items: list[Tile]
+
+
+@dataclass(frozen=True)
+class Plots:
+    """SVG plots side by side; they scroll on narrow screens where `wide`."""
+
+    kind: ClassVar[str] = "plots"
+    svgs: list[str]
+    columns: int = 1
+    wide: bool = False
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Text:
+    """A line of text; `left_out` ones say what is not shown and why."""
+
+    kind: ClassVar[str] = "text"
+    text: str
+    left_out: bool = False
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A list of lines."""
+
+    kind: ClassVar[str] = "listing"
+    lines: list[str]
+
+
+@dataclass(frozen=True)
+class Details:
+    """Preformatted text that is folded away."""
+
+    kind: ClassVar[str] = "details"
+    summary: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Card:
+    """One object: its turntable, facts and views."""
+
+    id: int
+    title: str
+    color: str
+    turntable: Picture
+    angles: int
+    facts: list[tuple[str, str]]
+    views: list[Picture]
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class Cards:
+    """All objects."""
+
+    kind: ClassVar[str] = "cards"
+    items: list[Card]
+
+
+Block = Pictures | Legend | Table | Tiles | Plots | Text | Listing | Details | Cards
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page with an entry in its table of contents."""
+
+    id: str
+    title: str
+    blocks: list[Block]
+    lead: str = ""
