@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit, prange
 
 from reconstruction.rasterize import rasterize_mesh
-from reconstruction.synthetic.room import EAST_M, NORTH_M, SOUTH_M, WEST_M, Room
+from reconstruction.synthetic.room import Room
 from reconstruction.synthetic.textures import Texture
 from reconstruction.types import Camera
 
@@ -51,14 +51,15 @@ def _pack_textures(looks: list[Texture]) -> tuple[np.ndarray, np.ndarray, np.nda
     return np.concatenate(chunks), levels, sizes
 
 
-def _lamps() -> list[tuple[np.ndarray, np.ndarray, float]]:
+def _lamps(extent: tuple[float, float, float, float]) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Return (position, color, weight): a soft warm lamp, and cool light spread over the ceiling."""
+    west, east, south, north = extent
     lamps = []
     for dx, dy in [(0, 0), (0.16, 0.05), (-0.12, 0.14), (-0.06, -0.17), (0.12, -0.13)]:
         position = np.array([-1.0 + dx, 0.3 + dy, _LAMP_HEIGHT_M - 0.2])
         lamps.append((position, np.array([1.06, 1.0, 0.90]), 0.60 / 5))
-    across = np.linspace(WEST_M + 0.4, EAST_M - 0.4, 4)
-    along = np.linspace(SOUTH_M + 0.4, NORTH_M - 0.4, 4)
+    across = np.linspace(west + 0.4, east - 0.4, 4)
+    along = np.linspace(south + 0.4, north - 0.4, 4)
     for x in across:
         for y in along:
             lamps.append((np.array([x, y, _LAMP_HEIGHT_M + 0.02]), np.array([0.95, 1.0, 1.05]), 0.50 / 16))
@@ -96,12 +97,14 @@ def _add_light(points, normals, lamp, weight, focal, size, depth, bias, light): 
             light[i, channel] += weight[channel] * amount
 
 
-def _bake_light(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, shadow_px: int) -> np.ndarray:
+def _bake_light(
+    vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, lamps: list, shadow_px: int
+) -> np.ndarray:
     focal = shadow_px / 2 / np.tan(np.radians(62))
     camera = Camera(shadow_px, shadow_px, focal, focal, shadow_px / 2, shadow_px / 2)
     # A little light from everywhere, more from above, stands for all further bounces.
     light = np.repeat((0.16 + 0.06 * normals[:, 2:3]), 3, axis=1)
-    for position, color, weight in _lamps():
+    for position, color, weight in lamps:
         world_from_camera = np.eye(4)
         world_from_camera[:3, :3] = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1.0]])
         world_from_camera[:3, 3] = position
@@ -130,7 +133,7 @@ def prepare(room: Room, *, shadow_px: int = 768) -> FilmSet:
         vertices=vertices,
         faces=faces,
         uvs_m=np.concatenate([p.uvs_m for _, p in patches]).astype(np.float32),
-        light=_bake_light(vertices, normals, faces, shadow_px),
+        light=_bake_light(vertices, normals, faces, _lamps(room.extent), shadow_px),
         face_texture=np.repeat(np.array([number_of[p.texture] for _, p in patches], np.int32), counts),
         face_entity=np.repeat(np.array([i for i, _ in patches], np.uint16), counts),
         face_normal=face_normal.astype(np.float32),

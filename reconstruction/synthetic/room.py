@@ -35,6 +35,7 @@ class Entity:
     world_from_object: np.ndarray  # float64 (4, 4)
     solids: tuple[Solid, ...]  # coarse closed parts in world space
     patches: tuple[Patch, ...]  # fine textured surface in world space, for drawing
+    pieces: tuple[np.ndarray, ...] = ()  # convex (v, 3), world space; set where a solid is hollow
 
     def mesh(self):
         """Return the closed outer surface in world space as a `trimesh.Trimesh` (union of the parts)."""
@@ -58,6 +59,7 @@ class Room:
 
     entities: tuple[Entity, ...]
     textures: dict[str, Texture]
+    extent: tuple[float, float, float, float] = (WEST_M, EAST_M, SOUTH_M, NORTH_M)
 
     @property
     def base(self) -> tuple[Entity, ...]:
