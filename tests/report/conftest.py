@@ -1,0 +1,136 @@
+"""A small filmed room taken through the stages that make pictures, published, with its truth beside it."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reconstruction.assembly import AssemblyConfig, assemble
+from reconstruction.assets import AssetsConfig, build_assets
+from reconstruction.cache import StageStore
+from reconstruction.config import PipelineConfig
+from reconstruction.evaluation.stage_results import StageResults
+from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.pipeline import STAGES, Run
+from reconstruction.profiling import Usage
+from reconstruction.progress import NO_PROGRESS
+from reconstruction.publish import publish_scene
+from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
+from reconstruction.surface import SurfaceConfig, fuse_surface
+from reconstruction.types import ScaleEstimate, WorldFrame
+from registry import SceneBundle, SceneRegistry
+
+SCENE = "small_room"
+SFM_SCALE = 0.5  # sfm units per metre: what is shown must be in metres all the same
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """A published scene, its stage results and its truth on disk."""
+
+    home: Path
+    truth: Path
+
+    @property
+    def registry(self) -> Path:
+        """The registry's root."""
+        return self.home / "registry"
+
+    def open(self) -> tuple[SceneBundle, StageResults]:
+        """Return the bundle and its stage results, freshly read."""
+        bundle = SceneRegistry(self.registry).load(SCENE)
+        return bundle, StageResults.find(bundle, self.registry)
+
+
+@pytest.fixture(scope="session")
+def reconstructed(small_capture, tmp_path_factory) -> Reconstructed:
+    """The generated room with true cameras and depth; everything after them is computed, coarsely."""
+    home = tmp_path_factory.mktemp("report")
+    sfm_from_world = np.diag([SFM_SCALE, SFM_SCALE, SFM_SCALE, 1.0])
+    posed, depth = small_capture.in_sfm_space(sfm_from_world)
+    world = WorldFrame(
+        np.linalg.inv(sfm_from_world),
+        ScaleEstimate("marker", 0.02, "a test said so"),
+        "cameras",
+        0.5,
+        True,
+        True,
+    )
+    surface = fuse_surface(
+        small_capture.posed, small_capture.depth, SurfaceConfig(voxel_size_m=0.016, space_voxel_m=0.04)
+    )
+    found = find_instances(
+        small_capture.posed, small_capture.depth, surface, InstancesConfig(), progress=NO_PROGRESS
+    )
+    coarse = AssetsConfig(
+        cells_along_longest=32, max_voxels=100_000, texture_max_px=128, texture_frames=4, base_texel_m=0.04
+    )
+    assets = build_assets(small_capture.posed, small_capture.depth, surface, found, coarse)
+    graph = infer_scene_graph(assets, SceneGraphConfig())
+    results = {
+        "frames": small_capture.frame_set(),
+        "poses": posed,
+        "depth": depth,
+        "world": world,
+        "surface": surface,
+        "instances": found,
+        "assets": assets,
+        "scene_graph": graph,
+        "assembly": assemble(assets, graph, AssemblyConfig()),
+    }
+    publish(home, results, PipelineConfig(surface=SurfaceConfig(voxel_size_m=0.016)))
+    write_truth(small_capture, home / "truth")
+    return Reconstructed(home, home / "truth")
+
+
+def publish(home: Path, results: dict, config: PipelineConfig) -> None:
+    """Keep stage results as a run would, and publish the scene made of them."""
+    digest = results["poses"].source.sha256
+    store = StageStore(home / "work" / digest[:16])
+    run = Run(Path("video.mp4"), config, store, input_digest=digest, results=results)
+    for number, stage in enumerate(STAGES, start=1):
+        key = f"{number:016x}"
+        usage = Usage(wall_s=number * 1.5, cpu_s=number * 2.0, peak_memory_mb=100.0 * number)
+        store.save(results[stage.name], number, stage.name, key, {"usage": asdict(usage)})
+        run.keys[stage.name], run.usage[stage.name] = key, usage
+    run.notes.append("depth: <b>a note</b> & more")
+    publish_scene(run, SceneRegistry(home / "registry", create=True), SCENE, require_stable=False)
+
+
+def write_truth(capture, folder: Path) -> None:
+    """Write the truth as CONTRACT section 3 has it, without images."""
+    (folder / "meshes").mkdir(parents=True)
+    names = {entity.id: entity.name for entity in capture.entities}
+    entities = []
+    for entity in capture.entities:
+        entity.mesh().export(folder / "meshes" / f"{entity.name}.ply")
+        seen = int((capture.id_maps == entity.id).sum())
+        entities.append(
+            {
+                "id": entity.id,
+                "name": entity.name,
+                "label": entity.label,
+                "base": entity.base,
+                "mesh": f"meshes/{entity.name}.ply",
+                "relation": entity.relation,
+                "parent": names.get(entity.parent),
+                "fixed": entity.fixed,
+                "visible_pixels": seen,
+            }
+        )
+    p = capture.posed
+    poses = {
+        **dict(zip(p.indices.tolist(), p.world_from_camera)),
+        **dict(zip(p.held_out_indices.tolist(), p.held_out_world_from_camera)),
+    }
+    c = p.camera
+    scene = {
+        "width": c.width,
+        "height": c.height,
+        "intrinsics": {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy},
+        "frames": [{"index": i, "world_from_camera": pose.tolist()} for i, pose in sorted(poses.items())],
+        "entities": entities,
+    }
+    (folder / "scene.json").write_text(json.dumps(scene))
