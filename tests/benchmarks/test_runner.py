@@ -13,7 +13,10 @@ import pytest
 
 from benchmarks.results import load_result, load_results
 from benchmarks.run import main, run_command
-from reconstruction.synthetic.videos import standard_film, write_not_a_video, write_video
+from reconstruction.synthetic.capture import write_ground_truth
+from reconstruction.synthetic.film import film_room, handheld_path, phone_camera, prepare
+from reconstruction.synthetic.room import build_room
+from reconstruction.synthetic.videos import write_not_a_video, write_video
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -119,10 +122,22 @@ def test_the_last_lines_of_a_failed_command_are_kept(tmp_path):
     assert run_command([sys.executable, "-c", "print(1)"], tmp_path, tmp_path / "log", 60.0) == (0, "")
 
 
+def _film_with_truth(folder: Path) -> None:
+    """Write a short film of a generated room as a capture with full ground truth."""
+    folder.mkdir(parents=True)
+    room, camera, path = (
+        build_room(0, step_m=0.08, density=0.5),
+        phone_camera(320, 240),
+        handheld_path(96, seed=0),
+    )
+    film_set = prepare(room, shadow_px=256)
+    write_video(folder / "video.mp4", film_room(film_set, camera, path, None, seed=0, supersample=1))
+    write_ground_truth(folder / "ground_truth", room, film_set, camera, path, 12.0)
+
+
 @pytest.mark.slow
 def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
-    (tmp_path / "captures" / "room").mkdir(parents=True)
-    write_video(tmp_path / "captures" / "room" / "video.mp4", standard_film())
+    _film_with_truth(tmp_path / "captures" / "room")
     out, page = tmp_path / "out", tmp_path / "page.md"
     line = [
         sys.executable,
@@ -158,6 +173,9 @@ def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
     assert result.metrics["stable_rate"] is not None
     assert result.metrics["psnr_db"] > 10
     assert 0 < result.metrics["registered_share"] <= 1
+    assert result.metrics["object_recall_25"] > 0.2
+    assert result.metrics["ate_cm"] < 5
+    assert result.metrics["stages.depth.median_rel"] < 0.1
     assert result.metrics["time_s"] == pytest.approx(sum(result.report["timings_s"].values()))
     assert result.metrics["peak_memory_mb"] > 100
-    assert "| room | fast | r1 |" in page.read_text()
+    assert "### room" in page.read_text()
