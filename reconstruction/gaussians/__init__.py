@@ -1,0 +1,29 @@
+"""Posed frames and depth maps -> 2D Gaussians (Huang et al. 2024), fitted on the CPU or with gsplat.
+
+`import reconstruction.gaussians` is light; what needs a compiler is imported when it is first used.
+"""
+
+from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig
+from reconstruction.gaussians.evaluate import GaussiansEvaluation, evaluate_gaussians
+from reconstruction.gaussians.fit import fit_gaussians
+from reconstruction.gaussians.model import Gaussians
+from reconstruction.gaussians.ply import read_ply, write_ply
+from reconstruction.gaussians.rasterizer import RasterSettings
+from reconstruction.gaussians.rendering import Render, render_gaussians
+
+VERSION = 1
+
+__all__ = [
+    "GAUSSIANS_PRESETS",
+    "VERSION",
+    "Gaussians",
+    "GaussiansConfig",
+    "GaussiansEvaluation",
+    "RasterSettings",
+    "Render",
+    "evaluate_gaussians",
+    "fit_gaussians",
+    "read_ply",
+    "render_gaussians",
+    "write_ply",
+]

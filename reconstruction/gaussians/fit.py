@@ -1,0 +1,209 @@
+"""Posed frames and depth maps -> Gaussians: the training loop.
+
+One frame a step, in a seeded random order; small images first. Everything that counts in meters is relative to the
+scene's median depth, so that the result does not depend on the scale of the input.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from reconstruction.gaussians.backends import Backend, load_backend
+from reconstruction.gaussians.config import GaussiansConfig
+from reconstruction.gaussians.holes import fill_holes
+from reconstruction.gaussians.losses import FrameTarget, weights_of
+from reconstruction.gaussians.model import Gaussians, from_packed
+from reconstruction.gaussians.optimizer import Adam, SplatState, prune, rates_of, split
+from reconstruction.gaussians.rasterizer import RasterSettings
+from reconstruction.gaussians.seeding import seed_from_depth
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.types import DepthMaps, PosedFrames
+from registry.errors import InputError
+
+_REPORT_EVERY = 10
+_EXPOSURE_PULL = 1e-3  # towards gain 1 and bias 0, which colors and exposures leave open together
+
+
+@dataclass
+class _Cameras:
+    """What is optimized per frame."""
+
+    gain: np.ndarray  # (k, 3)
+    bias: np.ndarray  # (k, 3)
+    poses: np.ndarray  # (k, 4, 4)
+    adam_exposure: Adam
+    adam_pose: Adam
+
+
+def median_depth_of(depth: DepthMaps) -> float:
+    """Return the median known depth, the unit of everything that should not depend on scale."""
+    stride = max(1, len(depth.depth) // 16)
+    known = np.asarray(depth.depth[::stride])[np.asarray(depth.confidence[::stride]) > 0]
+    if len(known) == 0:
+        raise InputError("gaussians: no depth map has a known pixel; nothing to fit to")
+    return float(np.median(known))
+
+
+def settings_of(config: GaussiansConfig, median_depth: float) -> RasterSettings:
+    """Return the rasterizer's settings for a scene of a certain size."""
+    return RasterSettings(
+        sigma_cutoff=config.sigma_cutoff,
+        transmittance_stop=config.transmittance_stop,
+        near=0.02 * median_depth,
+        reference_depth=median_depth,
+    )
+
+
+def make_target(posed: PosedFrames, depth: DepthMaps, row: int, side: int, completed: float) -> FrameTarget:
+    """Return frame `row` with its longer side at most `side` pixels, and its depth at the same pixels."""
+    full = posed.camera
+    scale = min(1.0, side / max(full.width, full.height))
+    width, height = round(full.width * scale), round(full.height * scale)
+    image = cv2.resize(np.asarray(posed.images[row]), (width, height), interpolation=cv2.INTER_AREA)
+    # Depth is never mixed across edges: the nearest pixel stands for the new one.
+    nearest = {"dsize": (width, height), "interpolation": cv2.INTER_NEAREST}
+    z = cv2.resize(np.asarray(depth.depth[row]), **nearest)
+    confidence = cv2.resize(np.asarray(depth.confidence[row]), **nearest)
+    weight = np.choose(np.minimum(confidence, 2), [0.0, completed, 1.0]).astype(np.float32) * (z > 0)
+    return FrameTarget(full.resized(width, height), image.astype(np.float32) / 255, z, weight)
+
+
+def fit_gaussians(
+    posed: PosedFrames, depth: DepthMaps, config: GaussiansConfig, *, progress: Progress = NO_PROGRESS
+) -> Gaussians:
+    """Fit 2D Gaussians to frames and depth maps.
+
+    Args:
+        posed: Keyframes with cameras, in any space; kept-out frames are not looked at.
+        depth: One depth map per keyframe, in the same units.
+        config: Settings; the result is the same for the same settings and seed.
+        progress: Told of steps and of what was decided.
+
+    Returns:
+        The Gaussians with the exposures (and cameras) of the keyframes.
+
+    Raises:
+        InputError: there is no usable depth.
+        EnvironmentMissing: the backend's needs are not met.
+    """
+    backend = load_backend(config.backend)
+    unit = median_depth_of(depth)
+    settings = settings_of(config, unit)
+    progress.start(config.iterations, "fitting Gaussians")
+    seeds = seed_from_depth(
+        posed, depth, int(config.seed_share * config.max_gaussians), config.initial_opacity
+    )
+    state = SplatState.start(seeds)
+    frames = len(posed.images)
+    cameras = _Cameras(
+        np.ones((frames, 3)), np.zeros((frames, 3)), np.array(posed.world_from_camera, np.float64),
+        Adam((frames, 6)), Adam((frames, 6)),
+    )  # fmt: skip
+    rng = np.random.default_rng(config.seed)
+    coarse_until = round(config.coarse_share * config.iterations)
+    added = 0
+    order: list[int] = []
+    targets: dict[int, FrameTarget] = {}
+    for step in range(config.iterations):
+        side = config.coarse_side_px if step < coarse_until else config.side_px
+        if step in (0, coarse_until):
+            targets.clear()
+        if not order:
+            order = rng.permutation(frames).tolist()
+        row = order.pop()
+        if row not in targets:
+            targets[row] = make_target(posed, depth, row, side, config.completed_depth_weight)
+        if step == 0:
+            added += _fill(backend, state, cameras, posed, depth, config, settings)
+        _take_step(
+            backend, state, cameras, row, targets[row], config, settings, unit, step / config.iterations
+        )
+        done = step + 1
+        if done % config.densify_every == 0:
+            if done <= config.densify_until * config.iterations:
+                prune(state, config)
+                added += split(state, config)
+            state.forget_tally()
+        if done % _REPORT_EVERY == 0:
+            progress.advance(_REPORT_EVERY)
+    progress.note(
+        f"{len(state)} Gaussians: {len(seeds)} seeded from depth, {added} added where the error asked for them"
+    )
+    return from_packed(
+        state.parameters, cameras.gain.astype(np.float32), cameras.bias.astype(np.float32), cameras.poses
+    )
+
+
+def _fill(
+    backend: Backend,
+    state: SplatState,
+    cameras: _Cameras,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: GaussiansConfig,
+    settings: RasterSettings,
+) -> int:
+    """Add Gaussians where frames show something and no depth map did. Returns how many."""
+    before = len(state)
+    for row in range(0, len(posed.images), max(1, len(posed.images) // 24)):
+        room = int(0.95 * config.max_gaussians) - len(state)
+        if room <= 0:
+            break
+        target = make_target(posed, depth, row, config.coarse_side_px, config.completed_depth_weight)
+        render = backend.render(state.parameters, target.camera, cameras.poses[row], settings)
+        new = fill_holes(render, target, cameras.poses[row])
+        state.append(new[:room])
+    return len(state) - before
+
+
+def _take_step(
+    backend: Backend,
+    state: SplatState,
+    cameras: _Cameras,
+    row: int,
+    target: FrameTarget,
+    config: GaussiansConfig,
+    settings: RasterSettings,
+    unit: float,
+    share_done: float,
+) -> None:
+    """One frame: loss, derivatives, and a step of everything that it depends on."""
+    gain, bias, pose = cameras.gain[row], cameras.bias[row], cameras.poses[row]
+    result = backend.step(state.parameters, pose, target, gain, bias, weights_of(config), settings)
+    rates = rates_of(config, unit, share_done)
+    limits = np.log(np.array([0.1, 60.0]) * 0.001 * unit)
+    state.update(result.parameters, result.rows, rates, limits)
+    state.tally(result.rows, result.depths, target.camera.fx, result.contribution, result.error)
+    fade = config.final_rate**share_done
+    if config.optimize_exposure:
+        pull = _EXPOSURE_PULL * np.concatenate([gain - 1, bias])
+        change = cameras.adam_exposure.step(
+            row, np.concatenate([result.gain, result.bias]) + pull, config.exposure_rate * fade
+        )
+        cameras.gain[row] = gain + change[:3]
+        cameras.bias[row] = bias + change[3:]
+    if config.optimize_poses:
+        scale = np.array([unit, unit, unit, 1, 1, 1])
+        change = cameras.adam_pose.step(row, result.pose * scale, config.pose_rate * fade) * scale
+        cameras.poses[row] = pose @ exponential(change)
+
+
+def exponential(xi: np.ndarray) -> np.ndarray:
+    """Return the rigid transform (4, 4) of a tangent vector (6,): translation, then rotation."""
+    w = np.asarray(xi[3:], np.float64)
+    angle = float(np.linalg.norm(w))
+    k = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+    if angle < 1e-6:
+        a, b, c = 1.0, 0.5, 1.0 / 6
+    else:
+        a, b, c = (
+            math.sin(angle) / angle,
+            (1 - math.cos(angle)) / angle**2,
+            (angle - math.sin(angle)) / angle**3,
+        )
+    out = np.eye(4)
+    out[:3, :3] += a * k + b * (k @ k)
+    out[:3, 3] = (np.eye(3) + b * k + c * (k @ k)) @ xi[:3]
+    return out

@@ -1,0 +1,683 @@
+"""Compiled kernels of the 2D Gaussian rasterizer: project, bin, blend, and their derivatives.
+
+A splat (Huang et al., "2D Gaussian Splatting", 2024) is a disk with center p, unit tangents t_u, t_v and standard
+deviations s_u, s_v. In camera space the 3x3 matrix H = [s_u t_u, s_v t_v, p] takes splat coordinates (u, v, 1) to
+points, so the ray d of a pixel meets the splat where (u, v, 1) is proportional to H^-1 d. H^-1 p = (0, 0, 1), hence
+with (dx, dy) the pixel's offset from the projected center
+
+    W = 1 + wx dx + wy dy,   u = (ax dx + ay dy) / W,   v = (bx dx + by dy) / W,   z = zc / W,
+
+exact, with six coefficients a splat. `G` below is H^-1.
+
+Nothing races: a tile is one unit of work; what belongs to a splat is written once per (splat, tile) entry and then
+summed per splat in the order of its entries. Results do not depend on the number of threads.
+All kernels are generic in the floating-point type of their arrays: float32 in use, float64 to check derivatives.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+TILE = 16  # pixels
+# Columns of a projected splat.
+XC, YC, ZC, AX, AY, BX, BY, WX, WY, OPACITY, REACH2, RED, GREEN, BLUE, NX, NY, NZ = range(17)
+N_PROJECTED = 17
+# Columns of the rendered image: sums over splats of alpha T times color, depth and normal; opacity; distortion; first
+# and second moments of the relative inverse depth, inverse depth of the first splat, and the median depth.
+N_FEATURES = 13
+F_DEPTH, F_NORMAL, F_ALPHA, F_DISTORTION, F_MOMENT1, F_MOMENT2, F_FIRST, F_MEDIAN = 3, 4, 7, 8, 9, 10, 11, 12
+# Columns of the derivative of a loss with respect to the rendered image.
+N_IMAGE_GRADIENTS = 9  # color, depth, normal, opacity, distortion
+# Columns of the per-splat derivatives: those of XC..OPACITY, color, normal; then alpha T summed plain and by error.
+N_SPLAT_GRADIENTS = 18
+S_COLOR, S_NORMAL, S_CONTRIBUTION, S_ERROR = 10, 13, 16, 17
+# Columns of the parameters: mean, quaternion, log scales, opacity logit, color (SH degree 0).
+N_PARAMETERS = 13
+P_QUATERNION, P_SCALE, P_OPACITY, P_COLOR = 3, 7, 9, 10
+SH_C0 = 0.28209479177387814
+_HALF = np.float32(0.5)
+_ONE = np.float32(1.0)
+_TWO = np.float32(2.0)
+# exp(-rho / 2) = exp(x)^64 with x = -rho / 128, by its Taylor polynomial.
+_FALLOFF_STEP = np.float32(-1.0 / 128.0)
+_E2, _E3, _E4, _E5 = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120)
+_CHUNKS = 64  # pieces that loops over Gaussians are cut into for the threads
+_MIN_COSINE = 0.01  # a splat seen more edge-on than this has no usable intersection
+_FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
+
+
+@numba.njit(cache=True, inline="always")
+def _rotation(quaternion):  # pragma: no cover - compiled
+    """Return the nine entries of the rotation matrix of a wxyz quaternion of any length, row by row."""
+    w, x, y, z = float(quaternion[0]), float(quaternion[1]), float(quaternion[2]), float(quaternion[3])
+    s = 1.0 / math.sqrt(max(w * w + x * x + y * y + z * z, 1e-30))
+    w, x, y, z = w * s, x * s, y * s, z * s
+    return (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _splat_in_camera(parameters, rotation, translation, h):  # pragma: no cover - compiled
+    """Fill h (3, 4): columns s_u t_u, s_v t_v, center and normal (towards the camera), in camera space.
+
+    Returns +1, or -1 where the normal had to be turned.
+    """
+    r = _rotation(parameters[P_QUATERNION:P_SCALE])
+    su, sv = math.exp(parameters[P_SCALE]), math.exp(parameters[P_SCALE + 1])
+    for i in range(3):
+        a, b, c = rotation[i, 0], rotation[i, 1], rotation[i, 2]
+        h[i, 0] = (a * r[0] + b * r[3] + c * r[6]) * su
+        h[i, 1] = (a * r[1] + b * r[4] + c * r[7]) * sv
+        h[i, 3] = a * r[2] + b * r[5] + c * r[8]
+        h[i, 2] = a * parameters[0] + b * parameters[1] + c * parameters[2] + translation[i]
+    if h[0, 3] * h[0, 2] + h[1, 3] * h[1, 2] + h[2, 3] * h[2, 2] > 0.0:
+        for i in range(3):
+            h[i, 3] = -h[i, 3]
+        return -1.0
+    return 1.0
+
+
+@numba.njit(cache=True)
+def _invert3(h, g):  # pragma: no cover - compiled
+    """Invert the left 3x3 block of h into g."""
+    g[0, 0] = h[1, 1] * h[2, 2] - h[1, 2] * h[2, 1]
+    g[0, 1] = h[0, 2] * h[2, 1] - h[0, 1] * h[2, 2]
+    g[0, 2] = h[0, 1] * h[1, 2] - h[0, 2] * h[1, 1]
+    g[1, 0] = h[1, 2] * h[2, 0] - h[1, 0] * h[2, 2]
+    g[1, 1] = h[0, 0] * h[2, 2] - h[0, 2] * h[2, 0]
+    g[1, 2] = h[0, 2] * h[1, 0] - h[0, 0] * h[1, 2]
+    g[2, 0] = h[1, 0] * h[2, 1] - h[1, 1] * h[2, 0]
+    g[2, 1] = h[0, 1] * h[2, 0] - h[0, 0] * h[2, 1]
+    g[2, 2] = h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0]
+    inverse = 1.0 / (h[0, 0] * g[0, 0] + h[0, 1] * g[1, 0] + h[0, 2] * g[2, 0])
+    for i in range(3):
+        for j in range(3):
+            g[i, j] *= inverse
+
+
+@numba.njit(cache=True)
+def _pixel_box(h, intrinsics, reach2, width, height, box):  # pragma: no cover - compiled
+    """Fill box with the pixels x0, y0, x1, y1 (end exclusive) that the splat may touch. True if there are any.
+
+    The exact bounds of the projected ellipse u^2 + v^2 = reach2 (Sigg et al. 2006; 2DGS eq. 8), joined with those of
+    the screen-space filter.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    zc = h[2, 2]
+    around = math.sqrt(reach2 * 0.5)
+    s = reach2 * (h[2, 0] * h[2, 0] + h[2, 1] * h[2, 1]) - zc * zc
+    for axis in range(2):
+        f = fx if axis == 0 else fy
+        size = width if axis == 0 else height
+        offset = f * h[axis, 2] / zc
+        center = offset + (cx if axis == 0 else cy)
+        if s >= 0.0:  # the ellipse reaches behind the camera: it may be anywhere
+            low, high = 0.0, float(size)
+        else:
+            # Rows of H as seen from the projected center, so that nothing large cancels.
+            tu, tv = f * h[axis, 0] - offset * h[2, 0], f * h[axis, 1] - offset * h[2, 1]
+            k = reach2 / s
+            middle = k * (tu * h[2, 0] + tv * h[2, 1])
+            extent = math.sqrt(max(middle * middle - k * (tu * tu + tv * tv), 0.0))
+            low = center + min(middle - extent, -around)
+            high = center + max(middle + extent, around)
+        low, high = max(low, -1.0), min(high, size + 1.0)
+        first, last = max(int(math.ceil(low - 0.5)), 0), min(int(math.floor(high - 0.5)) + 1, size)
+        if first >= last:
+            return False
+        box[axis], box[axis + 2] = first, last
+    return True
+
+
+@numba.njit(cache=True, parallel=True)
+def project(
+    parameters, rotation, translation, intrinsics, size, near, sigma_cutoff, alpha_min, splats, boxes
+):  # pragma: no cover - compiled
+    """Project every Gaussian; boxes (n, 4) pixel bounds, x1 = 0 where it is not seen. size is (width, height)."""
+    for chunk in numba.prange(_CHUNKS):
+        start, stop = chunk * len(parameters) // _CHUNKS, (chunk + 1) * len(parameters) // _CHUNKS
+        _project_rows(
+            start, stop, parameters, rotation, translation, intrinsics, size, near, sigma_cutoff, alpha_min,
+            splats, boxes,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _project_rows(
+    start,
+    stop,
+    parameters,
+    rotation,
+    translation,
+    intrinsics,
+    size,
+    near,
+    sigma_cutoff,
+    alpha_min,
+    splats,
+    boxes,
+):  # pragma: no cover - compiled
+    """Do the rows start..stop of `project`."""
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    h, g = np.empty((3, 4)), np.empty((3, 3))
+    for i in range(start, stop):
+        p = parameters[i]
+        boxes[i, 2] = 0
+        z = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2] + translation[2]
+        opacity = 1.0 / (1.0 + math.exp(-p[P_OPACITY]))
+        if z < near or opacity <= alpha_min:
+            continue
+        _splat_in_camera(p, rotation, translation, h)
+        distance = math.sqrt(h[0, 2] * h[0, 2] + h[1, 2] * h[1, 2] + z * z)
+        if -(h[0, 3] * h[0, 2] + h[1, 3] * h[1, 2] + h[2, 3] * z) < _MIN_COSINE * distance:
+            continue
+        reach2 = min(sigma_cutoff * sigma_cutoff, 2.0 * math.log(opacity / alpha_min))
+        if not _pixel_box(h, intrinsics, reach2, size[0], size[1], boxes[i]):
+            boxes[i, 2] = 0
+            continue
+        _invert3(h, g)
+        s = splats[i]
+        s[XC], s[YC], s[ZC] = fx * h[0, 2] / z + cx, fy * h[1, 2] / z + cy, z
+        s[AX], s[AY] = g[0, 0] * z / fx, g[0, 1] * z / fy
+        s[BX], s[BY] = g[1, 0] * z / fx, g[1, 1] * z / fy
+        s[WX], s[WY] = g[2, 0] * z / fx, g[2, 1] * z / fy
+        s[OPACITY], s[REACH2] = opacity, reach2
+        for c in range(3):
+            s[RED + c] = max(0.5 + SH_C0 * p[P_COLOR + c], 0.0)
+            s[NX + c] = h[c, 3]
+
+
+@numba.njit(cache=True)
+def sort_by_depth(splats, boxes):  # pragma: no cover - compiled
+    """Return the rows (k,) of the visible splats from near to far: a stable radix sort on the bits of the depth."""
+    n = 0
+    for i in range(len(boxes)):
+        n += boxes[i, 2] > 0
+    rows, keys = np.empty(n, np.int32), np.empty(n, np.uint32)
+    depth = np.empty(n, np.float32)
+    k = 0
+    for i in range(len(boxes)):
+        if boxes[i, 2] > 0:
+            rows[k], depth[k] = i, splats[i, ZC]
+            k += 1
+    keys[:] = depth.view(np.uint32)  # positive floats order as their bits do
+    other_rows, other_keys = np.empty_like(rows), np.empty_like(keys)
+    for shift in (0, 11, 22):
+        counts = np.zeros(2049, np.int64)
+        for i in range(n):
+            counts[((keys[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
+        for b in range(2048):
+            counts[b + 1] += counts[b]
+        for i in range(n):
+            b = (keys[i] >> np.uint32(shift)) & np.uint32(2047)
+            at = counts[b]
+            counts[b] += 1
+            other_rows[at], other_keys[at] = rows[i], keys[i]
+        rows, other_rows = other_rows, rows
+        keys, other_keys = other_keys, keys
+    return rows
+
+
+@numba.njit(cache=True)
+def bin_to_tiles(rows, boxes, tiles_x, tiles_y):  # pragma: no cover - compiled
+    """Counting sort of (splat, tile) entries by tile, near to far within each.
+
+    Returns:
+        tile_start (t + 1,), entries (e,) rank of the splat in `rows`, first (k + 1,) and positions (e,): the entries
+        of rank r are positions[first[r]:first[r + 1]].
+    """
+    tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    first = np.zeros(len(rows) + 1, np.int64)
+    for r in range(len(rows)):
+        b = boxes[rows[r]]
+        count = 0
+        for ty in range(b[1] // TILE, (b[3] - 1) // TILE + 1):
+            for tx in range(b[0] // TILE, (b[2] - 1) // TILE + 1):
+                tile_start[ty * tiles_x + tx + 1] += 1
+                count += 1
+        first[r + 1] = first[r] + count
+    for t in range(tiles_x * tiles_y):
+        tile_start[t + 1] += tile_start[t]
+    cursor = tile_start[:-1].copy()
+    entries, positions = np.empty(first[-1], np.int32), np.empty(first[-1], np.int32)
+    k = 0
+    for r in range(len(rows)):
+        b = boxes[rows[r]]
+        for ty in range(b[1] // TILE, (b[3] - 1) // TILE + 1):
+            for tx in range(b[0] // TILE, (b[2] - 1) // TILE + 1):
+                tile = ty * tiles_x + tx
+                entries[cursor[tile]] = r
+                positions[k] = cursor[tile]
+                cursor[tile] += 1
+                k += 1
+    return tile_start, entries, first, positions
+
+
+@numba.njit(cache=True, parallel=True)
+def gather(splats, boxes, rows):  # pragma: no cover - compiled
+    """Copy the visible splats and their boxes in depth order, so that tiles read them nearly in sequence."""
+    near_to_far = np.empty((len(rows), splats.shape[1]), splats.dtype)
+    near_boxes = np.empty((len(rows), 4), np.int32)
+    for r in numba.prange(len(rows)):
+        near_to_far[r] = splats[rows[r]]
+        near_boxes[r] = boxes[rows[r]]
+    return near_to_far, near_boxes
+
+
+@numba.njit(cache=True, inline="always", fastmath=_FAST)
+def _falloff(rho):  # pragma: no cover - compiled
+    """Return exp(-rho / 2) as exp(-rho / 128)^64: plain arithmetic, which compilers turn into vector code.
+
+    Right to 1e-5 of its value for rho < 100, and never negative.
+    """
+    x = rho * _FALLOFF_STEP
+    e = _ONE + x * (_ONE + x * (_E2 + x * (_E3 + x * (_E4 + x * _E5))))
+    e = max(e, x - x)
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    return e * e
+
+
+@numba.njit(cache=True, parallel=True)
+def blend(
+    splats, boxes, tile_start, entries, tile_order, tiles_x, scalars, weights, features, contributions
+):  # pragma: no cover - compiled
+    """Blend the splats of every tile front to back.
+
+    The innermost loops always run over the 16 pixels of a tile's row, without branches, on arrays with one plane a
+    quantity, so that they compile to vector instructions; pixels that a splat does not touch get alpha 0.
+
+    Args:
+        splats: (k, 17) near to far; boxes (k, 4) alike.
+        tile_start: Of `bin_to_tiles`; entries alike.
+        tile_order: (t,) order of the tiles over the threads.
+        tiles_x: Tiles in a row.
+        scalars: (3,) largest alpha, transmittance at which a pixel is finished, reference depth.
+        weights: (h, w) of the pixels in `contributions`; (0, 0) to leave those out.
+        features: (h, w, 13) filled.
+        contributions: (e,) filled: sum over the tile's pixels of weight alpha T of every entry.
+    """
+    for k in numba.prange(len(tile_order)):
+        _blend_tile(
+            tile_order[k],
+            splats,
+            boxes,
+            tile_start,
+            entries,
+            tiles_x,
+            scalars,
+            weights,
+            features,
+            contributions,
+        )
+
+
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy")
+def _blend_tile(
+    tile, splats, boxes, tile_start, entries, tiles_x, scalars, weights, features, contributions
+):  # pragma: no cover - compiled
+    """Do one tile of `blend`."""
+    height, width = features.shape[0], features.shape[1]
+    alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
+    zero = alpha_max - alpha_max
+    with_weights = weights.shape[0] > 0
+    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    image = np.zeros((N_FEATURES, TILE, TILE), features.dtype)
+    light = np.ones((TILE, TILE), features.dtype)
+    xs, ys = np.empty(TILE, features.dtype), np.empty(TILE, features.dtype)
+    factors = np.zeros((TILE, TILE), features.dtype)
+    for j in range(TILE):
+        xs[j], ys[j] = tx + j, ty + j
+    if with_weights:
+        contributions[tile_start[tile] : tile_start[tile + 1]] = 0
+        for y in range(ty, y_end):
+            for x in range(tx, x_end):
+                factors[y - ty, x - tx] = weights[y, x]
+    sums = np.zeros(TILE, features.dtype)
+    for e in range(tile_start[tile], tile_start[tile + 1]):
+        if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
+            break
+        s = splats[entries[e]]
+        box = boxes[entries[e]]
+        xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
+        ax, bx, wx, reach2, opacity = s[AX], s[BX], s[WX], s[REACH2], s[OPACITY]
+        red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
+        inverse_zc = _ONE / zc
+        if with_weights:
+            sums[:] = 0
+        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
+            dy = ys[i] - yc
+            u_row, v_row, w_row, dy2 = s[AY] * dy, s[BY] * dy, _ONE + s[WY] * dy, dy * dy
+            for j in range(TILE):
+                t = light[i, j]
+                dx = xs[j] - xc
+                w = w_row + wx * dx
+                inverse_w = _ONE / w
+                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
+                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+                on_disk = (w > zero) & (rho3 <= rho2)
+                rho = rho3 if on_disk else rho2
+                inverse_z = w * inverse_zc if on_disk else inverse_zc
+                z = zc * inverse_w if on_disk else zc
+                alpha = min(opacity * _falloff(rho), alpha_max)
+                alpha = alpha if (rho <= reach2) & (t >= stop) else zero
+                weight = alpha * t
+                first = inverse_z if (t == _ONE) else image[F_FIRST, i, j]
+                m = reference * (first - inverse_z)
+                before, m1, m2 = image[F_ALPHA, i, j], image[F_MOMENT1, i, j], image[F_MOMENT2, i, j]
+                after = t * (_ONE - alpha)
+                median = image[F_MEDIAN, i, j]
+                image[0, i, j] += weight * red
+                image[1, i, j] += weight * green
+                image[2, i, j] += weight * blue
+                image[F_DEPTH, i, j] += weight * z
+                image[F_NORMAL, i, j] += weight * nx
+                image[F_NORMAL + 1, i, j] += weight * ny
+                image[F_NORMAL + 2, i, j] += weight * nz
+                image[F_FIRST, i, j] = first
+                image[F_DISTORTION, i, j] += weight * (m * m * before + m2 - _TWO * m * m1)
+                image[F_ALPHA, i, j] = before + weight
+                image[F_MOMENT1, i, j] = m1 + weight * m
+                image[F_MOMENT2, i, j] = m2 + weight * m * m
+                image[F_MEDIAN, i, j] = z if (t > _HALF) & (after <= _HALF) else median
+                light[i, j] = after
+                sums[j] += weight * factors[i, j]
+        if with_weights:
+            contributions[e] = sums.sum()
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            for c in range(N_FEATURES):
+                features[y, x, c] = image[c, y - ty, x - tx]
+
+
+@numba.njit(cache=True, parallel=True)
+def blend_backward(
+    splats,
+    boxes,
+    tile_start,
+    entries,
+    tile_order,
+    tiles_x,
+    scalars,
+    features,
+    image_gradients,
+    error,
+    entry_gradients,
+):  # pragma: no cover - compiled
+    """Differentiate `blend`: front to back again, with what lies behind as total minus prefix.
+
+    With q_i the derivative of the loss by the weight w_i = alpha_i T_i, dL/dalpha_i = T_i q_i - sum_{j>i} w_j q_j /
+    (1 - alpha_i), and sum_j w_j q_j is known from the rendered image alone.
+
+    Args:
+        splats: As for `blend`, up to scalars.
+        features: (h, w, 13) of `blend`.
+        image_gradients: (h, w, 9).
+        error: (h, w) weight of the pixels in the last column of the result (for densification).
+        entry_gradients: (e, 18) filled.
+    """  # fmt: skip
+    for k in numba.prange(len(tile_order)):
+        _blend_tile_backward(
+            tile_order[k],
+            splats,
+            boxes,
+            tile_start,
+            entries,
+            tiles_x,
+            scalars,
+            features,
+            image_gradients,
+            error,
+            entry_gradients,
+        )
+
+
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy")
+def _blend_tile_backward(
+    tile,
+    splats,
+    boxes,
+    tile_start,
+    entries,
+    tiles_x,
+    scalars,
+    features,
+    image_gradients,
+    error,
+    entry_gradients,
+):  # pragma: no cover - compiled
+    """Do one tile of `blend_backward`."""
+    height, width = features.shape[0], features.shape[1]
+    alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
+    zero = alpha_max - alpha_max
+    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    light = np.ones((TILE, TILE), features.dtype)
+    # Planes: gradients 0..8, error 9, what lies behind 10, opacity 11, moments 12 and 13, first inverse depth 14.
+    given = np.zeros((15, TILE, TILE), features.dtype)
+    lanes = np.empty((N_SPLAT_GRADIENTS, TILE), features.dtype)
+    xs, ys = np.empty(TILE, features.dtype), np.empty(TILE, features.dtype)
+    for j in range(TILE):
+        xs[j], ys[j] = tx + j, ty + j
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            f, g, i, j = features[y, x], image_gradients[y, x], y - ty, x - tx
+            total = _TWO * g[8] * f[F_DISTORTION]
+            for c in range(8):
+                total += g[c] * f[c]
+                given[c, i, j] = g[c]
+            given[8, i, j], given[9, i, j], given[10, i, j] = g[8], error[y, x], total
+            given[11, i, j], given[12, i, j] = f[F_ALPHA], f[F_MOMENT1]
+            given[13, i, j], given[14, i, j] = f[F_MOMENT2], f[F_FIRST]
+    done = False
+    for e in range(tile_start[tile], tile_start[tile + 1]):
+        out = entry_gradients[e]
+        if (e - tile_start[tile]) % 32 == 31:
+            done = done or light[: y_end - ty, : x_end - tx].max() < stop
+        if done:
+            out[:] = 0
+            continue
+        s = splats[entries[e]]
+        box = boxes[entries[e]]
+        xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
+        ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
+        opacity, reach2 = s[OPACITY], s[REACH2]
+        red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
+        inverse_zc = _ONE / zc
+        lanes[:] = 0
+        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
+            dy = ys[i] - yc
+            u_row, v_row, w_row, dy2 = ay * dy, by * dy, _ONE + wy * dy, dy * dy
+            for j in range(TILE):
+                t = light[i, j]
+                dx = xs[j] - xc
+                w = w_row + wx * dx
+                inverse_w = _ONE / w
+                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
+                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+                on_disk = (w > zero) & (rho3 <= rho2)
+                rho = rho3 if on_disk else rho2
+                inverse_z = w * inverse_zc if on_disk else inverse_zc
+                inverse_w = inverse_w if on_disk else _ONE
+                z = zc * inverse_w
+                falloff = _falloff(rho)
+                inside = (rho <= reach2) & (t >= stop)
+                falloff = falloff if inside else zero
+                full = opacity * falloff
+                alpha = min(full, alpha_max)
+                weight = alpha * t
+                after = t * (_ONE - alpha)
+                light[i, j] = after
+                g_d, g_x = given[3, i, j], given[8, i, j]
+                g_r, g_g, g_b = given[0, i, j], given[1, i, j], given[2, i, j]
+                g_nx, g_ny, g_nz = given[4, i, j], given[5, i, j], given[6, i, j]
+                m = reference * (given[14, i, j] - inverse_z)
+                spread = m * given[11, i, j] - given[12, i, j]
+                q = (
+                    g_r * red + g_g * green + g_b * blue + g_d * z + g_nx * nx + g_ny * ny + g_nz * nz
+                    + given[7, i, j] + g_x * (m * spread + given[13, i, j] - m * given[12, i, j])
+                )  # fmt: skip
+                rest = given[10, i, j] - weight * q
+                given[10, i, j] = rest
+                d_z = weight * (g_d + _TWO * g_x * spread * reference * inverse_z * inverse_z)
+                d_alpha = t * q - rest / (_ONE - alpha)
+                d_alpha = d_alpha if inside & (full <= alpha_max) else zero
+                d_rho = -_HALF * d_alpha * alpha
+                disk_rho = d_rho if on_disk else zero
+                flat_rho = zero if on_disk else d_rho
+                d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
+                d_w = -(d_u * u + d_v * v) - d_z * z * inverse_w
+                d_w = d_w if on_disk else zero
+                lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
+                lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
+                lanes[ZC, j] += d_z * inverse_w
+                lanes[AX, j] += d_u * dx
+                lanes[AY, j] += d_u * dy
+                lanes[BX, j] += d_v * dx
+                lanes[BY, j] += d_v * dy
+                lanes[WX, j] += d_w * dx
+                lanes[WY, j] += d_w * dy
+                lanes[OPACITY, j] += d_alpha * falloff
+                lanes[10, j] += weight * g_r
+                lanes[11, j] += weight * g_g
+                lanes[12, j] += weight * g_b
+                lanes[13, j] += weight * g_nx
+                lanes[14, j] += weight * g_ny
+                lanes[15, j] += weight * g_nz
+                lanes[16, j] += weight
+                lanes[17, j] += weight * given[9, i, j]
+        for c in range(N_SPLAT_GRADIENTS):
+            total = zero
+            for j in range(TILE):
+                total += lanes[c, j]
+            out[c] = total
+
+
+@numba.njit(cache=True, parallel=True)
+def reduce_entries(entry_values, first, positions, rows, out):  # pragma: no cover - compiled
+    """Sum the values (e, k) of every splat's entries, in order, into out (n, k) at the Gaussian's row."""
+    columns = entry_values.shape[1]
+    for r in numba.prange(len(rows)):
+        for c in range(columns):
+            out[rows[r], c] = 0
+        for i in range(first[r], first[r + 1]):
+            for c in range(columns):
+                out[rows[r], c] += entry_values[positions[i], c]
+
+
+@numba.njit(cache=True, parallel=True)
+def project_backward(
+    parameters, rows, rotation, translation, intrinsics, splats, splat_gradients, gradients, pose_gradients
+):  # pragma: no cover - compiled
+    """Carry the derivatives of projected splats (n, 18) to parameters (n, 13) and camera pose (k, 6).
+
+    The pose moves as world_from_camera exp(xi), xi = (translation, rotation) in camera axes, so that a camera-space
+    point x moves by -rho - phi x x.
+    """
+    for chunk in numba.prange(_CHUNKS):
+        start, stop = chunk * len(rows) // _CHUNKS, (chunk + 1) * len(rows) // _CHUNKS
+        _project_rows_backward(
+            start, stop, parameters, rows, rotation, translation, intrinsics, splats, splat_gradients, gradients,
+            pose_gradients,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _project_rows_backward(
+    start,
+    stop,
+    parameters,
+    rows,
+    rotation,
+    translation,
+    intrinsics,
+    splats,
+    splat_gradients,
+    gradients,
+    pose_gradients,
+):  # pragma: no cover - compiled
+    """Do the rows start..stop of `project_backward`."""  # fmt: skip
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    h, g, dg = np.empty((3, 4)), np.empty((3, 3)), np.zeros((3, 3))
+    dh, dn, dr = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for k in range(start, stop):
+        i = rows[k]
+        p, s, d, out = parameters[i], splats[k], splat_gradients[i], gradients[i]
+        turned = _splat_in_camera(p, rotation, translation, h)
+        _invert3(h, g)
+        z = h[2, 2]
+        dg[0, 0], dg[0, 1] = d[AX] * z / fx, d[AY] * z / fy
+        dg[1, 0], dg[1, 1] = d[BX] * z / fx, d[BY] * z / fy
+        dg[2, 0], dg[2, 1] = d[WX] * z / fx, d[WY] * z / fy
+        dz = d[ZC]
+        for c in range(6):  # the coefficients carry a factor z
+            dz += d[AX + c] * s[AX + c] / z
+        # d(H^-1) = -H^-1 dH H^-1, hence dL/dH = -G^T (dL/dG) G^T; the third column of dL/dG is zero.
+        for a in range(3):
+            m0 = g[0, a] * dg[0, 0] + g[1, a] * dg[1, 0] + g[2, a] * dg[2, 0]
+            m1 = g[0, a] * dg[0, 1] + g[1, a] * dg[1, 1] + g[2, a] * dg[2, 1]
+            for b in range(3):
+                dh[a, b] = -(m0 * g[b, 0] + m1 * g[b, 1])
+        dh[0, 2] += d[XC] * fx / z
+        dh[1, 2] += d[YC] * fy / z
+        dh[2, 2] += dz - (d[XC] * (s[XC] - cx) + d[YC] * (s[YC] - cy)) / z
+        for c in range(3):
+            dn[c] = d[S_NORMAL + c]
+        # Derivative by the pose: minus the sum of x cross dL/dx over everything that turns with the camera.
+        for c in range(3):
+            a, b = (c + 1) % 3, (c + 2) % 3
+            pose_gradients[k, c] = -dh[c, 2]
+            turn = h[a, 3] * dn[b] - h[b, 3] * dn[a]
+            for j in range(3):
+                turn += h[a, j] * dh[b, j] - h[b, j] * dh[a, j]
+            pose_gradients[k, 3 + c] = -turn
+        # Columns back to world axes; then scales and the rotation matrix.
+        su, sv = math.exp(p[P_SCALE]), math.exp(p[P_SCALE + 1])
+        d_su, d_sv = 0.0, 0.0
+        for c in range(3):
+            d_su += dh[c, 0] * h[c, 0]
+            d_sv += dh[c, 1] * h[c, 1]
+            a, b, e = rotation[0, c], rotation[1, c], rotation[2, c]
+            out[c] = a * dh[0, 2] + b * dh[1, 2] + e * dh[2, 2]
+            dr[c, 0] = (a * dh[0, 0] + b * dh[1, 0] + e * dh[2, 0]) * su
+            dr[c, 1] = (a * dh[0, 1] + b * dh[1, 1] + e * dh[2, 1]) * sv
+            dr[c, 2] = (a * dn[0] + b * dn[1] + e * dn[2]) * turned
+        out[P_SCALE], out[P_SCALE + 1] = d_su, d_sv
+        _quaternion_gradient(p[P_QUATERNION:P_SCALE], dr, out)
+        out[P_OPACITY] = d[OPACITY] * s[OPACITY] * (1.0 - s[OPACITY])
+        for c in range(3):
+            out[P_COLOR + c] = SH_C0 * d[S_COLOR + c] if s[RED + c] > 0.0 else 0.0
+
+
+@numba.njit(cache=True)
+def _quaternion_gradient(quaternion, dr, out):  # pragma: no cover - compiled
+    """Carry the derivative by the rotation matrix to the quaternion (not normalized), into out[3:7]."""
+    w, x, y, z = float(quaternion[0]), float(quaternion[1]), float(quaternion[2]), float(quaternion[3])
+    s = 1.0 / math.sqrt(max(w * w + x * x + y * y + z * z, 1e-30))
+    w, x, y, z = w * s, x * s, y * s, z * s
+    dw = 2 * (x * (dr[2, 1] - dr[1, 2]) + y * (dr[0, 2] - dr[2, 0]) + z * (dr[1, 0] - dr[0, 1]))
+    dx = 2 * (
+        y * (dr[0, 1] + dr[1, 0]) + z * (dr[0, 2] + dr[2, 0]) + w * (dr[2, 1] - dr[1, 2])
+        - 2 * x * (dr[1, 1] + dr[2, 2])
+    )  # fmt: skip
+    dy = 2 * (
+        x * (dr[0, 1] + dr[1, 0]) + z * (dr[1, 2] + dr[2, 1]) + w * (dr[0, 2] - dr[2, 0])
+        - 2 * y * (dr[0, 0] + dr[2, 2])
+    )  # fmt: skip
+    dzz = 2 * (
+        x * (dr[0, 2] + dr[2, 0]) + y * (dr[1, 2] + dr[2, 1]) + w * (dr[1, 0] - dr[0, 1])
+        - 2 * z * (dr[0, 0] + dr[1, 1])
+    )  # fmt: skip
+    along = dw * w + dx * x + dy * y + dzz * z
+    out[P_QUATERNION] = (dw - w * along) * s
+    out[P_QUATERNION + 1] = (dx - x * along) * s
+    out[P_QUATERNION + 2] = (dy - y * along) * s
+    out[P_QUATERNION + 3] = (dzz - z * along) * s

@@ -1,0 +1,74 @@
+"""The Gaussians as an artifact, and the packed form that kernels work on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 * coefficient
+N_PARAMETERS = 13  # mean 3, quaternion 4, log scales 2, opacity logit 1, color 3
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """2D Gaussians (oriented disks) in the space of the posed frames that they were fitted to.
+
+    Colors are view-independent (spherical harmonics of degree 0), in the frames' sRGB values, not linear light: a
+    room's matte surfaces are what the later stages use. A disk's third axis is its normal. Frame k was seen as
+    `exposure_gain[k] * rendered + exposure_bias[k]`, by `world_from_camera[k]`.
+    """
+
+    means: np.ndarray  # float32 (n, 3)
+    quaternions: np.ndarray  # float32 (n, 4) wxyz, unit; columns of its matrix: t_u, t_v, normal
+    log_scales: np.ndarray  # float32 (n, 2) natural logarithm of the standard deviations along t_u and t_v
+    opacity_logits: np.ndarray  # float32 (n,)
+    colors: np.ndarray  # float32 (n, 3) SH coefficients of degree 0: rgb = 0.5 + 0.2821 c
+    exposure_gain: np.ndarray  # float32 (k, 3) of the keyframes they were fitted to
+    exposure_bias: np.ndarray  # float32 (k, 3)
+    world_from_camera: np.ndarray  # float64 (k, 4, 4) those frames' cameras, refined where that was asked for
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.means)
+
+    @property
+    def rgb(self) -> np.ndarray:
+        """Return colors (n, 3) in [0, 1] (not above, where the fit went there)."""
+        return np.maximum(0.5 + SH_C0 * self.colors, 0.0)
+
+    @property
+    def opacities(self) -> np.ndarray:
+        """Return opacities (n,) in (0, 1)."""
+        return 1.0 / (1.0 + np.exp(-self.opacity_logits))
+
+    def packed(self) -> np.ndarray:
+        """Return the parameters as one float32 array (n, 13)."""
+        return np.ascontiguousarray(
+            np.concatenate(
+                [self.means, self.quaternions, self.log_scales, self.opacity_logits[:, None], self.colors],
+                axis=1,
+            ),
+            np.float32,
+        )
+
+
+def from_packed(
+    parameters: np.ndarray,
+    exposure_gain: np.ndarray | None = None,
+    exposure_bias: np.ndarray | None = None,
+    world_from_camera: np.ndarray | None = None,
+) -> Gaussians:
+    """Unpack parameters (n, 13); quaternions are normalized, with w >= 0."""
+    p = np.asarray(parameters, np.float32)
+    quaternions = p[:, 3:7] / np.maximum(np.linalg.norm(p[:, 3:7], axis=1, keepdims=True), 1e-12)
+    quaternions = np.where(quaternions[:, :1] < 0, -quaternions, quaternions)
+    frames = 0 if world_from_camera is None else len(world_from_camera)
+    return Gaussians(
+        means=p[:, :3].copy(),
+        quaternions=quaternions.astype(np.float32),
+        log_scales=p[:, 7:9].copy(),
+        opacity_logits=p[:, 9].copy(),
+        colors=p[:, 10:13].copy(),
+        exposure_gain=np.ones((frames, 3), np.float32) if exposure_gain is None else exposure_gain,
+        exposure_bias=np.zeros((frames, 3), np.float32) if exposure_bias is None else exposure_bias,
+        world_from_camera=np.zeros((0, 4, 4)) if world_from_camera is None else world_from_camera,
+    )

@@ -1,0 +1,166 @@
+"""Adam over the packed Gaussians, only where a frame saw them, and the tally that densification goes by."""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from reconstruction.gaussians.config import GaussiansConfig
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15  # few visits a Gaussian: a shorter memory than Adam's usual 0.999
+
+
+@numba.njit(cache=True, parallel=True)
+def _adam_rows(parameters, gradients, first, second, visits, rows, rates):  # pragma: no cover - compiled
+    """One Adam step of the given rows; bias correction by each row's own number of visits."""
+    for k in numba.prange(len(rows)):
+        i = rows[k]
+        visits[i] += 1
+        correct1 = 1.0 / (1.0 - _BETA1 ** visits[i])
+        correct2 = 1.0 / (1.0 - _BETA2 ** visits[i])
+        for c in range(parameters.shape[1]):
+            g = float(gradients[i, c])
+            a = _BETA1 * first[i, c] + (1.0 - _BETA1) * g
+            b = _BETA2 * second[i, c] + (1.0 - _BETA2) * g * g
+            first[i, c], second[i, c] = a, b
+            parameters[i, c] -= rates[c] * a * correct1 / (math.sqrt(b * correct2) + _EPSILON)
+
+
+class Adam:
+    """Adam for one dense array whose rows are updated one at a time (exposures, poses)."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._first, self._second = np.zeros(shape), np.zeros(shape)
+        self._visits = np.zeros(shape[0], np.int64)
+
+    def step(self, row: int, gradient: np.ndarray, rate: float) -> np.ndarray:
+        """Return the change of one row."""
+        self._visits[row] += 1
+        n = self._visits[row]
+        self._first[row] = _BETA1 * self._first[row] + (1 - _BETA1) * gradient
+        self._second[row] = _BETA2 * self._second[row] + (1 - _BETA2) * gradient**2
+        a, b = self._first[row] / (1 - _BETA1**n), self._second[row] / (1 - _BETA2**n)
+        return -rate * a / (np.sqrt(b) + _EPSILON)
+
+
+@dataclass
+class SplatState:
+    """Parameters under optimization, with moments and the tally since the last densification."""
+
+    parameters: np.ndarray  # float32 (n, 13)
+    first: np.ndarray  # float32 (n, 13)
+    second: np.ndarray  # float32 (n, 13)
+    visits: np.ndarray  # int32 (n,) steps of Adam
+    seen: np.ndarray  # int32 (n,) frames that drew it since the last densification
+    contribution: np.ndarray  # float32 (n,) sum of alpha T over those
+    error: np.ndarray  # float32 (n,) sum of alpha T times the pixel's error
+    radius_px: np.ndarray  # float32 (n,) largest standard deviation in pixels
+
+    @classmethod
+    def start(cls, parameters: np.ndarray) -> "SplatState":
+        """Begin with seeds (n, 13)."""
+        n = len(parameters)
+        return cls(
+            np.ascontiguousarray(parameters, np.float32), np.zeros((n, 13), np.float32),
+            np.zeros((n, 13), np.float32), np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.float32),
+            np.zeros(n, np.float32), np.zeros(n, np.float32),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.parameters)
+
+    def update(self, gradients: np.ndarray, rows: np.ndarray, rates: np.ndarray, limits: np.ndarray) -> None:
+        """Take one Adam step on the rows in view; limits are the smallest and largest log scale."""
+        _adam_rows(self.parameters, gradients, self.first, self.second, self.visits, rows, rates)
+        scales = self.parameters[:, 7:9]
+        np.clip(scales, limits[0], limits[1], out=scales)
+
+    def tally(
+        self, rows: np.ndarray, depths: np.ndarray, focal: float, contribution: np.ndarray, error: np.ndarray
+    ) -> None:
+        """Count what a frame says: rows (k,) seen at depths (k,); contribution and error (n,)."""
+        self.seen[rows] += 1
+        self.contribution += contribution
+        self.error += error
+        radius = np.exp(self.parameters[rows, 7:9].max(axis=1)) * focal / depths
+        self.radius_px[rows] = np.maximum(self.radius_px[rows], radius)
+
+    def forget_tally(self) -> None:
+        """Begin a new tally."""
+        for counter in (self.seen, self.contribution, self.error, self.radius_px):
+            counter[:] = 0
+
+    def keep(self, mask: np.ndarray) -> None:
+        """Drop the rows where the mask is False."""
+        for name in self.__dataclass_fields__:
+            setattr(self, name, np.ascontiguousarray(getattr(self, name)[mask]))
+
+    def append(self, parameters: np.ndarray) -> None:
+        """Add Gaussians without history."""
+        new = SplatState.start(parameters)
+        for name in self.__dataclass_fields__:
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(new, name)]))
+
+
+def rates_of(config: GaussiansConfig, median_depth: float, share_done: float) -> np.ndarray:
+    """Return the Adam rate (13,) of every column after a share of the training."""
+    rates = np.empty(13)
+    rates[:3], rates[3:7], rates[7:9] = (
+        config.mean_rate * median_depth,
+        config.quaternion_rate,
+        config.scale_rate,
+    )
+    rates[9], rates[10:] = config.opacity_rate, config.color_rate
+    return rates * config.final_rate**share_done
+
+
+def prune(state: SplatState, config: GaussiansConfig) -> int:
+    """Remove what is nearly transparent or what frames saw hardly anything of. Returns how many."""
+    opacity = 1.0 / (1.0 + np.exp(-state.parameters[:, 9]))
+    hidden = (state.seen >= 3) & (state.contribution < 0.02 * state.seen)
+    keep = (opacity >= config.prune_opacity) & ~hidden & np.isfinite(state.parameters).all(axis=1)
+    state.keep(keep)
+    return int((~keep).sum())
+
+
+def split(state: SplatState, config: GaussiansConfig) -> int:
+    """Split the Gaussians with the most error per view in two along their longer axis. Returns how many.
+
+    Error, not the gradient of the position, says where detail is missing (Rota Bulo et al., "Revising Densification
+    in Gaussian Splatting", 2024). A splat that is already smaller than a pixel cannot show more.
+    """
+    room = min(config.max_gaussians - len(state), int(config.densify_growth * len(state)))
+    score = state.error / np.maximum(state.seen, 1)
+    score[(state.radius_px < 0.6) | (state.seen == 0)] = 0
+    if room <= 0:
+        return 0
+    rows = np.argsort(-score, kind="stable")[:room]
+    rows = np.sort(rows[score[rows] > 0])
+    if len(rows) == 0:
+        return 0
+    p = state.parameters[rows]
+    longer = np.argmax(p[:, 7:9], axis=1)
+    every = np.arange(len(rows))
+    sigma = np.exp(p[every, 7 + longer])
+    axis = _tangents(p[:, 3:7])[every, :, longer]
+    one, other = p.copy(), p.copy()
+    # Two Gaussians of 0.63 sigma at +-0.77 sigma have the mean and variance of the one that they replace.
+    one[:, :3] += 0.77 * sigma[:, None] * axis
+    other[:, :3] -= 0.77 * sigma[:, None] * axis
+    for half in (one, other):
+        half[every, 7 + longer] += np.float32(math.log(0.63))
+    state.parameters[rows] = one
+    for moments in (state.first, state.second):
+        moments[rows] = 0
+    state.visits[rows] = 0
+    state.append(other)
+    return len(rows)
+
+
+def _tangents(quaternions: np.ndarray) -> np.ndarray:
+    """Return the matrices (n, 3, 3) of quaternions wxyz of any length."""
+    from registry.geometry import matrix_from_quat
+
+    return matrix_from_quat(quaternions)

@@ -1,0 +1,140 @@
+"""Gaussians as a standard 3DGS `.ply`, which existing viewers open, and back.
+
+The third scale of a disk is written as a thousandth of its smaller one. Reading takes any 3DGS file: the axis with
+the smallest scale becomes the normal, higher spherical harmonics are dropped (colors are view-independent here).
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.gaussians.model import Gaussians, from_packed
+from registry.errors import BundleError
+from registry.geometry import matrix_from_quat, quat_from_matrix
+
+_THICKNESS = 1e-3
+_REQUIRED = (
+    "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3",
+)  # fmt: skip
+_WRITTEN = (
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+    "rot_0", "rot_1", "rot_2", "rot_3",
+)  # fmt: skip
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
+    "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
+    "float32": "<f4", "float64": "<f8",
+}  # fmt: skip
+
+
+def write_ply(gaussians: Gaussians, path: Path) -> None:
+    """Write the Gaussians (not exposures and cameras) as binary little-endian PLY."""
+    g = gaussians
+    columns = np.empty(len(g), [(name, "<f4") for name in _WRITTEN])
+    normals = matrix_from_quat(g.quaternions)[:, :, 2]
+    for c in range(3):
+        columns["xyz"[c]], columns[f"n{'xyz'[c]}"] = g.means[:, c], normals[:, c]
+        columns[f"f_dc_{c}"] = g.colors[:, c]
+    columns["opacity"] = g.opacity_logits
+    columns["scale_0"], columns["scale_1"] = g.log_scales[:, 0], g.log_scales[:, 1]
+    columns["scale_2"] = g.log_scales.min(axis=1) + np.log(_THICKNESS)
+    for c in range(4):
+        columns[f"rot_{c}"] = g.quaternions[:, c]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(g)}"]
+    header += [f"property float {name}" for name in _WRITTEN] + ["end_header", ""]
+    with Path(path).open("wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        file.write(columns.tobytes())
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Read a 3DGS .ply, binary little-endian or ASCII.
+
+    Raises:
+        BundleError: it is not a PLY of Gaussians, or it is cut short.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        count, dtype, binary = _read_header(file, path)
+        if binary:
+            data = file.read(count * dtype.itemsize)
+            if len(data) < count * dtype.itemsize:
+                raise BundleError(
+                    f"{path}: cut short: {len(data)} of {count * dtype.itemsize} bytes of vertices"
+                )
+            rows = np.frombuffer(data, dtype)
+        else:
+            try:
+                table = np.loadtxt(file, max_rows=count, ndmin=2)
+            except ValueError as error:
+                raise BundleError(f"{path}: malformed ASCII vertices ({error})") from error
+            if table.shape != (count, len(dtype.names)):
+                raise BundleError(f"{path}: expected {count} rows of {len(dtype.names)}, found {table.shape}")
+            rows = np.rec.fromarrays(list(table.T), names=list(dtype.names))
+    names = set(rows.dtype.names)
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing:
+        raise BundleError(f"{path}: not a 3DGS file: no property {', '.join(missing)}")
+
+    def take(*wanted: str) -> np.ndarray:
+        return np.stack([np.asarray(rows[name], np.float64) for name in wanted], axis=1)
+
+    quaternions = take("rot_0", "rot_1", "rot_2", "rot_3")
+    scales = take("scale_0", "scale_1", "scale_2") if "scale_2" in names else None
+    if scales is not None and count:
+        quaternions, scales = _normal_last(quaternions, scales)
+    else:
+        scales = take("scale_0", "scale_1")
+    packed = np.concatenate(
+        [
+            take("x", "y", "z"),
+            quaternions,
+            scales[:, :2],
+            take("opacity"),
+            take("f_dc_0", "f_dc_1", "f_dc_2"),
+        ],
+        axis=1,
+    )
+    return from_packed(packed)
+
+
+def _normal_last(quaternions: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Turn the axes of 3D Gaussians cyclically, so that the third is the thinnest."""
+    thinnest = np.argmin(scales, axis=1)
+    order = (thinnest[:, None] + np.array([1, 2, 0])) % 3  # a cyclic change keeps the axes right-handed
+    turned = thinnest != 2
+    if turned.any():
+        axes = np.take_along_axis(matrix_from_quat(quaternions[turned]), order[turned][:, None, :], axis=2)
+        quaternions = quaternions.copy()
+        quaternions[turned] = quat_from_matrix(axes)
+    return quaternions, np.take_along_axis(scales, order, axis=1)
+
+
+def _read_header(file, path: Path) -> tuple[int, np.dtype, bool]:
+    """Read up to end_header: number of vertices, their type, and whether they are binary."""
+    if file.readline().strip() != b"ply":
+        raise BundleError(f"{path}: not a PLY file")
+    count, fields, binary, element = -1, [], True, ""
+    for _ in range(1000):
+        words = file.readline().decode("ascii", "replace").split()
+        if not words:
+            raise BundleError(f"{path}: the PLY header does not end")
+        if words[0] == "format":
+            if words[1] not in ("binary_little_endian", "ascii"):
+                raise BundleError(f"{path}: format {words[1]} is not read; write binary_little_endian")
+            binary = words[1] != "ascii"
+        elif words[0] == "element":
+            if words[1] == "vertex":
+                count = int(words[2])
+            elif count < 0:
+                raise BundleError(f"{path}: element {words[1]} comes before the vertices")
+            element = words[1]
+        elif words[0] == "property" and element == "vertex":
+            if words[1] not in _TYPES:
+                raise BundleError(f"{path}: property type {words[1]} of a vertex is not read")
+            fields.append((words[2], _TYPES[words[1]]))
+        elif words[0] == "end_header":
+            break
+    if count < 0:
+        raise BundleError(f"{path}: no vertices")
+    return count, np.dtype(fields), binary
