@@ -77,7 +77,7 @@ class Result:
         for key, reason in left_out.items():
             if key in (metric, stage) or (group and group in key.split(", ")):
                 return str(reason)
-        return f"the evaluation has no {metric}"
+        return f"the evaluation has no {stage or metric}"
 
 
 def _flat_numbers(prefix: str, tree: dict) -> dict[str, float | None]:

@@ -94,6 +94,12 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> l
     return ["| " + " | ".join(cell.strip() for cell in line) + " |" for line in lines]
 
 
+def _measured(columns: Sequence[Column], results: Sequence[Result]) -> list[Column]:
+    """Leave out stages that no run had (a pipeline need not have all of them); other figures stay, missing or not."""
+    found = {key for result in results for key in result.metrics}
+    return [column for column in columns if not column.key.startswith("stages.") or column.key in found]
+
+
 # -- Means over captures -------------------------------------------------------------------------------------------
 
 
@@ -115,8 +121,8 @@ def mean_of(results: Sequence[Result], key: str) -> tuple[float | None, int]:
 def _means(results: Sequence[Result]) -> str:
     captures = sorted({result.capture for result in results})
     parts = [f"{len(captures)} captures: {', '.join(captures)}."]
-    for title, columns in GROUPS:
-        notes, rows = Notes(), []
+    for title, every in GROUPS:
+        columns, notes, rows = _measured(every, results), Notes(), []
         for name in _variant_names(results):
             group = [result for result in results if result.variant == name]
             done = sum(not result.failed for result in group)
@@ -207,7 +213,8 @@ def _captures(results: Sequence[Result], keys: dict[int, str]) -> str:
         group = [result for result in results if result.capture == name]
         parts += ["", f"### {name}"] if parts else [f"### {name}"]
         for title, columns in GROUPS:
-            parts += ["", f"{title}:", "", _rows(group, columns, keys, with_capture=False)]
+            table = _rows(group, _measured(columns, results), keys, with_capture=False)
+            parts += ["", f"{title}:", "", table]
     return "\n".join(parts)
 
 

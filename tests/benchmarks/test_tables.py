@@ -209,3 +209,13 @@ def test_results_survive_the_disk_and_unknown_keys(tmp_path):
     path.write_text("[1]")
     with pytest.raises(UsageError, match=r"default\.json"):
         load_results(tmp_path)
+
+
+def test_stages_that_no_run_had_have_no_column_and_others_do():
+    result = made("a")
+    stages = {"depth": {"median_rel": 0.0123}, "instances": {"surface": {"mean_iou": 0.5}, "per_view": None}}
+    result = replace(result, evaluation=result.evaluation | {"stages": stages})
+    page = render_page([result], CODE)
+    heads = rows(page, "### Stages", "variant")[0]
+    assert heads[2:] == ["recall@.25 ↑", "prec@.25 ↑", "depth error % ↓", "instances IoU ↑"]
+    assert rows(page, "### Stages", "default")[0][-2:] == ["1.23", "0.50"]
