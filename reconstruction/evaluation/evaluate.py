@@ -21,7 +21,13 @@ from reconstruction.evaluation.scene import (
     placed_meshes,
 )
 from reconstruction.evaluation.stage_results import StageResults
-from reconstruction.evaluation.surfaces import OBJECT_POINTS, compare, sample, sample_seen
+from reconstruction.evaluation.surfaces import (
+    COMPOSITION_POINTS,
+    OBJECT_POINTS,
+    compare,
+    sample,
+    sample_seen,
+)
 from reconstruction.progress import NO_PROGRESS, Progress
 from registry import SceneBundle
 from registry.errors import UsageError
@@ -67,6 +73,7 @@ def evaluate_scene(
     *,
     stages: StageResults | None = None,
     video: Path | None = None,
+    composition_points: int = COMPOSITION_POINTS,
     progress: Progress = NO_PROGRESS,
 ) -> Evaluation:
     """Evaluate a scene against the truth, or without it only what needs none (physics, rendering, registration).
@@ -76,6 +83,7 @@ def evaluate_scene(
         ground_truth: folder of CONTRACT section 3, or of cameras and depth only; None where there is no truth.
         stages: the results of the scene's stages, for the figures per stage; None leaves them out.
         video: the video, for kept-out frames, where the stages' results are gone; None: the one beside the truth.
+        composition_points: drawn on each side's whole surface; the contract's figures need the default.
         progress: told of each part.
 
     Raises:
@@ -95,7 +103,7 @@ def evaluate_scene(
         moved = [mesh.moved(alignment.true_from_estimated) for mesh in scene]
         _cameras(alignment, truth, out)
         parts += [
-            lambda: _composition(moved, truth, stages, alignment, out),
+            lambda: _composition(moved, truth, stages, alignment, composition_points, out),
             lambda: _objects(bundle, moved, truth, out),
             lambda: _stage_figures(truth, stages, alignment, out),
         ]
@@ -195,13 +203,18 @@ def _cameras(alignment: Alignment, truth: GroundTruth, out: Evaluation) -> None:
 
 
 def _composition(
-    scene: list[PlacedMesh], truth: GroundTruth, stages: StageResults, alignment: Alignment, out: Evaluation
+    scene: list[PlacedMesh],
+    truth: GroundTruth,
+    stages: StageResults,
+    alignment: Alignment,
+    count: int,
+    out: Evaluation,
 ) -> None:
     from reconstruction.evaluation.stages import sensor_surface, surface_figures
 
     poses = list(truth.world_from_camera.values())
     if truth.entities:
-        true_seen = sample_seen(*joined([e.mesh for e in truth.entities]), truth.camera, poses)
+        true_seen = sample_seen(*joined([e.mesh for e in truth.entities]), truth.camera, poses, count)
     else:
         # What a depth sensor measured stands for the surface; it tells of no normals worth comparing.
         true_seen = sensor_surface(truth)
@@ -210,7 +223,7 @@ def _composition(
         reason = "the truth has neither meshes nor depth"
         out.left_out.update({"cd_cm": reason, "f_5cm": reason, "nc": reason})
         return
-    estimated = sample_seen(*joined(scene), truth.camera, poses)
+    estimated = sample_seen(*joined(scene), truth.camera, poses, count)
     score = compare(estimated, true_seen, COMPOSITION_BOUND_M)
     if score is None:
         reason = "no part of the scene is where the true cameras look"
@@ -222,7 +235,7 @@ def _composition(
             out.metrics["nc"] = score.nc
     surface = stages.get("surface")
     if surface is not None:
-        figures = surface_figures(surface, alignment, truth, true_seen, COMPOSITION_BOUND_M)
+        figures = surface_figures(surface, alignment, truth, true_seen, COMPOSITION_BOUND_M, count)
         if not truth.entities:
             figures.pop("nc", None)
         out.stages["surface"] = figures

@@ -92,12 +92,17 @@ def _depth_error(error: np.ndarray) -> dict[str, float]:
 
 
 def surface_figures(
-    surface: Surface, alignment: Alignment, truth: GroundTruth, true_seen: Samples, bound_m: float
+    surface: Surface,
+    alignment: Alignment,
+    truth: GroundTruth,
+    true_seen: Samples,
+    bound_m: float,
+    count: int,
 ) -> dict[str, float]:
     """Chamfer distance, F-score and normal consistency of the visible surface, before it is cut into objects."""
     vertices = alignment.to_true(surface.vertices)
     poses = list(truth.world_from_camera.values())
-    seen = sample_seen(vertices, surface.faces, truth.camera, poses)
+    seen = sample_seen(vertices, surface.faces, truth.camera, poses, count)
     score = compare(seen, true_seen, bound_m)
     if score is None:
         return {}

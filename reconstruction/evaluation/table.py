@@ -65,7 +65,11 @@ def as_table(evaluation: Evaluation) -> str:
             lines.append(f"  {name:<26} {'left out':>10}   {evaluation.left_out[name]}")
     lines += _objects(evaluation) + _stages(evaluation)
     known = {name for name, _, _ in _ROWS}
-    lines += [f"left out: {name}: {why}" for name, why in evaluation.left_out.items() if name not in known]
+    reasons: dict[str, list[str]] = {}
+    for name, why in evaluation.left_out.items():
+        if name not in known:
+            reasons.setdefault(why, []).append(name)
+    lines += [f"left out: {', '.join(names)}: {why}" for why, names in reasons.items()]
     return "\n".join(lines)
 
 
@@ -95,7 +99,6 @@ def _stages(evaluation: Evaluation) -> list[str]:
             lines.append(f"  {stage:<10} {name:<26} {form.format(value):>10}   {meaning}")
     for part, figures in (evaluation.stages.get("instances") or {}).items():
         if figures:
-            lines.append(
-                f"  instances  {part:<26} {figures['mean_iou']:>10.2f}   mean IoU; found at 0.5: {figures['recall_50']:.2f}"
-            )
+            found = f"mean IoU; found at 0.5: {figures['recall_50']:.2f}"
+            lines.append(f"  instances  {part:<26} {figures['mean_iou']:>10.2f}   {found}")
     return ["stages", *lines] if lines else []

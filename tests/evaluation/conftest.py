@@ -1,0 +1,35 @@
+"""One room for all tests of the ruler: its truth is written once."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from truth_bundle import Change, Truth, write_bundle, write_truth
+
+from reconstruction.evaluation import Evaluation, evaluate_scene
+
+POINTS = 40_000
+
+
+@pytest.fixture(scope="session")
+def truth(tmp_path_factory) -> Truth:
+    """The room's truth on disk."""
+    return write_truth(tmp_path_factory.mktemp("truth"))
+
+
+@pytest.fixture
+def evaluate(truth, tmp_path) -> Callable[..., Evaluation]:
+    """Return a function that evaluates the truth, changed as asked, against the truth."""
+
+    def run(change: Change | None = None, folder: Path | None = None) -> Evaluation:
+        bundle = write_bundle(truth, folder or tmp_path / "bundle", change)
+        return evaluate_scene(bundle, truth.folder, video=truth.frames, composition_points=POINTS)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def perfect(truth, tmp_path_factory) -> Evaluation:
+    """The truth against itself."""
+    bundle = write_bundle(truth, tmp_path_factory.mktemp("perfect") / "bundle")
+    return evaluate_scene(bundle, truth.folder, video=truth.frames, composition_points=POINTS)
