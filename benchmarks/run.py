@@ -74,7 +74,6 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 if everything has figures, 1 if something failed, 130 if interrupted."""
     arguments = build_parser().parse_args(argv)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return _run(arguments)
     except SimReconError as error:
@@ -274,4 +273,7 @@ def _summary(result: Result) -> str:
 
 
 if __name__ == "__main__":
+    # Also where a shell started this in the background, with Ctrl-C ignored; commands then inherit the default.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     sys.exit(main())
