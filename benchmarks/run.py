@@ -161,7 +161,7 @@ def run_variant(
             meaning=variant.meaning,
             status=status,
             exit_code=exit_code,
-            error=error,
+            error=error.replace(str(home), "<home>").replace(str(capture.source), capture.source.name),
             commit=code["commit"],
             dirty=code["dirty"],
             date=datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),

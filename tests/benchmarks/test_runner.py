@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks.results import load_result, load_results
 from benchmarks.run import main, run_command
+from reconstruction.pipeline import STAGE_NAMES
 from reconstruction.synthetic.capture import write_ground_truth
 from reconstruction.synthetic.film import film_room, handheld_path, phone_camera, prepare
 from reconstruction.synthetic.room import build_room
@@ -47,6 +48,7 @@ def test_a_capture_that_fails_is_a_row_that_says_why(broken):
     result = load_result(out / "shopping" / "fast.json")
     assert (result.status, result.exit_code) == ("reconstruct failed", 3)
     assert "video.mp4" in result.error
+    assert str(out) not in result.error  # the page is published; whose machine it was is nobody's business
     assert result.machine["cores"] >= 1
     assert result.commit
     text = page.read_text()
@@ -179,3 +181,14 @@ def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
     assert result.metrics["time_s"] == pytest.approx(sum(result.report["timings_s"].values()))
     assert result.metrics["peak_memory_mb"] > 100
     assert "### room" in page.read_text()
+
+    # A run whose stages all come from the cache tells what they cost when they were computed.
+    again = subprocess.run([*line, "--force"], cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert again.returncode == 0, again.stdout + again.stderr
+    repeated = load_results(out)[0]
+    assert "assembly: already done" in log.read_text()
+    assert repeated.wall_s["reconstruct"] < 0.5 * repeated.metrics["time_s"]
+    for stage in STAGE_NAMES:
+        assert repeated.report["timings_s"][stage] == result.report["timings_s"][stage]
+    same = {key for key in result.metrics if key not in ("time_s", "peak_memory_mb")}
+    assert {key: repeated.metrics[key] for key in same} == {key: result.metrics[key] for key in same}
