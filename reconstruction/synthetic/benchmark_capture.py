@@ -70,7 +70,7 @@ class CaptureSpec:
     def sensor(self) -> Sensor:
         """Return what the phone does to light."""
         shutter = self.motion_blur_s * self.fps
-        return Sensor(self.noise, self.exposure_drift, shutter, 2 if shutter <= 0.15 else 4)
+        return Sensor(self.noise, self.exposure_drift, shutter, blur_samples=4, blur_jitter=True)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Light is computed once per vertex from many shadow maps (lamps spread over the c
 darken corners), so a frame costs one pass of the rasterizer and one texture lookup per sample.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -235,6 +235,8 @@ class Sensor:
     """Share of the time between two frames that the shutter is open; 0 draws sharp frames."""
     blur_samples: int = 3
     """Positions along the motion that a blurred frame averages."""
+    blur_jitter: bool = False
+    """Draw each of those positions unsupersampled, shifted by its share of a pixel: as smooth, and much faster."""
 
 
 def film_room(
@@ -270,15 +272,27 @@ def iterate_film(
         if sensor.blur_shutter > 0:
             other = world_from_camera[min(number + 1, count - 1)]
             shares = np.linspace(0, sensor.blur_shutter, sensor.blur_samples)
-            image = np.mean(
-                [render_color(film_set, camera, _between(pose, other, s), supersample) for s in shares],
-                axis=0,
-            )
+            shots = [
+                (_between(pose, other, s), *_shot(camera, k, sensor, supersample))
+                for k, s in enumerate(shares)
+            ]
+            image = np.mean([render_color(film_set, lens, at, times) for at, lens, times in shots], axis=0)
         else:
             image = render_color(film_set, camera, pose, supersample)
         gain = 1 + sensor.exposure_drift * np.sin(phase + 2 * np.pi * 1.3 * number / max(count, 1))
         image = image * gain + sensor.noise * rng.standard_normal(image.shape, np.float32)
         yield np.clip(image + 0.5, 0, 255).astype(np.uint8)
+
+
+def _shot(camera: Camera, number: int, sensor: Sensor, supersample: int) -> tuple[Camera, int]:
+    """Return camera and supersampling of one of the pictures that make a blurred frame."""
+    if not sensor.blur_jitter:
+        return camera, supersample
+    # A lattice of rank 1 spreads any number of samples over the pixel; together they must not shift the frame.
+    order = np.arange(sensor.blur_samples)
+    x, y = (order + 0.5) / len(order) - 0.5, order * 0.618034 % 1.0
+    y = y - y.mean()
+    return replace(camera, cx=camera.cx + float(x[number]), cy=camera.cy + float(y[number])), 1
 
 
 def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:

@@ -23,7 +23,7 @@ KINDS: dict[str, Kind] = {
 }  # fmt: skip
 """Everything that a procedural room may hold."""
 
-_WALK_AWAY_M = 0.85  # of the camera from the middle group, as a person stands at a table
+_WALK_AWAY_M = 0.78  # of the camera from the middle group, as a person stands at a table
 _WALK_HALF_M = 0.36  # half the width of the band that stays free
 _ZONE_M = 0.52  # between the band and the walls
 _WALL_YAW = {"wall_north": 0.0, "wall_west": np.pi / 2, "wall_south": np.pi, "wall_east": -np.pi / 2}

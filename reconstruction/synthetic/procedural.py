@@ -106,22 +106,23 @@ def _fill(spec: RoomSpec, room: Layout) -> Layout:
     small = count - middle - side - hanging
     containers = min(round(spec.containers * count), small // 2)
     holders = containers + sum(item.key == "crate" for item in room.items)
-    inside = min(int(sum(room.rng.integers(1, 4) for _ in range(holders))), small - containers)
-    inside = max(inside, min(holders, small - containers))
-    stacked = (
-        0 if spec.max_stack < 2 else min(round(spec.stacks * small), (small - containers - inside) * 2 // 3)
-    )
-    free = small - containers - inside - stacked
-    supports = min(free, -(-stacked // max(spec.max_stack - 1, 1)) + (stacked > 1))
+    available = max(small - containers - holders, 0)  # every holder gets something
+    stacked = min(round(spec.stacks * small), available * (spec.max_stack - 1) // spec.max_stack)
+    supports = -(-stacked // (spec.max_stack - 1)) if stacked else 0
+    left = small - containers - stacked - supports
+    inside = min(int(sum(room.rng.integers(1, 4) for _ in range(holders))), left)
+    free = left - inside
     for _ in range(containers):
         room.put(layout.CONTAINER_KINDS, room.open_places)
-    for _ in range(supports if stacked else 0):
+    for _ in range(supports):
         room.put(layout.support_keys(), room.open_places)
-    for _ in range(stacked):
-        room.put(layout.stacked_keys(), room.stack_places, 20)
+    for number in range(stacked):
+        # Every other one has a flat top, so that stacks can grow.
+        keys = layout.support_keys() if number % 2 == 0 and number + 1 < stacked else layout.stacked_keys()
+        room.put(keys, lambda: room.stack_places() or room.open_places(), 20)
     for _ in range(inside):
         room.put(layout.content_keys(), room.container_places, 20)
-    for _ in range(free - (supports if stacked else 0)):
+    for _ in range(free):
         room.put(layout.free_keys(), room.open_places)
     return room
 

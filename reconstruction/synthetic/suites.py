@@ -15,7 +15,7 @@ CI_CAPTURES: dict[str, CaptureSpec] = {
         _SMALL, room=RoomSpec(seed=1, objects=6, stacks=0.0, containers=0.0, clutter_gap_m=0.1)
     ),
     "ci_stack": replace(
-        _SMALL, room=RoomSpec(seed=4, objects=7, stacks=0.5, containers=0.15, clutter_gap_m=0.08)
+        _SMALL, room=RoomSpec(seed=4, objects=8, stacks=0.4, containers=0.12, clutter_gap_m=0.08)
     ),
 }
 """Small enough that `simrecon reconstruct --preset fast` takes about a minute on two cores."""

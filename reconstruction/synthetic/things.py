@@ -275,19 +275,21 @@ def make_candle(shop: Workshop, name: str) -> Thing:
 def prism(outline: np.ndarray, depth: float, textures_of: tuple[str, str], step_m: float) -> Solid:
     """Extrude a convex outline (k, 2) of (x, z), counter-clockwise, along y, centered; (side, cap) textures."""
     side, cap = textures_of
-    patches, start = [], 0.0
+    patches = []
     half = depth / 2
     for a, b in zip(outline, np.roll(outline, -1, axis=0)):
+        # Prints stand upright: v rises with z, and u runs to the right for who looks at the face.
+        a, b, right = (a, b, -1.0) if b[1] >= a[1] else (b, a, 1.0)
         length = float(np.linalg.norm(b - a))
         s = np.linspace(0, 1, int(np.ceil(length / step_m)) + 1)
         t = np.linspace(0, 1, int(np.ceil(depth / step_m)) + 1)
         flat = a + s[:, None] * (b - a)
-        y = half - depth * t
+        y = right * (depth * t - half)
         points = np.empty((len(s), len(t), 3))
         points[..., 0], points[..., 1], points[..., 2] = flat[:, None, 0], y[None], flat[:, None, 1]
-        uvs = np.stack(np.broadcast_arrays(start + s[:, None] * length, t[None] * depth), -1)
-        patches.append(_outward(points, uvs, side, np.array([(b - a)[1], 0, -(b - a)[0]])))
-        start += length
+        uvs = np.stack(np.broadcast_arrays(t[None] * depth, s[:, None] * length), -1)
+        outward = -right * np.array([(b - a)[1], 0, -(b - a)[0]])
+        patches.append(_outward(points, uvs, side, outward))
     closed = np.concatenate([outline, outline[:1]])
     for sign in (-1, 1):
         rim = np.column_stack([closed[:, 0], np.full(len(closed), sign * half), closed[:, 1]])

@@ -57,7 +57,7 @@ def walk_path(shape: RoomShape, kind: str, n_frames: int, seed: int, shake: floa
 
 def _aim(shape: RoomShape, ground: np.ndarray, t: np.ndarray, looks_up: float) -> np.ndarray:
     """Look down at the middle and up at what stands behind it, in turn; returns points (n, 3)."""
-    reach = np.array([max(h - 0.85, 0.0) for h in shape.half])
+    reach = np.array([max(h - 0.8, 0.0) for h in shape.half])
     follow = np.clip(ground, -0.6 * reach, 0.6 * reach)  # along a long row of tables, look at the near one
     near = np.column_stack([follow, np.full(len(t), 0.52)])
     away = -ground / np.linalg.norm(ground, axis=1, keepdims=True)
