@@ -1,7 +1,7 @@
 """A small filmed room taken through the stages that make pictures, published, with its truth beside it."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +17,15 @@ from reconstruction.pipeline import STAGES, Run
 from reconstruction.profiling import Usage
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.publish import publish_scene
+from reconstruction.report.page import build_page
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
 from reconstruction.surface import SurfaceConfig, fuse_surface
+from reconstruction.synthetic.capture import make_test_capture
 from reconstruction.types import ScaleEstimate, WorldFrame
 from registry import SceneBundle, SceneRegistry
 
 SCENE = "small_room"
+THINGS = ("table", "mug", "box", "picture")
 SFM_SCALE = 0.5  # sfm units per metre: what is shown must be in metres all the same
 
 
@@ -45,11 +48,16 @@ class Reconstructed:
 
 
 @pytest.fixture(scope="session")
-def reconstructed(small_capture, tmp_path_factory) -> Reconstructed:
-    """The generated room with true cameras and depth; everything after them is computed, coarsely."""
+def reconstructed(tmp_path_factory) -> Reconstructed:
+    """A generated room with true cameras and nearly true depth; everything after them is computed, coarsely."""
     home = tmp_path_factory.mktemp("report")
+    capture = make_test_capture(9, 256, 192, objects=THINGS)
     sfm_from_world = np.diag([SFM_SCALE, SFM_SCALE, SFM_SCALE, 1.0])
-    posed, depth = small_capture.in_sfm_space(sfm_from_world)
+    noise = 1 + 0.002 * np.random.default_rng(0).standard_normal(capture.depth.depth.shape)
+    capture = replace(
+        capture, depth=replace(capture.depth, depth=(capture.depth.depth * noise).astype(np.float32))
+    )
+    posed, depth = capture.in_sfm_space(sfm_from_world)
     world = WorldFrame(
         np.linalg.inv(sfm_from_world),
         ScaleEstimate("marker", 0.02, "a test said so"),
@@ -59,18 +67,16 @@ def reconstructed(small_capture, tmp_path_factory) -> Reconstructed:
         True,
     )
     surface = fuse_surface(
-        small_capture.posed, small_capture.depth, SurfaceConfig(voxel_size_m=0.016, space_voxel_m=0.04)
+        capture.posed, capture.depth, SurfaceConfig(voxel_size_m=0.016, space_voxel_m=0.04)
     )
-    found = find_instances(
-        small_capture.posed, small_capture.depth, surface, InstancesConfig(), progress=NO_PROGRESS
-    )
+    found = find_instances(capture.posed, capture.depth, surface, InstancesConfig(), progress=NO_PROGRESS)
     coarse = AssetsConfig(
         cells_along_longest=32, max_voxels=100_000, texture_max_px=128, texture_frames=4, base_texel_m=0.04
     )
-    assets = build_assets(small_capture.posed, small_capture.depth, surface, found, coarse)
+    assets = build_assets(capture.posed, capture.depth, surface, found, coarse)
     graph = infer_scene_graph(assets, SceneGraphConfig())
     results = {
-        "frames": small_capture.frame_set(),
+        "frames": capture.frame_set(),
         "poses": posed,
         "depth": depth,
         "world": world,
@@ -81,8 +87,20 @@ def reconstructed(small_capture, tmp_path_factory) -> Reconstructed:
         "assembly": assemble(assets, graph, AssemblyConfig()),
     }
     publish(home, results, PipelineConfig(surface=SurfaceConfig(voxel_size_m=0.016)))
-    write_truth(small_capture, home / "truth")
+    write_truth(capture, home / "truth")
     return Reconstructed(home, home / "truth")
+
+
+@pytest.fixture(scope="session")
+def page(reconstructed) -> str:
+    """The page without a truth."""
+    return build_page(*reconstructed.open())
+
+
+@pytest.fixture(scope="session")
+def page_with_truth(reconstructed) -> str:
+    """The page with the truth beside everything."""
+    return build_page(*reconstructed.open(), reconstructed.truth)
 
 
 def publish(home: Path, results: dict, config: PipelineConfig) -> None:

@@ -32,16 +32,6 @@ def left_out(page: str) -> list[str]:
     return [html.unescape(text) for text in re.findall(r'<p class="left-out">([^<]+)</p>', page)]
 
 
-@pytest.fixture(scope="module")
-def page(reconstructed) -> str:
-    return build_page(*reconstructed.open())
-
-
-@pytest.fixture(scope="module")
-def page_with_truth(reconstructed) -> str:
-    return build_page(*reconstructed.open(), reconstructed.truth)
-
-
 def test_nothing_is_left_out_and_all_sections_are_there(page):
     assert left_out(page) == []
     assert re.findall(r'<section id="([\w-]+)"', page) == SECTIONS
