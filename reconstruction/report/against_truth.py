@@ -7,16 +7,16 @@ from reconstruction.report.collect import Gathered
 
 # Metric, name, unit, factor, digits: what a reader looks at first.
 _HEADLINE = (
-    ("ate_cm", "camera error", "cm", 1, 1),
+    ("ate_cm", "camera error", " cm", 1, 1),
     ("scale_error", "scale error", "%", 100, 1),
-    ("cd_cm", "Chamfer", "cm", 1, 1),
+    ("cd_cm", "Chamfer", " cm", 1, 1),
     ("f_5cm", "F-score, 5 cm", "%", 1, 0),
     ("object_recall_25", "objects found, IoU 0.25", "%", 100, 0),
     ("object_precision_25", "object precision", "%", 100, 0),
-    ("object_cd_cm", "object Chamfer", "cm", 1, 1),
+    ("object_cd_cm", "object Chamfer", " cm", 1, 1),
     ("object_f_1cm", "object F-score, 1 cm", "%", 1, 0),
     ("graph_f1", "graph F1", "", 1, 2),
-    ("psnr_db", "PSNR", "dB", 1, 1),
+    ("psnr_db", "PSNR", " dB", 1, 1),
 )
 
 
@@ -26,11 +26,11 @@ def truth_section(g: Gathered) -> Section | None:
         return None
     metrics = g.evaluation["metrics"]
     tiles = [
-        Tile(f"{factor * metrics[key]:.{digits}f} {unit}".strip(), name)
+        Tile(f"{factor * metrics[key]:.{digits}f}{unit}", name)
         for key, name, unit, factor, digits in _HEADLINE
         if metrics.get(key) is not None
     ]
-    blocks: list[Block] = [Tiles(tiles)]
+    blocks: list[Block] = [Tiles(tiles, columns=5)]
     if g.evaluation["objects"]:
         blocks.append(_objects_table(g))
     extra = [f"{item['label']} {item['id']}" for item in g.evaluation["extra"]]
@@ -42,7 +42,9 @@ def truth_section(g: Gathered) -> Section | None:
     left = g.evaluation["left_out"]
     if left:
         blocks += [Text(f"{name} left out: {why}.", left_out=True) for name, why in sorted(left.items())]
-    return Section("truth", "Against the truth", blocks, "After aligning the cameras with the true ones.")
+    return Section(
+        "truth", "Against the truth", blocks, "After aligning the cameras with the true ones.", "Truth"
+    )
 
 
 def _objects_table(g: Gathered) -> Table:
@@ -55,7 +57,7 @@ def _objects_table(g: Gathered) -> Table:
                 Cell("missed", "bad") if match is None else Cell(g.names[match]),
                 Cell(f"{item['box_iou']:.2f}", "" if item["box_iou"] >= 0.5 else "warn"),
                 Cell(f"{item['cd_cm']:.1f} cm"),
-                Cell(f"{item['f_1cm']:.0f} %"),
+                Cell(f"{item['f_1cm']:.0f}%"),
                 Cell("–")
                 if right is None
                 else Cell("right" if right else "wrong", "good" if right else "bad"),
@@ -66,12 +68,15 @@ def _objects_table(g: Gathered) -> Table:
 
 
 def _stages_table(stages: dict[str, Any]) -> Table:
+    """One row for each stage, in the order of the pipeline."""
+    from reconstruction.pipeline import STAGE_NAMES
+
+    order = [name for name in STAGE_NAMES if name in stages] + sorted(set(stages) - set(STAGE_NAMES))
     rows = []
-    for stage, figures in stages.items():
-        for name, value in _flat(figures):
-            rows.append([Cell(stage), Cell(name.replace("_", " ")), Cell(value)])
-            stage = ""  # named once
-    return Table(["stage", "figure", "value"], rows, numeric=[2])
+    for stage in order:
+        figures = [f"{name.replace('_', ' ')} {value}" for name, value in _flat(stages[stage])]
+        rows.append([Cell(stage), Cell(" · ".join(figures))])
+    return Table(["stage", "figures"], rows)
 
 
 def _flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -57,7 +57,6 @@ class Table:
     rows: list[list[Cell]]
     numeric: list[int] = field(default_factory=list)
     caption: str = ""
-    helps: dict[int, str] = field(default_factory=dict)  # column -> what it means
 
 
 @dataclass(frozen=True)
@@ -76,6 +75,7 @@ class Tiles:
 
     kind: ClassVar[str] = "tiles"
     items: list[Tile]
+    columns: int = 6
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,16 @@ class Cards:
     items: list[Card]
 
 
-Block = Pictures | Legend | Table | Tiles | Plots | Text | Listing | Details | Cards
+@dataclass(frozen=True)
+class Split:
+    """Two blocks side by side on a wide screen."""
+
+    kind: ClassVar[str] = "split"
+    left: "Block"
+    right: "Block"
+
+
+Block = Pictures | Legend | Table | Tiles | Plots | Text | Listing | Details | Cards | Split
 
 
 @dataclass(frozen=True)
@@ -148,3 +157,4 @@ class Section:
     title: str
     blocks: list[Block]
     lead: str = ""
+    short: str = ""  # its name in the table of contents, where the title is too long

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 BACKGROUND = np.array([236, 238, 241], np.uint8)
 UNKNOWN = np.array([222, 224, 228], np.uint8)
 PAPER = np.array([205, 208, 212], np.float32)
+ERROR_MAP = "YlOrRd"
 _FAR = 40.0  # A camera this many radii away is orthographic to a percent.
 
 Placed = tuple[TexturedMesh, np.ndarray]  # a mesh with its world_from_mesh

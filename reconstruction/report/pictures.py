@@ -107,7 +107,7 @@ def _depth_error(
     known = (depth > 0) & (true[0] > 0)
     error = np.abs(depth * g.truth.alignment.scale - true[0])
     median = float(np.median(error[known])) if known.any() else None
-    colored = drawing.colorize(error, 0, DEPTH_ERROR_M, "inferno", known)
+    colored = drawing.colorize(error, 0, DEPTH_ERROR_M, drawing.ERROR_MAP, known)
     text = "nothing to compare" if median is None else f"median {100 * median:.1f} cm"
     return _frame(colored, f"depth error of frame {index}", text), median
 
@@ -129,7 +129,7 @@ def side_views(g: Gathered, width: int = VIEW_PX) -> list[tuple[str, Camera, np.
     points = np.concatenate([_box(v) for v in things])
     floor = [m for m in g.meshes if m.label == "floor"]
     for mesh in floor:  # as much floor as lies around the things
-        low, high = points.min(axis=0) - 0.6, points.max(axis=0) + 0.6
+        low, high = points.min(axis=0) - 0.4, points.max(axis=0) + 0.4
         inside = np.clip(_box(mesh.vertices), low, high)
         points = np.concatenate([points, inside])
     center = points.mean(axis=0)
@@ -168,15 +168,11 @@ def surface_views(g: Gathered) -> tuple[list[Picture], list[str]]:
         for name, camera, pose in views:
             faces = surface_faces(g, surface, pose)
             image = drawing.render_colored(vertices, faces, colors, camera, pose)
-            out.append(picture(image, f"the surface {name}, {what}", f"{name}, {what}"))
+            out.append(picture(image, f"the surface {name}, {what}", what))
     if g.truth is not None and g.truth.has_meshes:
         for name, camera, pose in views:
             image, median = error_view(g, vertices, surface_faces(g, surface, pose), camera, pose)
-            out.append(
-                picture(
-                    image, f"surface error {name}", f"distance to the truth, median {100 * median:.1f} cm"
-                )
-            )
+            out.append(picture(image, f"surface error {name}", f"error, median {100 * median:.1f} cm"))
     return out, [name for name, _, _ in views]
 
 
@@ -212,9 +208,9 @@ def missing_view(
 
 
 def _error_colors(distance: np.ndarray, known: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    image = drawing.colorize(distance, 0, SURFACE_ERROR_M, "inferno", known)
+    image = drawing.colorize(distance, 0, SURFACE_ERROR_M, drawing.ERROR_MAP, known)
     image[depth <= 0] = drawing.BACKGROUND
-    return drawing.shaded(image, depth, camera, 0.25)
+    return drawing.shaded(image, depth, camera)
 
 
 def instance_frames(g: Gathered, count: int = 6) -> list[Picture]:
@@ -424,7 +420,7 @@ def kept_out_frames(g: Gathered, count: int = 4) -> tuple[list[Picture], list[tu
         if score is not None:
             scores.append((score.psnr_db, score.ssim, score.coverage))
             text = f"{score.psnr_db:.1f} dB over {score.coverage:.0%}"
-        drawn = drawing.colorize(difference, 0, COLOR_ERROR, "inferno", covered)
+        drawn = drawing.colorize(difference, 0, COLOR_ERROR, drawing.ERROR_MAP, covered)
         out += [
             picture(frame, f"kept-out frame {index}", f"kept-out frame {index}"),
             picture(image, f"the scene at the camera of frame {index}", "the scene"),

@@ -18,6 +18,7 @@ from reconstruction.report.blocks import (
     Pictures,
     Plots,
     Section,
+    Split,
     Table,
     Text,
     Tile,
@@ -32,7 +33,7 @@ def all_sections(g: Gathered) -> list[Section]:
 
     makers = (
         truth_section, cameras_section, depth_section, gaussians_section, surface_section, instances_section,
-        objects_section, graph_section, assembly_section, physics_section, kept_out_section, cost_section,
+        objects_section, graph_section, assembly_section, kept_out_section, physics_section, cost_section,
         notes_section,
     )  # fmt: skip
     made = [maker(g) for maker in makers]
@@ -58,9 +59,7 @@ def summary_tiles(g: Gathered) -> Tiles:
         tiles.append(Tile(f"{depth:.1f} mm", "deepest overlap", _graded(-depth, -1.0, -5.0)))
     sigma = scale["uncertainty"]
     tiles.append(
-        Tile(
-            f"± {100 * sigma:.0f} %", "scale", _graded(-sigma, -0.05, -0.2), scale["method"].replace("-", " ")
-        )
+        Tile(f"± {sigma:.0%}", "scale", _graded(-sigma, -0.05, -0.2), scale["method"].replace("-", " "))
     )
     if "registration" in report:
         found = report["registration"]
@@ -84,13 +83,6 @@ def cameras_section(g: Gathered) -> Section:
         blocks.append(left_out("Keyframes", g.why_missing("poses", "world")))
     else:
         blocks.append(Pictures(pictures.keyframes(g), 6, phone_columns=3))
-    blocks.append(
-        Pictures(
-            [pictures.camera_path(g)], 1, phone_columns=1,
-            caption="The assembled scene from above. Full dots are keyframes, empty dots are kept-out frames, "
-            "lines show where the camera looks.",
-        )
-    )  # fmt: skip
     centers = g.bundle.cameras.world_from_camera[:, :3, 3]
     length = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
     scene, source = g.scene, g.scene["source"]
@@ -111,15 +103,22 @@ def cameras_section(g: Gathered) -> Section:
     rows.append(("camera", f"{c.width}×{c.height}, focal length {c.fx:.0f} px, field of view {_fov(c):.0f}°"))
     scale = scene["scale"]
     detail = f"; {scale['detail']}" if scale.get("detail") else ""
-    rows.append(("scale", f"{scale['method']}, ± {100 * scale['uncertainty']:.0f} % (1 σ){detail}"))
+    rows.append(("scale", f"{scale['method']}, ± {scale['uncertainty']:.0%} (1 σ){detail}"))
     world = scene.get("world")
     if world:
         floor = "seen" if world["floor_observed"] else "assumed below everything seen"
         rows.append(
             ("gravity", f"{world['gravity_method']}, ± {world['gravity_sigma_deg']:.1f}°; floor {floor}")
         )
-    blocks.append(facts(rows))
-    return Section("cameras", "Video and cameras", blocks)
+    path = Pictures(
+        [pictures.camera_path(g)],
+        1,
+        phone_columns=1,
+        caption="The assembled scene from above. Full dots are keyframes, empty dots kept-out frames; lines show where "
+        "the camera looks.",
+    )
+    blocks.append(Split(path, facts(rows)))
+    return Section("cameras", "Video and cameras", blocks, short="Cameras")
 
 
 def _fov(camera: Any) -> float:
@@ -145,7 +144,7 @@ def depth_section(g: Gathered) -> Section:
     section.blocks.append(Legend(drawing.gradient("turbo_r"), "near", "far", "depth; gray: unknown"))
     if errors:
         limit = f"{100 * pictures.DEPTH_ERROR_M:.0f} cm or more"
-        section.blocks.append(Legend(drawing.gradient("inferno"), "0", limit, "error of the depth"))
+        section.blocks.append(Legend(drawing.gradient(drawing.ERROR_MAP), "0", limit, "error of the depth"))
     section.blocks.append(
         Text(
             "Normals have world axes as colors: the floor is even lavender, facing walls are even red or green."
@@ -182,7 +181,9 @@ def surface_section(g: Gathered) -> Section:
 
 def _distance_legend() -> Legend:
     limit = f"{100 * pictures.SURFACE_ERROR_M:.0f} cm or more"
-    return Legend(drawing.gradient("inferno"), "0", limit, "distance to the true surface; gray: never filmed")
+    return Legend(
+        drawing.gradient(drawing.ERROR_MAP), "0", limit, "distance to the true surface; gray: never filmed"
+    )
 
 
 def instances_section(g: Gathered) -> Section:
@@ -280,7 +281,8 @@ def assembly_section(g: Gathered) -> Section:
     blocks: list[Block] = []
     if g.seen_poses is None:
         blocks.append(left_out("The scene before assembly", g.why_missing("assets")))
-    blocks.append(Pictures(shown, len(shown), phone_columns=1))
+    shown += [] if moved is None else [moved]
+    blocks.append(Pictures(shown, 2, phone_columns=1))
     rows = [
         [
             Cell(g.names[o["id"]], swatch=drawing.css_color(g.colors[o["id"]])),
@@ -294,8 +296,6 @@ def assembly_section(g: Gathered) -> Section:
         for o in g.objects
         if "assembly" in o
     ]
-    if moved is not None:
-        blocks.append(Pictures([moved], 2, phone_columns=1))
     if rows:
         blocks.append(Table(["object", "moved", "turned", "kind", "what was done"], rows, numeric=[1, 2]))
     true = g.truth is not None and g.truth.has_meshes
@@ -358,7 +358,7 @@ def physics_section(g: Gathered) -> Section:
 
 def kept_out_section(g: Gathered) -> Section:
     """The scene at the cameras of frames that nothing was fitted to."""
-    section = Section("kept-out", "Kept-out frames", [])
+    section = Section("kept-out", "Kept-out frames", [], short="Kept out")
     if g.posed is None:
         section.blocks.append(left_out("Kept-out frames", g.why_missing("poses", "world")))
         return section
@@ -368,7 +368,9 @@ def kept_out_section(g: Gathered) -> Section:
     items, scores = pictures.kept_out_frames(g)
     section.blocks.append(Pictures(items, 3, ["frame", "scene", "color error"], phone_columns=3))
     limit = f"{pictures.COLOR_ERROR:.0f} of 255"
-    section.blocks.append(Legend(drawing.gradient("inferno"), "0", limit, "color error; gray: nothing there"))
+    section.blocks.append(
+        Legend(drawing.gradient(drawing.ERROR_MAP), "0", limit, "color error; gray: nothing there")
+    )
     if scores:
         psnr, ssim, covered = np.mean(scores, axis=0)
         section.blocks.append(
@@ -407,7 +409,7 @@ def cost_section(g: Gathered) -> Section:
     rows += [("backends", backends)] if backends else []
     if rows:
         blocks.append(facts(rows))
-    return Section("cost", "Time and memory", blocks)
+    return Section("cost", "Time and memory", blocks, short="Cost")
 
 
 def notes_section(g: Gathered) -> Section:
@@ -425,7 +427,7 @@ def notes_section(g: Gathered) -> Section:
         blocks.append(Details("Overrides", json.dumps(report["overrides"], indent=1)))
     if report.get("config"):
         blocks.append(Details("All options", _config_lines(report["config"])))
-    return Section("notes", "Notes and options", blocks)
+    return Section("notes", "Notes and options", blocks, short="Notes")
 
 
 def changed_options(config: dict[str, dict]) -> list[tuple[str, str, str]]:
