@@ -54,11 +54,12 @@ def sample_seen(
     camera: Camera,
     world_from_camera: list[np.ndarray],
     count: int = COMPOSITION_POINTS,
+    seed: int = _SEED,
 ) -> Samples:
     """Draw `count` area-uniform points and keep those that some camera sees within 5 m."""
     from reconstruction.evaluation.visibility import seen_points
 
-    drawn = sample(vertices, faces, count)
+    drawn = sample(vertices, faces, count, seed)
     seen = seen_points(drawn.points, vertices, faces, camera, world_from_camera)
     return Samples(drawn.points[seen], drawn.normals[seen])
 

@@ -1,4 +1,4 @@
-"""Which points of a surface some camera sees: a depth map per camera, compared with each point's own depth."""
+"""Which points of a surface some camera sees: the triangle at each pixel, compared with each point's own ray."""
 
 from collections.abc import Sequence
 
@@ -10,33 +10,41 @@ from reconstruction.types import Camera
 from registry.geometry import invert_rigid
 
 MAX_DISTANCE_M = 5.0  # CONTRACT section 4: what is farther does not count
-_SIDE_PX = 640
-_TOLERANCE_M, _TOLERANCE_SHARE = 0.002, 0.001
+_SIDE_PX = 960
+_TOLERANCE_M = 0.001
 
 
 @njit(cache=True, parallel=True)
-def _mark_seen(points, m, fx, fy, cx, cy, depth, far, tolerance, share, seen):  # pragma: no cover - compiled
-    """Mark points that lie within `far` of the camera and not behind all of the four pixels around them."""
-    height, width = depth.shape
+def _mark_seen(
+    points, m, eye, fx, fy, cx, cy, face, normals, offsets, far, tolerance, seen
+):  # pragma: no cover
+    """Mark points within `far` of the camera that do not lie behind the triangle seen at their pixel.
+
+    The triangle's plane is cut with the very ray to the point, so slanted surfaces need no slack for the pixel's size.
+    """
+    height, width = face.shape
     for i in prange(points.shape[0]):
         if seen[i]:
             continue
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        a = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-        b = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
         c = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if c <= 1e-3 or a * a + b * b + c * c > far * far:
+        if c <= 1e-3:
             continue
-        u, v = fx * a / c + cx, fy * b / c + cy
+        u = fx * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / c + cx
+        v = fy * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / c + cy
         if u < 0 or v < 0 or u >= width or v >= height:
             continue
-        left, top = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
-        # The depth map is sampled at pixel centers; on a slanted surface the point lies between the four around it.
-        limit = 0.0
-        for row in range(max(top, 0), min(top + 2, height)):
-            for column in range(max(left, 0), min(left + 2, width)):
-                limit = max(limit, depth[row, column])
-        if limit > 0.0 and c <= limit * (1.0 + share) + tolerance:
+        dx, dy, dz = x - eye[0], y - eye[1], z - eye[2]
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if distance > far:
+            continue
+        f = face[int(v), int(u)]
+        if f < 0:
+            continue
+        toward = normals[f, 0] * dx + normals[f, 1] * dy + normals[f, 2] * dz
+        gap = normals[f, 0] * x + normals[f, 1] * y + normals[f, 2] * z - offsets[f]
+        # eye + t (point - eye) meets the plane at t = 1 - gap / toward; behind it means t < 1.
+        if abs(gap) <= tolerance or abs(toward) < 1e-12 or gap / toward * distance <= tolerance:
             seen[i] = True
 
 
@@ -54,21 +62,25 @@ def seen_points(
         points: (n, 3) on the mesh, world space, metres.
         vertices: (v, 3) of everything that can hide them.
         faces: (f, 3).
-        camera: of all poses; depth maps are drawn at most 640 pixels wide.
+        camera: of all poses; what they see is drawn 960 pixels wide.
         world_from_camera: poses (4, 4), OpenCV.
         max_distance_m: from the camera's center.
 
     Returns:
         bool (n,).
     """
-    scale = min(1.0, _SIDE_PX / max(camera.width, camera.height))
+    scale = _SIDE_PX / max(camera.width, camera.height)
     small = camera.resized(round(camera.width * scale), round(camera.height * scale))
+    corners = np.asarray(vertices, np.float64)[np.asarray(faces)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    offsets = np.einsum("fc,fc->f", normals, corners[:, 0])
     seen = np.zeros(len(points), np.bool_)
     points = np.ascontiguousarray(points, np.float64)
     for pose in world_from_camera:
-        depth = rasterize_mesh(vertices, faces, small, pose).depth
+        face = rasterize_mesh(vertices, faces, small, pose).face
         _mark_seen(
-            points, invert_rigid(pose), small.fx, small.fy, small.cx, small.cy, depth, max_distance_m,
-            _TOLERANCE_M, _TOLERANCE_SHARE, seen,
+            points, invert_rigid(pose), np.ascontiguousarray(pose[:3, 3]), small.fx, small.fy, small.cx, small.cy,
+            face, normals, offsets, max_distance_m, _TOLERANCE_M, seen,
         )  # fmt: skip
     return seen
