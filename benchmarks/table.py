@@ -14,6 +14,7 @@ from benchmarks.columns import GROUPS, ORACLE, PAPER, PAPER_ROWS, REAL, Column
 from benchmarks.machine import ROOT, describe_code, machine_line
 from benchmarks.results import Result, load_results
 from benchmarks.variants import BASELINE, VARIANTS, is_oracle
+from reconstruction.profiling import cost_rows
 from registry.errors import SimReconError, UsageError
 
 DEFAULT_OUT = ROOT / "benchmarks" / "out"
@@ -71,6 +72,7 @@ def render_page(results: Sequence[Result], code: dict) -> str:
         paper=_paper(),
         oracles=_oracles(full) or _NOTHING,
         captures=_captures(full, keys) or _NOTHING,
+        times=_times(results) or _NOTHING,
         real=_rows(real, REAL, keys, with_capture=True) if real else _NOTHING,
         runs=_runs(results, keys, code) if results else _NOTHING,
     )
@@ -202,6 +204,21 @@ def _difference(
     if len(differences) < len(pairs):
         text += notes.mark(f"over {len(differences)} of {len(pairs)} captures: the others lack the figure")
     return text
+
+
+# -- Time by stage -----------------------------------------------------------------------------------------------
+
+
+def _times(results: Sequence[Result]) -> str:
+    """Mean wall seconds of each step over the captures of a variant, in the order in which they run."""
+    done = [result for result in results if result.report.get("timings_s")]
+    steps = list(dict.fromkeys(row.name for result in done for row in cost_rows(result.report)))
+    rows = []
+    for name in _variant_names(done):
+        group = [result.report["timings_s"] for result in done if result.variant == name]
+        means = [sum(times.get(step, 0.0) for times in group) / len(group) for step in steps]
+        rows.append([name, f"{len(group)}", *(f"{mean:.1f}" for mean in means), f"{sum(means):.0f}"])
+    return "\n".join(_table(["variant", "captures", *steps, "total"], rows, 2)) if rows else ""
 
 
 # -- Capture by capture --------------------------------------------------------------------------------------------

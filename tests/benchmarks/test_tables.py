@@ -219,3 +219,12 @@ def test_stages_that_no_run_had_have_no_column_and_others_do():
     heads = rows(page, "### Stages", "variant")[0]
     assert heads[2:] == ["recall@.25 ↑", "prec@.25 ↑", "depth error % ↓", "instances IoU ↑"]
     assert rows(page, "### Stages", "default")[0][-2:] == ["1.23", "0.50"]
+
+
+def test_time_by_stage_is_the_mean_over_captures_in_the_order_of_the_run():
+    slow = made("b")
+    slow = replace(slow, report=slow.report | {"timings_s": {"depth": 30.0, "frames": 20.0, "publish": 4.0}})
+    page = render_page([made("a"), slow, failed("c")], CODE)
+    section = "## Time by stage"
+    assert rows(page, section, "variant")[0] == ["variant", "captures", "frames", "depth", "publish", "total"]
+    assert rows(page, section, "default")[0] == ["default", "2", "15.0", "60.0", "3.0", "78"]
