@@ -212,7 +212,8 @@ def _difference(
 def _times(results: Sequence[Result]) -> str:
     """Mean wall seconds of each step over the captures of a variant, in the order in which they run."""
     done = [result for result in results if result.report.get("timings_s")]
-    steps = list(dict.fromkeys(row.name for result in done for row in cost_rows(result.report)))
+    every = {"timings_s": {step: 0.0 for result in done for step in result.report["timings_s"]}}
+    steps = [row.name for row in cost_rows(every)]
     rows = []
     for name in _variant_names(done):
         group = [result.report["timings_s"] for result in done if result.variant == name]
