@@ -7,7 +7,6 @@ depths); and other views object where they looked through the plane. A fill must
 
 from collections.abc import Callable
 
-import numba
 import numpy as np
 
 from reconstruction.depth.config import DepthConfig
@@ -17,166 +16,6 @@ from reconstruction.types import Camera, PosedFrames
 from registry.geometry import invert_rigid
 
 _MAX_LABELS = 20
-
-
-@numba.njit(cache=True, nogil=True)
-def fill_small_gaps(depth, out):  # pragma: no cover - compiled
-    """Fill pixels that measured ones of a single surface surround (5x5, both sides) with the plane through them."""
-    h, w = depth.shape
-    for y in range(h):
-        for x in range(w):
-            out[y, x] = depth[y, x]
-            if depth[y, x] > 0.0 or x < 2 or y < 2 or x >= w - 2 or y >= h - 2:
-                continue
-            n, low, high = 0, 1e30, 0.0
-            left = right = up = down = 0
-            sx = sy = sr = sxx = syy = sxy = sxr = syr = 0.0
-            for b in range(-2, 3):
-                for a in range(-2, 3):
-                    z = depth[y + b, x + a]
-                    if z <= 0.0:
-                        continue
-                    r = 1.0 / z
-                    n += 1
-                    low, high = min(low, r), max(high, r)
-                    left, right, up, down = left + (a < 0), right + (a > 0), up + (b < 0), down + (b > 0)
-                    sx, sy, sr = sx + a, sy + b, sr + r
-                    sxx, syy, sxy = sxx + a * a, syy + b * b, sxy + a * b
-                    sxr, syr = sxr + a * r, syr + b * r
-            if n < 8 or min(min(left, right), min(up, down)) < 2 or high - low > 0.03 * high:
-                continue
-            sxx, syy, sxy = sxx - sx * sx / n, syy - sy * sy / n, sxy - sx * sy / n
-            sxr, syr = sxr - sx * sr / n, syr - sy * sr / n
-            det = sxx * syy - sxy * sxy
-            if det > 1.0:
-                gx, gy = (sxr * syy - syr * sxy) / det, (syr * sxx - sxr * sxy) / det
-                r = (sr - gx * sx - gy * sy) / n
-                if r > 0.0:
-                    out[y, x] = 1.0 / r
-
-
-@numba.njit(cache=True, nogil=True)
-def label_costs(
-    depth, raw, planes, bounds, doubt, neighbors, relative, maps, k, near, far, cost
-):  # pragma: no cover - compiled
-    """Fill cost (h, w, labels + 1): how badly each plane suits a pixel; the last label is "no plane".
-
-    Args:
-        depth: (h, w) measured depth, 0 = none.
-        raw: (h, w) depth before it was checked: a weak hint.
-        planes: (labels, 4) in this camera's space: inverse depth = -(n . r) / d.
-        bounds: (labels, sides, 4) within which each plane was measured, in this camera's space.
-        doubt: (labels,) what filling with a plane costs more, because few things in a room lie like it.
-        neighbors: (m,) rows of `maps`, -1 = none.
-        relative: (m, 4, 4) neighbour_from_view.
-        maps: (n, h, w) measured depth of all views.
-        k: fx, fy, cx, cy.
-        near: Nearest depth that a plane may have here.
-        far: Farthest depth.
-        cost: uint8, written.
-    """
-    h, w = depth.shape
-    labels = planes.shape[0]
-    fx, fy, cx, cy = k
-    for y in range(h):
-        for x in range(w):
-            xn, yn = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
-            z = depth[y, x]
-            cost[y, x, labels] = 35 if z > 0.0 else 42
-            for c in range(labels):
-                p = planes[c]
-                rho = -(p[0] * xn + p[1] * yn + p[2]) / p[3]
-                if not (rho > 1.0 / far and rho < 1.0 / near):
-                    cost[y, x, c] = 200
-                    continue
-                if z > 0.0:
-                    cost[y, x, c] = np.uint8(min(100.0, abs(z * rho - 1.0) * 5000.0))
-                    continue
-                through, agree = 0, 0
-                q = 1.0 / rho
-                within = True
-                for side in range(bounds.shape[1]):
-                    e = bounds[c, side]
-                    if q * (e[0] * xn + e[1] * yn + e[2]) + e[3] < 0.0:
-                        within = False
-                        break
-                if not within:
-                    cost[y, x, c] = 255
-                    continue
-                for s in range(len(neighbors)):
-                    j = neighbors[s]
-                    if j < 0:
-                        break
-                    m = relative[s]
-                    qz = q * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
-                    if qz <= 1e-9:
-                        continue
-                    u = fx * (q * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
-                    v = fy * (q * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
-                    if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
-                        continue
-                    d = maps[j, int(v), int(u)]
-                    if d > 1.025 * qz:
-                        through += 1
-                    elif d > 0.985 * qz and d < 1.015 * qz:
-                        agree += 1
-                value = 44.0 + doubt[c] + 40.0 * through - 15.0 * min(agree, 2)
-                if raw[y, x] > 0.0 and abs(raw[y, x] * rho - 1.0) < 0.015:
-                    value -= 12.0
-                cost[y, x, c] = np.uint8(min(200.0, max(0.0, value)))
-
-
-@numba.njit(cache=True, nogil=True)
-def choose_labels(total, cost, depth, label):  # pragma: no cover - compiled
-    """Write the cheapest label, or -1 where it is "none" or where another view objects to it."""
-    h, w, n = total.shape
-    for y in range(h):
-        for x in range(w):
-            best, at = np.int64(1 << 40), n - 1
-            for c in range(n):
-                if total[y, x, c] < best:
-                    best, at = np.int64(total[y, x, c]), c
-            label[y, x] = at
-            if at == n - 1 or cost[y, x, at] > (30 if depth[y, x] > 0.0 else 66):
-                label[y, x] = -1
-
-
-@numba.njit(cache=True, nogil=True)
-def confirm_fill(i, neighbors, depth, confidence, relative, k, keep):  # pragma: no cover - compiled
-    """Mark in keep (h, w) the completed pixels of view i that the completed maps of other views bear out.
-
-    The planes are the scene's, so right fills meet in space; what was filled with the wrong one differs from view to
-    view, or other views look through it.
-    """
-    h, w = depth.shape[1:]
-    fx, fy, cx, cy = k
-    for y in range(h):
-        for x in range(w):
-            if confidence[i, y, x] != 1:
-                continue
-            z = depth[i, y, x]
-            xn, yn = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
-            agree, through = 0, 0
-            for s in range(len(neighbors)):
-                j = neighbors[s]
-                if j < 0:
-                    break
-                m = relative[s]
-                qz = z * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
-                if qz <= 1e-9:
-                    continue
-                u = fx * (z * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
-                v = fy * (z * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
-                if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
-                    continue
-                d = depth[j, int(v), int(u)]
-                if d <= 0.0:
-                    continue
-                if abs(d - qz) < 0.01 * qz:
-                    agree += 1
-                elif d > 1.02 * qz:
-                    through += 2 if confidence[j, int(v), int(u)] == 2 else 1
-            keep[y, x] = agree >= 2 and agree > through
 
 
 def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarray:
@@ -275,6 +114,13 @@ def complete_depth(
     """Return completed depth and confidence (n, h, w): 2 measured, 1 completed, 0 unknown."""
     import cv2
 
+    from reconstruction.depth.fill_kernels import (
+        choose_labels,
+        confirm_fill,
+        exposure_gains,
+        fill_small_gaps,
+        label_costs,
+    )
     from reconstruction.depth.planes import find_planes, oriented_points, plane_extents
     from reconstruction.depth.refine import fit_slopes
     from reconstruction.depth.sgm import aggregate
@@ -285,6 +131,7 @@ def complete_depth(
     size = (small.width, small.height)
     gapless = np.empty_like(depth)
     maps = np.empty((n, small.height, small.width), np.float32)
+    tones = np.empty((n, small.height, small.width, 3), np.uint8)
     clouds: list[tuple] = [()] * n
 
     def prepare(i: int) -> None:
@@ -294,6 +141,8 @@ def complete_depth(
         fit_slopes(rho, 0.01, smooth, gx, gy)
         clouds[i] = oriented_points(depth[i], gx, gy, camera, posed.world_from_camera[i])
         maps[i] = cv2.resize(depth[i], size, interpolation=cv2.INTER_NEAREST)
+        color = cv2.resize(np.ascontiguousarray(posed.images[i]), size, interpolation=cv2.INTER_AREA)
+        tones[i] = cv2.GaussianBlur(color, (0, 0), 1.0)
 
     each(n, prepare, "looking for planes", progress)
     points, normals, depths = (np.concatenate([c[a] for c in clouds]) for a in range(3))
@@ -314,7 +163,25 @@ def complete_depth(
         cost = np.empty((small.height, small.width, len(local) + 1), np.uint8)
         here = bounds[chosen] @ posed.world_from_camera[i]
         near, far = plan.near[i] * 0.8, plan.far[i]
-        label_costs(maps[i], hint, local, here, doubt[chosen], rows, relative, maps, k, near, far, cost)
+        gains = np.ones(len(rows))
+        exposure_gains(maps[i], tones[i], rows, relative, maps, tones, k, gains)
+        label_costs(
+            maps[i],
+            hint,
+            local,
+            here,
+            doubt[chosen],
+            tones[i],
+            rows,
+            relative,
+            maps,
+            tones,
+            gains,
+            k,
+            near,
+            far,
+            cost,
+        )
         gray = cv2.cvtColor(np.ascontiguousarray(posed.images[i]), cv2.COLOR_RGB2GRAY)
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         total = np.zeros(cost.shape, np.uint16)
