@@ -14,7 +14,7 @@ from reconstruction.synthetic.shapes import Solid, box, lathe, shifted, tube
 from reconstruction.synthetic.things import Kind, Place, Thing, pick_color, prefixed
 
 _SEGMENTS = 48  # of the turned mesh
-_SECTORS = 16  # of its convex pieces; each spans three segments
+_SECTORS = 24  # of its convex pieces; each spans two segments
 
 
 def vessel(outer: np.ndarray, inner: np.ndarray, looks: tuple[str, str], step_m: float) -> Solid:
@@ -143,7 +143,7 @@ def make_bowl(shop: Workshop, name: str) -> Thing:
     solid = vessel(outer, inner, (f"{name}out", f"{name}in"), shop.step_m)
     place = Place(base, disc(floor), inside=True, rim_m=rise, name="inside")
     size = (2 * radius, 2 * radius, height)
-    pieces = vessel_pieces(outer, inner, 4)
+    pieces = vessel_pieces(outer, inner, 5)
     return Thing("bowl", [solid], prefixed(name, look), size, places=(place,), pieces=pieces)
 
 

@@ -62,6 +62,9 @@ def write_video(
             if stream is None:
                 # One thread, so that the same frames always give the same file.
                 settings = {"crf": str(crf), "preset": preset, "threads": "1", "g": str(keyframe_every)}
+                if any(side % 16 for side in image.shape[:2]):
+                    # x264's macroblock tree reads memory that it never wrote below such frames.
+                    settings["x264-params"] = "mbtree=0"
                 stream = container.add_stream(
                     "libx264", rate=Fraction(fps).limit_denominator(1001), options=settings
                 )
