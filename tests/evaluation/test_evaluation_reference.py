@@ -10,7 +10,7 @@ from reconstruction.evaluation.visibility import seen_points
 from registry.geometry import rigid
 
 pytest.importorskip("embreex", reason="the reference casts exact rays with embreex (pip install embreex)")
-POINTS = 200_000
+POINTS = 300_000
 
 
 def seen_by_rays(mesh: trimesh.Trimesh, points: np.ndarray, truth) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_geometry_agrees_within_one_percent(truth):
         "shelf": rigid(translation=np.array([0.25, -0.2, 0.0])),
         "table": rigid(translation=np.array([0.0, -0.15, 0.1])),
     }
-    kept = [e for e in truth.room.entities if e.name not in ("wall_west", "book")]
+    kept = [e for e in truth.room.entities if e.name not in ("book", "tin")]
     true = trimesh.util.concatenate([e.mesh() for e in truth.room.entities])
     found = trimesh.util.concatenate(
         [e.mesh().apply_transform(moved[e.name]) if e.name in moved else e.mesh() for e in kept]
@@ -70,8 +70,8 @@ def test_geometry_agrees_within_one_percent(truth):
     assert score.cd_cm == pytest.approx(wanted["cd_cm"], rel=0.01)
     assert score.f == pytest.approx(wanted["f_5cm"], rel=0.01)
     assert score.nc == pytest.approx(wanted["nc"], rel=0.01)
-    assert 3 < score.cd_cm < 10  # the faults are large: 1 % of the figure is far above chance
-    assert 70 < score.f < 95
+    assert 1 < score.cd_cm < 10  # the faults are large: 1 % of the figure is far above chance
+    assert 70 < score.f < 97
 
 
 def test_seen_points_agree_with_exact_rays(truth):
