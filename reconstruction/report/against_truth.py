@@ -37,7 +37,7 @@ def truth_section(g: Gathered) -> Section | None:
     if extra:
         blocks.append(Text(f"Found, but no match of an evaluated object: {', '.join(extra)}."))
     blocks.append(_stages_table(g.evaluation["stages"]))
-    lines = [f"{key} = {_number(value)}" for key, value in metrics.items() if value is not None]
+    lines = [f"{key} = {value:.6g}" for key, value in metrics.items() if value is not None]
     blocks.append(Details("All metrics", "\n".join(lines)))
     left = g.evaluation["left_out"]
     if left:
@@ -74,20 +74,34 @@ def _stages_table(stages: dict[str, Any]) -> Table:
     order = [name for name in STAGE_NAMES if name in stages] + sorted(set(stages) - set(STAGE_NAMES))
     rows = []
     for stage in order:
-        figures = [f"{name.replace('_', ' ')} {value}" for name, value in _flat(stages[stage])]
-        rows.append([Cell(stage), Cell(" · ".join(figures))])
+        figures = tuple(_with_unit(name, value) for name, value in _flat(stages[stage]))
+        rows.append([Cell(stage), Cell("", figures=figures)])
     return Table(["stage", "figures"], rows)
 
 
-def _flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+def _flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return single figures by name; lists (of objects) have tables of their own."""
     out = []
     for name, value in figures.items():
         if isinstance(value, dict):
             out += _flat(value, f"{prefix}{name}: ")
         elif isinstance(value, bool | int | float | str):
-            out.append((f"{prefix}{name}", _number(value)))
+            out.append((f"{prefix}{name}", value))
     return out
 
 
-def _number(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+_UNITS = (("_cm", " cm"), ("_mm", " mm"), ("_deg", "°"), ("_db", " dB"), ("_s", " s"), ("_mb", " MB"))
+
+
+def _with_unit(name: str, value: Any) -> tuple[str, str]:
+    """Return a metric's name in words, and its value with the unit that the name ends in."""
+    if not isinstance(value, float):
+        return name.replace("_", " "), str(value)
+    if "share" in name or name.endswith("_rel") or "recall" in name or "precision" in name:
+        return name.removesuffix("_rel").replace("_", " "), f"{100 * value:.3g}%"
+    for suffix, unit in _UNITS:
+        if name.endswith(suffix):
+            return name.removesuffix(suffix).replace("_", " "), f"{value:.3g}{unit}"
+    if name.endswith("_percent"):
+        return name.removesuffix("_percent").replace("_", " "), f"{value:.3g}%"
+    return name.replace("_", " "), f"{value:.3g}"

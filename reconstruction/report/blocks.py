@@ -46,6 +46,7 @@ class Cell:
     text: str
     status: str = ""
     swatch: str = ""  # CSS color
+    figures: tuple[tuple[str, str], ...] = ()  # names and values, set in one paragraph
 
 
 @dataclass(frozen=True)
@@ -158,3 +159,18 @@ class Section:
     blocks: list[Block]
     lead: str = ""
     short: str = ""  # its name in the table of contents, where the title is too long
+
+
+def left_out(what: str, why: str) -> Text:
+    """One line for what cannot be shown."""
+    return Text(f"{what} left out: {why}.", left_out=True)
+
+
+def facts(rows: list[tuple[str, str]]) -> Table:
+    """A table of names and values."""
+    return Table([], [[Cell(name), Cell(value)] for name, value in rows])
+
+
+def graded(value: float, good: float, fair: float) -> str:
+    """Return the status of a figure that is better the larger it is."""
+    return "good" if value >= good else "warn" if value >= fair else "bad"

@@ -1,20 +1,17 @@
 """What the report says, section by section: each function turns what was gathered into blocks of the page."""
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from reconstruction.report import drawing, pictures, plots
+from reconstruction.report import drawing, object_pictures, pictures, plots, scene_pictures
 from reconstruction.report.blocks import (
     Block,
     Card,
     Cards,
     Cell,
-    Details,
     Legend,
-    Listing,
     Pictures,
     Plots,
     Section,
@@ -23,6 +20,9 @@ from reconstruction.report.blocks import (
     Text,
     Tile,
     Tiles,
+    facts,
+    graded,
+    left_out,
 )
 from reconstruction.report.collect import Gathered
 
@@ -30,19 +30,15 @@ from reconstruction.report.collect import Gathered
 def all_sections(g: Gathered) -> list[Section]:
     """Return the page's sections in order."""
     from reconstruction.report.against_truth import truth_section
+    from reconstruction.report.report_card import cost_section, notes_section, physics_section
 
     makers = (
-        truth_section, cameras_section, depth_section, gaussians_section, surface_section, instances_section,
+        truth_section, cameras_section, depth_section,  surface_section, instances_section,
         objects_section, graph_section, assembly_section, kept_out_section, physics_section, cost_section,
         notes_section,
     )  # fmt: skip
     made = [maker(g) for maker in makers]
     return [section for section in made if section is not None]
-
-
-def left_out(what: str, why: str) -> Text:
-    """One line for what cannot be shown."""
-    return Text(f"{what} left out: {why}.", left_out=True)
 
 
 def summary_tiles(g: Gathered) -> Tiles:
@@ -53,27 +49,23 @@ def summary_tiles(g: Gathered) -> Tiles:
     if "stable_rate" in physics:
         rate = physics["stable_rate"]
         detail = f"of {physics.get('dynamic_objects', '?')} movable objects, 10 s"
-        tiles.append(Tile(f"{rate:.0%}", "stable", _graded(rate, 1.0, 0.8), detail))
+        tiles.append(Tile(f"{rate:.0%}", "stable", graded(rate, 1.0, 0.8), detail))
     if "spawn_penetration_mm" in physics:
         depth = physics["spawn_penetration_mm"]
-        tiles.append(Tile(f"{depth:.1f} mm", "deepest overlap", _graded(-depth, -1.0, -5.0)))
+        tiles.append(Tile(f"{depth:.1f} mm", "deepest overlap", graded(-depth, -1.0, -5.0)))
     sigma = scale["uncertainty"]
     tiles.append(
-        Tile(f"± {sigma:.0%}", "scale", _graded(-sigma, -0.05, -0.2), scale["method"].replace("-", " "))
+        Tile(f"± {sigma:.0%}", "scale", graded(-sigma, -0.05, -0.2), scale["method"].replace("-", " "))
     )
     if "registration" in report:
         found = report["registration"]
         share = found["registered"] / max(found["keyframes"], 1)
         text = f"{found['registered']} of {found['keyframes']}"
-        tiles.append(Tile(text, "keyframes registered", _graded(share, 0.95, 0.7)))
+        tiles.append(Tile(text, "keyframes registered", graded(share, 0.95, 0.7)))
     total = sum(report["timings_s"].values())
     memory = f"peak {report['peak_memory_mb'] / 1024:.1f} GB"
     tiles.append(Tile(f"{total / 60:.1f} min" if total >= 90 else f"{total:.0f} s", "time", detail=memory))
     return Tiles(tiles)
-
-
-def _graded(value: float, good: float, fair: float) -> str:
-    return "good" if value >= good else "warn" if value >= fair else "bad"
 
 
 def cameras_section(g: Gathered) -> Section:
@@ -125,11 +117,6 @@ def _fov(camera: Any) -> float:
     return float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
 
 
-def facts(rows: list[tuple[str, str]]) -> Table:
-    """A table of names and values."""
-    return Table([], [[Cell(name), Cell(value)] for name, value in rows])
-
-
 def depth_section(g: Gathered) -> Section:
     """Depth and normals beside color, and the error."""
     section = Section("depth", "Depth", [])
@@ -153,18 +140,13 @@ def depth_section(g: Gathered) -> Section:
     return section
 
 
-def gaussians_section(g: Gathered) -> Section | None:
-    """Gaussians' renders beside kept-out frames; nothing until the pipeline has that stage."""
-    return None
-
-
 def surface_section(g: Gathered) -> Section:
     """The fused surface from three sides."""
     section = Section("surface", "Surface", [])
     if g.surface is None:
         section.blocks.append(left_out("The fused surface", g.why_missing("surface")))
         return section
-    items, heads = pictures.surface_views(g)
+    items, heads = scene_pictures.surface_views(g)
     section.blocks.append(Pictures(items, 3, heads, phone_columns=3))
     if g.truth is not None and g.truth.has_meshes:
         section.blocks.append(_distance_legend())
@@ -180,7 +162,7 @@ def surface_section(g: Gathered) -> Section:
 
 
 def _distance_legend() -> Legend:
-    limit = f"{100 * pictures.SURFACE_ERROR_M:.0f} cm or more"
+    limit = f"{100 * scene_pictures.SURFACE_ERROR_M:.0f} cm or more"
     return Legend(
         drawing.gradient(drawing.ERROR_MAP), "0", limit, "distance to the true surface; gray: never filmed"
     )
@@ -194,7 +176,7 @@ def instances_section(g: Gathered) -> Section:
         return section
     true = g.truth is not None and g.truth.has_meshes
     items = pictures.instance_frames(g, 4 if true else 6)
-    heads = ["found", "true, in the color and number of its match"] if true else []
+    heads = ["found", "true, colored as matched"] if true else []
     section.blocks.append(Pictures(items, 2 if true else 3, heads, phone_columns=2 if true else 1))
     return section
 
@@ -212,10 +194,10 @@ def objects_section(g: Gathered) -> Section:
                 item["id"],
                 f"{item['label']} {item['id']}",
                 drawing.css_color(g.colors[item["id"]]),
-                pictures.turntable(g, mesh, first),
-                pictures.ANGLES,
+                object_pictures.turntable(g, mesh, first),
+                object_pictures.ANGLES,
                 _object_facts(item, scores.get(item["id"])),
-                pictures.object_views(g, mesh, list(item["views"])),
+                object_pictures.object_views(g, mesh, list(item["views"])),
                 [item["assembly"]["repair"]] if item.get("assembly", {}).get("repair") else [],
             )
         )
@@ -246,7 +228,7 @@ def _object_facts(item: dict, score: dict | None) -> list[tuple[str, str]]:
             (
                 "truth",
                 f"{score['name'].replace('_', ' ')}: box IoU {score['box_iou']:.2f}, "
-                f"Chamfer {score['cd_cm']:.1f} cm, F 1 cm {score['f_1cm']:.0f} %",
+                f"Chamfer {score['cd_cm']:.1f} cm, F 1 cm {score['f_1cm']:.0f}%",
             )
         )
     return out
@@ -299,65 +281,15 @@ def assembly_section(g: Gathered) -> Section:
     if rows:
         blocks.append(Table(["object", "moved", "turned", "kind", "what was done"], rows, numeric=[1, 2]))
     true = g.truth is not None and g.truth.has_meshes
-    blocks.append(Pictures(pictures.scene_views(g), 3, phone_columns=3))
+    blocks.append(Pictures(scene_pictures.scene_views(g), 3, phone_columns=3))
     if true:
-        blocks.append(_distance_legend())
+        text = "Second row: how far the scene is from the true surface. Third: the other way around."
+        blocks += [Text(text), _distance_legend()]
     return Section("assembly", "Assembly", blocks)
 
 
-_THRESHOLDS = (
-    ("stable", "< 2 cm, < 5°"),
-    ("stable_10cm_0.1rad", "< 0.1 m, < 0.1 rad"),
-    ("stable_5cm_drop_5deg", "< 5 cm drop, < 5°"),
-)
-
-
-def physics_section(g: Gathered) -> Section:
-    """The report card, overall and for each object."""
-    physics = g.scene["report"]["physics"]
-    if "objects" not in physics:
-        return Section("physics", "Physics", [left_out("The report card", "the bundle's report has none")])
-    rates = {"stable": "stable_rate", **{key: f"stable_rate_{key[7:]}" for key, _ in _THRESHOLDS[1:]}}
-    tiles = [
-        Tile(f"{physics[rates[key]]:.0%}", text, _graded(physics[rates[key]], 1.0, 0.8))
-        for key, text in _THRESHOLDS
-    ]
-    floating, overlap = physics["floating_rate"], physics["spawn_penetration_mm"]
-    between = " and ".join(x.replace("_", " ") for x in physics.get("spawn_penetration_between", []))
-    tiles.append(Tile(f"{floating:.0%}", "floating", _graded(-floating, 0.0, -0.2), "fall > 5 mm in 0.5 s"))
-    tiles.append(
-        Tile(f"{overlap:.2f} mm", "deepest overlap at spawn", _graded(-overlap, -1.0, -5.0), between)
-    )
-    rows = []
-    ids = {o["id"] for o in g.objects}
-    for item in physics["objects"]:
-        swatch = drawing.css_color(g.colors[item["id"]]) if item["id"] in ids else ""
-        rows.append(
-            [
-                Cell(item["name"].replace("_", " "), swatch=swatch),
-                Cell(f"{1000 * item['moved_m']:.1f} mm"),
-                Cell(f"{item['turned_deg']:.2f}°"),
-                Cell(f"{1000 * item['drop_m'] + 0.0:.1f} mm".replace("-0.0", "0.0")),
-                *(
-                    Cell("yes" if item[key] else "no", "good" if item[key] else "bad")
-                    for key, _ in _THRESHOLDS
-                ),
-                Cell("yes" if item["floating"] else "no", "bad" if item["floating"] else ""),
-            ]
-        )
-    columns = ["object", "moved", "turned", "drop", *(text for _, text in _THRESHOLDS), "floats"]
-    lead = (
-        f"All {physics['dynamic_objects']} movable objects together for {physics['duration_s']:.0f} s at "
-        f"1/{1 / physics['timestep_s']:.0f} s, undamped, never asleep; {physics['fixed_objects']} objects are fixed."
-    )
-    blocks: list[Block] = [Tiles(tiles)]
-    if rows:
-        blocks.append(Table(columns, rows, numeric=[1, 2, 3]))
-    return Section("physics", "Physics", blocks, lead)
-
-
 def kept_out_section(g: Gathered) -> Section:
-    """The scene at the cameras of frames that nothing was fitted to."""
+    """Frames that nothing was fitted to, beside whatever can be rendered at their cameras."""
     section = Section("kept-out", "Kept-out frames", [], short="Kept out")
     if g.posed is None:
         section.blocks.append(left_out("Kept-out frames", g.why_missing("poses", "world")))
@@ -365,90 +297,23 @@ def kept_out_section(g: Gathered) -> Section:
     if not len(g.posed.held_out_indices):
         section.blocks.append(left_out("Kept-out frames", "no kept-out frame could be registered"))
         return section
-    items, scores = pictures.kept_out_frames(g)
-    section.blocks.append(Pictures(items, 3, ["frame", "scene", "color error"], phone_columns=3))
+    if "gaussians" in g.stages.missing:
+        section.blocks.append(left_out("Gaussians", g.why_missing("gaussians")))
+    renderers = pictures.renderers(g)
+    items, scores = pictures.kept_out_frames(g, renderers)
+    heads = ["frame"] + [head for name in renderers for head in (name, f"error of the {name}")]
+    section.blocks.append(Pictures(items, len(heads), heads, phone_columns=3))
     limit = f"{pictures.COLOR_ERROR:.0f} of 255"
     section.blocks.append(
         Legend(drawing.gradient(drawing.ERROR_MAP), "0", limit, "color error; gray: nothing there")
     )
-    if scores:
-        psnr, ssim, covered = np.mean(scores, axis=0)
-        section.blocks.append(
-            Text(
-                f"Of the {len(scores)} frames shown: PSNR {psnr:.1f} dB, SSIM {ssim:.2f}, coverage {covered:.0%}."
+    for name, found in scores.items():
+        if found:
+            psnr, ssim, covered = np.mean(found, axis=0)
+            section.blocks.append(
+                Text(
+                    f"The {name} in the {len(found)} frames shown: PSNR {psnr:.1f} dB, SSIM {ssim:.2f}, "
+                    f"coverage {covered:.0%}."
+                )
             )
-        )
     return section
-
-
-def cost_section(g: Gathered) -> Section:
-    """Wall time, CPU time and peak memory of each stage."""
-    from reconstruction.pipeline import STAGE_NAMES
-
-    report = g.scene["report"]
-    wall, volatile = report["timings_s"], report.get("volatile", {})
-    names = [name for name in STAGE_NAMES if name in wall] + sorted(set(wall) - set(STAGE_NAMES))
-    svgs = [plots.bars(names, [wall[n] for n in names], "wall time", "s", "#4f86e3", "wall")]
-    for key, title, unit, color in (
-        ("cpu_s", "CPU time", "s", "#53a58b"),
-        ("stage_peak_memory_mb", "peak memory", "MB", "#c78a3b"),
-    ):
-        if key in volatile:
-            svgs.append(
-                plots.bars(names, [volatile[key].get(n, 0.0) for n in names], title, unit, color, key[:3])
-            )
-    blocks: list[Block] = [Plots(svgs, columns=3)]
-    if len(svgs) < 3:
-        blocks.append(left_out("CPU time and memory by stage", "the bundle does not have them"))
-    versions = ", ".join(
-        f"{name} {version}" for name, version in sorted(volatile.get("versions", {}).items())
-    )
-    rows = [(name, volatile[name]) for name in ("machine", "commit") if volatile.get(name)]
-    backends = ", ".join(f"{stage}: {name}" for stage, name in sorted(report["backends"].items()))
-    rows += [("versions", versions)] if versions else []
-    rows += [("backends", backends)] if backends else []
-    if rows:
-        blocks.append(facts(rows))
-    return Section("cost", "Time and memory", blocks, short="Cost")
-
-
-def notes_section(g: Gathered) -> Section:
-    """Notes of the stages, what differs from the default options, overrides, the whole config."""
-    report = g.scene["report"]
-    blocks: list[Block] = []
-    if report.get("notes"):
-        blocks.append(Listing(list(report["notes"])))
-    changed = changed_options(report.get("config", {}))
-    if changed:
-        blocks.append(facts([(name, f"{value} (default {default})") for name, value, default in changed]))
-    else:
-        blocks.append(Text("All options have their default values."))
-    if report.get("overrides"):
-        blocks.append(Details("Overrides", json.dumps(report["overrides"], indent=1)))
-    if report.get("config"):
-        blocks.append(Details("All options", _config_lines(report["config"])))
-    return Section("notes", "Notes and options", blocks, short="Notes")
-
-
-def changed_options(config: dict[str, dict]) -> list[tuple[str, str, str]]:
-    """List options that differ from the defaults: (stage.option, value, default)."""
-    from reconstruction.config import PipelineConfig
-
-    default = json.loads(json.dumps(asdict(PipelineConfig())))
-    return [
-        (f"{stage}.{name}", json.dumps(value), json.dumps(default[stage][name]))
-        for stage, options in sorted(config.items())
-        if isinstance(options, dict)
-        for name, value in sorted(options.items())
-        if name in default.get(stage, {}) and default[stage][name] != value
-    ]
-
-
-def _config_lines(config: dict[str, Any], prefix: str = "") -> str:
-    lines = []
-    for name, value in sorted(config.items()):
-        if isinstance(value, dict):
-            lines.append(_config_lines(value, f"{prefix}{name}."))
-        else:
-            lines.append(f"{prefix}{name} = {json.dumps(value)}")
-    return "\n".join(lines)
