@@ -8,13 +8,14 @@ import numpy as np
 from reconstruction.gaussians.losses import FrameTarget, LossWeights, image_loss
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize, rasterize_backward
 from reconstruction.gaussians.rendering import Render
+from reconstruction.gaussians.scratch import Scratch
 from reconstruction.types import Camera
 from registry.errors import UsageError
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """Loss of one frame and its derivatives by everything that is optimized."""
+    """Loss of one frame and its derivatives by everything that is optimized; valid until the next step."""
 
     terms: dict[str, float]  # unweighted
     total: float
@@ -61,6 +62,9 @@ class CpuBackend:
 
     name = "cpu"
 
+    def __init__(self) -> None:
+        self._scratch = Scratch()
+
     def render(
         self,
         parameters: np.ndarray,
@@ -86,9 +90,9 @@ class CpuBackend:
         settings: RasterSettings,
     ) -> StepResult:
         """See `Backend.step`."""
-        image = rasterize(parameters, target.camera, world_from_camera, settings)
-        loss = image_loss(image.features, target, gain, bias, weights)
-        gradients = rasterize_backward(image, loss.image_gradients, loss.error)
+        image = rasterize(parameters, target.camera, world_from_camera, settings, scratch=self._scratch)
+        loss = image_loss(image.features, target, gain, bias, weights, self._scratch)
+        gradients = rasterize_backward(image, loss.image_gradients, loss.error, self._scratch)
         return StepResult(
             loss.terms, loss.total, gradients.parameters, gradients.pose, loss.gain, loss.bias, image.rows,
             image.splats[:, 2], gradients.contributions, gradients.errors,

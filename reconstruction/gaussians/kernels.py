@@ -9,6 +9,7 @@ with (dx, dy) the pixel's offset from the projected center
 
 exact, with six coefficients a splat. `G` below is H^-1.
 
+Kernels with `start, stop` do their share of the rows and release the interpreter lock (see `threads.run_over`).
 Nothing races: a tile is one unit of work; what belongs to a splat is written once per (splat, tile) entry and then
 summed per splat in the order of its entries. Results do not depend on the number of threads.
 All kernels are generic in the floating-point type of their arrays: float32 in use, float64 to check derivatives.
@@ -42,7 +43,6 @@ _TWO = np.float32(2.0)
 # exp(-rho / 2) = exp(x)^64 with x = -rho / 128, by its Taylor polynomial.
 _FALLOFF_STEP = np.float32(-1.0 / 128.0)
 _E2, _E3, _E4, _E5 = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120)
-_CHUNKS = 64  # pieces that loops over Gaussians are cut into for the threads
 _MIN_COSINE = 0.01  # a splat seen more edge-on than this has no usable intersection
 _FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
 
@@ -133,21 +133,8 @@ def _pixel_box(h, intrinsics, reach2, width, height, box):  # pragma: no cover -
     return True
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def project(
-    parameters, rotation, translation, intrinsics, size, near, sigma_cutoff, alpha_min, splats, boxes
-):  # pragma: no cover - compiled
-    """Project every Gaussian; boxes (n, 4) pixel bounds, x1 = 0 where it is not seen. size is (width, height)."""
-    for chunk in numba.prange(_CHUNKS):
-        start, stop = chunk * len(parameters) // _CHUNKS, (chunk + 1) * len(parameters) // _CHUNKS
-        _project_rows(
-            start, stop, parameters, rotation, translation, intrinsics, size, near, sigma_cutoff, alpha_min,
-            splats, boxes,
-        )  # fmt: skip
-
-
-@numba.njit(cache=True)
-def _project_rows(
     start,
     stop,
     parameters,
@@ -161,7 +148,10 @@ def _project_rows(
     splats,
     boxes,
 ):  # pragma: no cover - compiled
-    """Do the rows start..stop of `project`."""
+    """Project the Gaussians start..stop; boxes (n, 4) pixel bounds, x1 = 0 where one is not seen.
+
+    size is (width, height); splats (n, 17) filled where seen.
+    """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     h, g = np.empty((3, 4)), np.empty((3, 3))
     for i in range(start, stop):
@@ -257,15 +247,14 @@ def bin_to_tiles(rows, boxes, tiles_x, tiles_y):  # pragma: no cover - compiled
     return tile_start, entries, first, positions
 
 
-@numba.njit(cache=True, parallel=True)
-def gather(splats, boxes, rows):  # pragma: no cover - compiled
+@numba.njit(cache=True, nogil=True)
+def gather(start, stop, splats, boxes, rows, near_splats, near_boxes):  # pragma: no cover - compiled
     """Copy the visible splats and their boxes in depth order, so that tiles read them nearly in sequence."""
-    near_to_far = np.empty((len(rows), splats.shape[1]), splats.dtype)
-    near_boxes = np.empty((len(rows), 4), np.int32)
-    for r in numba.prange(len(rows)):
-        near_to_far[r] = splats[rows[r]]
-        near_boxes[r] = boxes[rows[r]]
-    return near_to_far, near_boxes
+    for r in range(start, stop):
+        for c in range(splats.shape[1]):
+            near_splats[r, c] = splats[rows[r], c]
+        for c in range(4):
+            near_boxes[r, c] = boxes[rows[r], c]
 
 
 @numba.njit(cache=True, inline="always", fastmath=_FAST)
@@ -285,9 +274,20 @@ def _falloff(rho):  # pragma: no cover - compiled
     return e * e
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def blend(
-    splats, boxes, tile_start, entries, tile_order, tiles_x, scalars, weights, features, contributions
+    start,
+    stop,
+    splats,
+    boxes,
+    tile_start,
+    entries,
+    tile_order,
+    tiles_x,
+    scalars,
+    weights,
+    features,
+    contributions,
 ):  # pragma: no cover - compiled
     """Blend the splats of every tile front to back.
 
@@ -304,7 +304,7 @@ def blend(
         features: (h, w, 13) filled.
         contributions: (e,) filled: sum over the tile's pixels of weight alpha T of every entry.
     """
-    for k in numba.prange(len(tile_order)):
+    for k in range(start, stop):
         _blend_tile(
             tile_order[k],
             splats,
@@ -398,8 +398,10 @@ def _blend_tile(
                 features[y, x, c] = image[c, y - ty, x - tx]
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def blend_backward(
+    start,
+    stop,
     splats,
     boxes,
     tile_start,
@@ -424,7 +426,7 @@ def blend_backward(
         error: (h, w) weight of the pixels in the last column of the result (for densification).
         entry_gradients: (e, 18) filled.
     """  # fmt: skip
-    for k in numba.prange(len(tile_order)):
+    for k in range(start, stop):
         _blend_tile_backward(
             tile_order[k],
             splats,
@@ -561,11 +563,11 @@ def _blend_tile_backward(
             out[c] = total
 
 
-@numba.njit(cache=True, parallel=True)
-def reduce_entries(entry_values, first, positions, rows, out):  # pragma: no cover - compiled
-    """Sum the values (e, k) of every splat's entries, in order, into out (n, k) at the Gaussian's row."""
+@numba.njit(cache=True, nogil=True)
+def reduce_entries(start, stop, entry_values, first, positions, rows, out):  # pragma: no cover - compiled
+    """Sum the values (e, k) of the entries of splats start..stop, in order, into out (n, k) at the Gaussians' rows."""
     columns = entry_values.shape[1]
-    for r in numba.prange(len(rows)):
+    for r in range(start, stop):
         for c in range(columns):
             out[rows[r], c] = 0
         for i in range(first[r], first[r + 1]):
@@ -573,25 +575,8 @@ def reduce_entries(entry_values, first, positions, rows, out):  # pragma: no cov
                 out[rows[r], c] += entry_values[positions[i], c]
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def project_backward(
-    parameters, rows, rotation, translation, intrinsics, splats, splat_gradients, gradients, pose_gradients
-):  # pragma: no cover - compiled
-    """Carry the derivatives of projected splats (n, 18) to parameters (n, 13) and camera pose (k, 6).
-
-    The pose moves as world_from_camera exp(xi), xi = (translation, rotation) in camera axes, so that a camera-space
-    point x moves by -rho - phi x x.
-    """
-    for chunk in numba.prange(_CHUNKS):
-        start, stop = chunk * len(rows) // _CHUNKS, (chunk + 1) * len(rows) // _CHUNKS
-        _project_rows_backward(
-            start, stop, parameters, rows, rotation, translation, intrinsics, splats, splat_gradients, gradients,
-            pose_gradients,
-        )  # fmt: skip
-
-
-@numba.njit(cache=True)
-def _project_rows_backward(
     start,
     stop,
     parameters,
@@ -604,7 +589,11 @@ def _project_rows_backward(
     gradients,
     pose_gradients,
 ):  # pragma: no cover - compiled
-    """Do the rows start..stop of `project_backward`."""  # fmt: skip
+    """Carry the derivatives of projected splats (n, 18) to parameters (n, 13) and camera pose (k, 6).
+
+    Of the visible splats start..stop. The pose moves as world_from_camera exp(xi), xi = (translation, rotation) in
+    camera axes, so that a camera-space point x moves by -rho - phi x x.
+    """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     h, g, dg = np.empty((3, 4)), np.empty((3, 3)), np.zeros((3, 3))
     dh, dn, dr = np.empty((3, 3)), np.empty(3), np.empty((3, 3))

@@ -1,6 +1,7 @@
 """Compiled kernels of the losses: values and derivatives by the rendered image.
 
-Sums are kept per image row and added by the caller, so that they do not depend on the number of threads.
+All loop over the image rows start..stop. Sums are kept per row and added by the caller, so that they do not
+depend on the number of threads.
 """
 
 import math
@@ -14,26 +15,30 @@ MIN_ALPHA = 0.2  # depth and normals are only compared where at least this much 
 EDGE = 0.05  # relative depth difference of neighbors across which no normal is taken
 
 
-@numba.njit(cache=True, parallel=True)
-def ssim_statistics(color, target, squares, products):  # pragma: no cover - compiled
-    """Fill squares = color^2 and products = color target, all (h, w, 3)."""
-    for y in numba.prange(color.shape[0]):
+@numba.njit(cache=True, nogil=True)
+def color_products(
+    start, stop, features, gain, bias, target, color, squares, products
+):  # pragma: no cover - compiled
+    """Fill color = gain * rendered + bias, its square, and its product with the target, all (h, w, 3)."""
+    for y in range(start, stop):
         for x in range(color.shape[1]):
             for c in range(3):
-                squares[y, x, c] = color[y, x, c] * color[y, x, c]
-                products[y, x, c] = color[y, x, c] * target[y, x, c]
+                value = gain[c] * features[y, x, c] + bias[c]
+                color[y, x, c] = value
+                squares[y, x, c] = value * value
+                products[y, x, c] = value * target[y, x, c]
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def ssim_partials(
-    mean, mean_target, square, square_target, product, row_sum, d_mean, d_square, d_product
+    start, stop, mean, mean_target, square, square_target, product, row_sum, d_mean, d_square, d_product
 ):  # pragma: no cover - compiled
     """SSIM of every pixel from windowed moments; derivatives of its sum by mean, square and product.
 
     All (h, w, 3); row_sum (h,) gets the sum of SSIM. Wang et al. 2004 with K1 = 0.01, K2 = 0.03, range 1.
     """
     c1, c2 = 0.0001, 0.0009
-    for y in numba.prange(mean.shape[0]):
+    for y in range(start, stop):
         total = 0.0
         for x in range(mean.shape[1]):
             for c in range(3):
@@ -56,8 +61,10 @@ def ssim_partials(
         row_sum[y] = total
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def color_gradients(
+    start,
+    stop,
     features,
     color,
     target,
@@ -84,8 +91,9 @@ def color_gradients(
         error: (h, w) filled with the mean absolute difference.
         sums: (h, 7) filled: sum of |difference|, derivative by gain (3) and bias (3).
     """  # fmt: skip
-    for y in numba.prange(color.shape[0]):
-        sums[y] = 0
+    for y in range(start, stop):
+        for c in range(7):
+            sums[y, c] = 0
         for x in range(color.shape[1]):
             total = 0.0
             for c in range(3):
@@ -106,15 +114,17 @@ def color_gradients(
             error[y, x] = total / 3
 
 
-@numba.njit(cache=True, parallel=True)
-def normal_partials(features, rays, factor, d_axes, image_gradients, row_sum):  # pragma: no cover - compiled
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def normal_partials(
+    start, stop, features, rays, factor, d_axes, image_gradients, row_sum
+):  # pragma: no cover - compiled
     """Normal consistency (2DGS eq. 14): alpha minus the rendered normals along the normal of the rendered depth.
 
     Fills image_gradients[..., 4:7] and d_axes (h, w, 6), the derivatives by the two differences of neighboring
     points that span the pixel's surface; alpha counts as constant in it. row_sum (h,) gets the loss.
     """
     height, width = features.shape[0], features.shape[1]
-    for y in numba.prange(height):
+    for y in range(start, stop):
         row_sum[y] = 0
         p = np.empty((4, 3))
         for x in range(width):
@@ -161,8 +171,10 @@ def normal_partials(features, rays, factor, d_axes, image_gradients, row_sum):  
             d_axes[y, x, 4], d_axes[y, x, 5] = az * gx - ax * gz, ax * gy - ay * gx
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def depth_gradients(
+    start,
+    stop,
     features,
     rays,
     target,
@@ -188,8 +200,9 @@ def depth_gradients(
         sums: (h, 3) filled: depth, opacity and distortion loss.
     """  # fmt: skip
     height, width = features.shape[0], features.shape[1]
-    for y in numba.prange(height):
-        sums[y] = 0
+    for y in range(start, stop):
+        for c in range(3):
+            sums[y, c] = 0
         for x in range(width):
             alpha = features[y, x, F_ALPHA]
             image_gradients[y, x, 8] = distortion_factor

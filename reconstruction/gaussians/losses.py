@@ -10,12 +10,15 @@ Means are over all pixels of the image. z is the expected depth, sum(w z) / sum(
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from reconstruction.gaussians.config import GaussiansConfig
+from reconstruction.gaussians.scratch import Scratch
 from reconstruction.gaussians.seeding import rays_of
+from reconstruction.gaussians.threads import run_over
 from reconstruction.types import Camera
 
 _WINDOW, _WINDOW_SIGMA = 11, 1.5
@@ -29,6 +32,21 @@ class FrameTarget:
     image: np.ndarray  # float32 (h, w, 3) in [0, 1]
     depth: np.ndarray  # float32 (h, w), 0 unknown
     depth_weight: np.ndarray  # float32 (h, w): 0 unknown, 1 measured, less where completed
+
+    @cached_property
+    def blurred(self) -> np.ndarray:
+        """The image through SSIM's window (h, w, 3)."""
+        return window(self.image)
+
+    @cached_property
+    def blurred_square(self) -> np.ndarray:
+        """Its square through SSIM's window (h, w, 3)."""
+        return window(self.image**2)
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """The camera-space rays of the pixels (h, w, 3), z = 1."""
+        return rays_of(self.camera, self.image.dtype)
 
 
 @dataclass(frozen=True)
@@ -58,14 +76,19 @@ class ImageLoss:
 def weights_of(config: GaussiansConfig) -> LossWeights:
     """Return the weights that a config asks for."""
     return LossWeights(
-        config.ssim_weight, config.depth_weight, config.depth_scale, config.normal_weight,
-        config.distortion_weight, config.opacity_weight,
-    )  # fmt: skip
+        config.ssim_weight,
+        config.depth_weight,
+        config.depth_scale,
+        config.normal_weight,
+        config.distortion_weight,
+        config.opacity_weight,
+    )
 
 
-def window(image: np.ndarray) -> np.ndarray:
+def window(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """Blur with SSIM's 11x11 Gaussian window; zero outside, which makes the operation its own adjoint."""
-    return cv2.GaussianBlur(image, (_WINDOW, _WINDOW), _WINDOW_SIGMA, borderType=cv2.BORDER_CONSTANT)
+    size, border = (_WINDOW, _WINDOW), cv2.BORDER_CONSTANT
+    return cv2.GaussianBlur(image, size, _WINDOW_SIGMA, dst=out, borderType=border)
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
@@ -74,49 +97,106 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
     a, b = np.ascontiguousarray(a, np.float32), np.ascontiguousarray(b, np.float32)
     row_sum, unused = np.empty(len(a)), [np.empty_like(a) for _ in range(3)]
-    loss_kernels.ssim_partials(
-        window(a), window(b), window(a * a), window(b * b), window(a * b), row_sum, *unused
+    run_over(
+        len(a),
+        loss_kernels.ssim_partials,
+        window(a),
+        window(b),
+        window(a * a),
+        window(b * b),
+        window(a * b),
+        row_sum,
+        *unused,
     )
     return float(row_sum.sum() / a.size)
 
 
 def image_loss(
-    features: np.ndarray, target: FrameTarget, gain: np.ndarray, bias: np.ndarray, weights: LossWeights
+    features: np.ndarray,
+    target: FrameTarget,
+    gain: np.ndarray,
+    bias: np.ndarray,
+    weights: LossWeights,
+    scratch: Scratch | None = None,
 ) -> ImageLoss:
     """Evaluate the loss of a rendered frame.
 
     Args:
-        features: (h, w, 13) of `rasterize`, float32.
+        features: (h, w, 13) of `rasterize`.
         target: The frame.
         gain: (3,) exposure; bias alike.
         weights: Of the terms.
+        scratch: Memory for the result, which is then valid until the next call with it.
     """
     from reconstruction.gaussians import loss_kernels
 
+    scratch, dtype = scratch or Scratch(), features.dtype
     height, width = features.shape[:2]
-    pixels = height * width
-    gradients = np.empty((height, width, 9), features.dtype)
-    color = features[..., :3] * gain.astype(features.dtype) + bias.astype(features.dtype)
-    squares, products = np.empty_like(color), np.empty_like(color)
-    loss_kernels.ssim_statistics(color, target.image, squares, products)
-    moments = [window(x) for x in (color, target.image, squares, target.image**2, products)]
-    partials = [np.empty_like(color) for _ in range(3)]
+    pixels, shape = height * width, (height, width, 3)
+    gradients = scratch.empty("image_gradients", (height, width, 9), dtype)
+    names = ("color", "squares", "products", "blur_color", "blur_squares", "blur_products")
+    color, squares, products, *blurred = (scratch.empty(name, shape, dtype) for name in names)
+    run_over(
+        height, loss_kernels.color_products, features, gain, bias, target.image, color, squares, products
+    )
+    mean, square, product = (window(x, out) for x, out in zip((color, squares, products), blurred))
     ssim_rows = np.empty(height)
-    loss_kernels.ssim_partials(*moments, ssim_rows, *partials)
-    partials = [window(x) for x in partials]
-    color_sums, error = np.empty((height, 7)), np.empty((height, width), features.dtype)
-    loss_kernels.color_gradients(
-        features, color, target.image, gain, *partials, (1 - weights.ssim) / (3 * pixels),
-        -weights.ssim / (3 * pixels), gradients, error, color_sums,
-    )  # fmt: skip
-    rays = rays_of(target.camera, features.dtype)
-    axes, normal_rows = np.empty((height, width, 6), features.dtype), np.empty(height)
-    loss_kernels.normal_partials(features, rays, weights.normal / pixels, axes, gradients, normal_rows)
+    # The windowed derivatives take the place of what is not needed any more.
+    partials = [scratch.empty(f"partial_{i}", shape, dtype) for i in range(3)]
+    run_over(
+        height,
+        loss_kernels.ssim_partials,
+        mean,
+        target.blurred,
+        square,
+        target.blurred_square,
+        product,
+        ssim_rows,
+        *partials,
+    )
+    partials = [window(x, out) for x, out in zip(partials, blurred)]
+    color_sums, error = np.empty((height, 7)), scratch.empty("error", (height, width), dtype)
+    run_over(
+        height,
+        loss_kernels.color_gradients,
+        features,
+        color,
+        target.image,
+        gain,
+        *partials,
+        (1 - weights.ssim) / (3 * pixels),
+        -weights.ssim / (3 * pixels),
+        gradients,
+        error,
+        color_sums,
+    )
+    axes, normal_rows = scratch.empty("axes", (height, width, 6), dtype), np.empty(height)
+    run_over(
+        height,
+        loss_kernels.normal_partials,
+        features,
+        target.rays,
+        weights.normal / pixels,
+        axes,
+        gradients,
+        normal_rows,
+    )
     depth_sums = np.empty((height, 3))
-    loss_kernels.depth_gradients(
-        features, rays, target.depth, target.depth_weight, axes, weights.depth_scale, weights.depth / pixels,
-        weights.opacity / pixels, weights.distortion / pixels, gradients, depth_sums,
-    )  # fmt: skip
+    run_over(
+        height,
+        loss_kernels.depth_gradients,
+        features,
+        target.rays,
+        target.depth,
+        target.depth_weight,
+        axes,
+        weights.depth_scale,
+        weights.depth / pixels,
+        weights.opacity / pixels,
+        weights.distortion / pixels,
+        gradients,
+        depth_sums,
+    )
     color_total, depth_total = color_sums.sum(axis=0), depth_sums.sum(axis=0) / pixels
     terms = {
         "l1": float(color_total[0] / (3 * pixels)),

@@ -3,28 +3,12 @@
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from reconstruction.gaussians.config import GaussiansConfig
+from reconstruction.gaussians.threads import run_over
 
-_BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15  # few visits a Gaussian: a shorter memory than Adam's usual 0.999
-
-
-@numba.njit(cache=True, parallel=True)
-def _adam_rows(parameters, gradients, first, second, visits, rows, rates):  # pragma: no cover - compiled
-    """One Adam step of the given rows; bias correction by each row's own number of visits."""
-    for k in numba.prange(len(rows)):
-        i = rows[k]
-        visits[i] += 1
-        correct1 = 1.0 / (1.0 - _BETA1 ** visits[i])
-        correct2 = 1.0 / (1.0 - _BETA2 ** visits[i])
-        for c in range(parameters.shape[1]):
-            g = float(gradients[i, c])
-            a = _BETA1 * first[i, c] + (1.0 - _BETA1) * g
-            b = _BETA2 * second[i, c] + (1.0 - _BETA2) * g * g
-            first[i, c], second[i, c] = a, b
-            parameters[i, c] -= rates[c] * a * correct1 / (math.sqrt(b * correct2) + _EPSILON)
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15  # few visits a frame: a shorter memory than Adam's usual 0.999
 
 
 class Adam:
@@ -38,10 +22,10 @@ class Adam:
         """Return the change of one row."""
         self._visits[row] += 1
         n = self._visits[row]
-        self._first[row] = _BETA1 * self._first[row] + (1 - _BETA1) * gradient
-        self._second[row] = _BETA2 * self._second[row] + (1 - _BETA2) * gradient**2
-        a, b = self._first[row] / (1 - _BETA1**n), self._second[row] / (1 - _BETA2**n)
-        return -rate * a / (np.sqrt(b) + _EPSILON)
+        self._first[row] = BETA1 * self._first[row] + (1 - BETA1) * gradient
+        self._second[row] = BETA2 * self._second[row] + (1 - BETA2) * gradient**2
+        a, b = self._first[row] / (1 - BETA1**n), self._second[row] / (1 - BETA2**n)
+        return -rate * a / (np.sqrt(b) + EPSILON)
 
 
 @dataclass
@@ -73,7 +57,22 @@ class SplatState:
 
     def update(self, gradients: np.ndarray, rows: np.ndarray, rates: np.ndarray, limits: np.ndarray) -> None:
         """Take one Adam step on the rows in view; limits are the smallest and largest log scale."""
-        _adam_rows(self.parameters, gradients, self.first, self.second, self.visits, rows, rates)
+        from reconstruction.gaussians import adam_kernel
+
+        run_over(
+            len(rows),
+            adam_kernel.adam_rows,
+            self.parameters,
+            gradients,
+            self.first,
+            self.second,
+            self.visits,
+            rows,
+            rates,
+            BETA1,
+            BETA2,
+            EPSILON,
+        )
         scales = self.parameters[:, 7:9]
         np.clip(scales, limits[0], limits[1], out=scales)
 

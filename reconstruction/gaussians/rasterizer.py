@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reconstruction.gaussians.scratch import Scratch
+from reconstruction.gaussians.threads import run_over
 from reconstruction.types import Camera
 from registry.geometry import invert_rigid
 
@@ -73,6 +75,7 @@ def rasterize(
     world_from_camera: np.ndarray,
     settings: RasterSettings,
     pixel_weights: np.ndarray | None = None,
+    scratch: Scratch | None = None,
 ) -> Rasterized:
     """Render packed Gaussians.
 
@@ -82,44 +85,79 @@ def rasterize(
         world_from_camera: (4, 4) rigid.
         settings: Cut-offs.
         pixel_weights: (h, w) sums alpha T of every Gaussian over the pixels with these weights; None: not wanted.
+        scratch: Memory for the result, which is then valid until the next call with it.
     """
     from reconstruction.gaussians import kernels
 
-    dtype = parameters.dtype
+    dtype, scratch = parameters.dtype, scratch or Scratch()
     camera_from_world = invert_rigid(world_from_camera)
     rotation, translation = camera_from_world[:3, :3].copy(), camera_from_world[:3, 3].copy()
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
     n, width, height = len(parameters), camera.width, camera.height
-    splats, boxes = np.empty((n, kernels.N_PROJECTED), dtype), np.empty((n, 4), np.int32)
-    kernels.project(
-        parameters, rotation, translation, intrinsics, (width, height), settings.near, settings.sigma_cutoff,
-        settings.alpha_min, splats, boxes,
-    )  # fmt: skip
+    splats = scratch.empty("splats", (n, kernels.N_PROJECTED), dtype)
+    boxes = scratch.empty("boxes", (n, 4), np.int32)
+    run_over(
+        n,
+        kernels.project,
+        parameters,
+        rotation,
+        translation,
+        intrinsics,
+        (width, height),
+        settings.near,
+        settings.sigma_cutoff,
+        settings.alpha_min,
+        splats,
+        boxes,
+    )
     tiles_x, tiles_y = -(-width // kernels.TILE), -(-height // kernels.TILE)
     rows = kernels.sort_by_depth(splats, boxes)
     bins = kernels.bin_to_tiles(rows, boxes, tiles_x, tiles_y)
-    splats, boxes = kernels.gather(splats, boxes, rows)
-    features = np.empty((height, width, kernels.N_FEATURES), dtype)
+    near_splats = scratch.empty("near_splats", (len(rows), kernels.N_PROJECTED), dtype)
+    near_boxes = scratch.empty("near_boxes", (len(rows), 4), np.int32)
+    run_over(len(rows), kernels.gather, splats, boxes, rows, near_splats, near_boxes)
+    features = scratch.empty("features", (height, width, kernels.N_FEATURES), dtype)
     wanted = pixel_weights is not None
     weights = np.ascontiguousarray(pixel_weights, dtype) if wanted else np.empty((0, 0), dtype)
     entry_values = np.empty((len(bins[1]) if wanted else 0, 1), dtype)
-    kernels.blend(
-        splats, boxes, bins[0], bins[1], _tile_order(tiles_x * tiles_y), tiles_x,
-        _scalars(settings, dtype), weights, features, entry_values[:, 0],
-    )  # fmt: skip
+    run_over(
+        tiles_x * tiles_y,
+        kernels.blend,
+        near_splats,
+        near_boxes,
+        bins[0],
+        bins[1],
+        _tile_order(tiles_x * tiles_y),
+        tiles_x,
+        _scalars(settings, dtype),
+        weights,
+        features,
+        entry_values[:, 0],
+    )
     contributions = None
     if wanted:
         total = np.zeros((n, 1), dtype)
-        kernels.reduce_entries(entry_values, bins[2], bins[3], rows, total)
+        run_over(len(rows), kernels.reduce_entries, entry_values, bins[2], bins[3], rows, total)
         contributions = total[:, 0]
     return Rasterized(
-        features, contributions, parameters, rows, splats, boxes, bins, (rotation, translation), intrinsics,
+        features,
+        contributions,
+        parameters,
+        rows,
+        near_splats,
+        near_boxes,
+        bins,
+        (rotation, translation),
+        intrinsics,
         settings,
-    )  # fmt: skip
+    )
 
 
 def rasterize_backward(
-    image: Rasterized, image_gradients: np.ndarray, error: np.ndarray | None = None
+    image: Rasterized,
+    image_gradients: np.ndarray,
+    error: np.ndarray | None = None,
+    scratch: Scratch | None = None,
 ) -> RasterGradients:
     """Differentiate a loss through `rasterize`.
 
@@ -127,28 +165,59 @@ def rasterize_backward(
         image: The result of `rasterize`.
         image_gradients: (h, w, 9) derivative by summed color (3), depth, normal (3), opacity and distortion.
         error: (h, w) per-pixel error to attribute to the Gaussians that made it.
+        scratch: Memory for the result, which is then valid until the next call with it.
     """
     from reconstruction.gaussians import kernels
 
     height, width = image.features.shape[:2]
-    dtype, n = image.parameters.dtype, len(image.parameters)
+    dtype, n, scratch = image.parameters.dtype, len(image.parameters), scratch or Scratch()
     tiles_x, tiles_y = -(-width // kernels.TILE), -(-height // kernels.TILE)
-    entry_gradients = np.empty((len(image.bins[1]), kernels.N_SPLAT_GRADIENTS), dtype)
+    entry_gradients = scratch.empty("entries", (len(image.bins[1]), kernels.N_SPLAT_GRADIENTS), dtype)
     if error is None:
         error = np.zeros((height, width), dtype)
-    kernels.blend_backward(
-        image.splats, image.boxes, image.bins[0], image.bins[1], _tile_order(tiles_x * tiles_y), tiles_x,
-        _scalars(image.settings, dtype), image.features, image_gradients, error, entry_gradients,
-    )  # fmt: skip
-    splat_gradients = np.zeros((n, kernels.N_SPLAT_GRADIENTS), dtype)
-    kernels.reduce_entries(entry_gradients, image.bins[2], image.bins[3], image.rows, splat_gradients)
-    gradients = np.zeros((n, kernels.N_PARAMETERS), dtype)
-    pose_gradients = np.empty((len(image.rows), 6))
-    kernels.project_backward(
-        image.parameters, image.rows, *image.pose, image.intrinsics, image.splats, splat_gradients, gradients,
+    run_over(
+        tiles_x * tiles_y,
+        kernels.blend_backward,
+        image.splats,
+        image.boxes,
+        image.bins[0],
+        image.bins[1],
+        _tile_order(tiles_x * tiles_y),
+        tiles_x,
+        _scalars(image.settings, dtype),
+        image.features,
+        image_gradients,
+        error,
+        entry_gradients,
+    )
+    splat_gradients = scratch.zeros("splat_gradients", (n, kernels.N_SPLAT_GRADIENTS), dtype)
+    run_over(
+        len(image.rows),
+        kernels.reduce_entries,
+        entry_gradients,
+        image.bins[2],
+        image.bins[3],
+        image.rows,
+        splat_gradients,
+    )
+    gradients = scratch.zeros("gradients", (n, kernels.N_PARAMETERS), dtype)
+    pose_gradients = scratch.empty("pose", (len(image.rows), 6), np.float64)
+    run_over(
+        len(image.rows),
+        kernels.project_backward,
+        image.parameters,
+        image.rows,
+        *image.pose,
+        image.intrinsics,
+        image.splats,
+        splat_gradients,
+        gradients,
         pose_gradients,
-    )  # fmt: skip
+    )
     return RasterGradients(
-        gradients, pose_gradients.sum(axis=0), splat_gradients[:, :2], splat_gradients[:, kernels.S_CONTRIBUTION],
+        gradients,
+        pose_gradients.sum(axis=0),
+        splat_gradients[:, :2],
+        splat_gradients[:, kernels.S_CONTRIBUTION],
         splat_gradients[:, kernels.S_ERROR],
-    )  # fmt: skip
+    )
