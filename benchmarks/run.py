@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def _run(arguments: argparse.Namespace) -> int:
     captures = find_captures(arguments.captures, arguments.only)
     names = arguments.variants or ([] if arguments.variant else ["default"])
     variants = choose_variants(names, arguments.variant)
-    code, machine = describe_code(), describe_machine()
+    machine = describe_machine()
     out = arguments.out.resolve()
     failed = 0
     for capture in captures:
@@ -98,6 +99,7 @@ def _run(arguments: argparse.Namespace) -> int:
             if not variant.applies_to(capture):
                 print(f"{label}: left out, needs a ground truth with {variant.needs}.json", flush=True)
                 continue
+            code = describe_code()  # each time: a long run may see changes
             known = _known(out, capture, variant, inputs, code, arguments)
             if known is not None:
                 print(f"{label}: {known.status} at {known.commit}, kept", flush=True)
@@ -108,13 +110,18 @@ def _run(arguments: argparse.Namespace) -> int:
                 continue
             print(f"{label}: ...", flush=True)
             result = run_variant(capture, variant, out, inputs, code, machine, arguments.timeout_s)
+            if describe_code()["sources"] != code["sources"]:
+                print(
+                    f"{label}: the sources changed meanwhile; it is marked and will be done again", flush=True
+                )
+                result = replace(result, dirty=True, sources="changed during the run")
             save_result(result, out)
             print(f"{label}: {_summary(result)}", flush=True)
             failed += result.failed
         if arguments.discard_stages and not arguments.dry_run:
             shutil.rmtree(home_of(out, capture) / "work", ignore_errors=True)
     if not arguments.dry_run:
-        write_page(load_results(out), arguments.page, code)
+        write_page(load_results(out), arguments.page, describe_code())
         print(f"{arguments.page} is written", flush=True)
     return 1 if failed else 0
 
