@@ -25,29 +25,43 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         help="the truth of the video (docs/evaluation.md); adds error maps",
     )
     parser.add_argument(
+        "--evaluation",
+        type=Path,
+        metavar="FILE",
+        help="what `simrecon evaluate --json FILE` wrote, instead of measuring again (a minute)",
+    )
+    parser.add_argument(
         "--work-dir",
         type=Path,
         metavar="DIR",
         help="the folder that `simrecon reconstruct --work-dir` was given, if it was",
     )
+    parser.add_argument("--quiet", action="store_true", help="no progress")
     add_common(parser, json=False)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the page."""
+    from reconstruction.commands.reporting import make_listener
     from reconstruction.evaluation.stage_results import StageResults
-    from reconstruction.report.page import build_page
+    from reconstruction.report.page import build_page, read_evaluation
     from registry import SceneRegistry
     from registry.errors import UsageError
 
     out = arguments.out or Path(f"{arguments.scene}.html")
-    if out.is_dir() or not out.parent.is_dir():
+    if out.is_dir() or not out.absolute().parent.is_dir():
         raise UsageError(f"--out {out}: give the name of a file in a folder that exists")
     registry = SceneRegistry(arguments.registry)
     bundle = registry.load(arguments.scene)
     stages = StageResults.find(bundle, registry.root, arguments.work_dir)
-    out.write_text(build_page(bundle, stages, arguments.ground_truth), encoding="utf-8")
+    evaluation = None if arguments.evaluation is None else read_evaluation(arguments.evaluation, bundle)
+    listener = make_listener(quiet=arguments.quiet)
+    with listener:
+        listener.begin_stage("report", 1, 1, False)
+        page = build_page(bundle, stages, arguments.ground_truth, evaluation, progress=listener)
+        listener.end_stage("report", None)
+    out.write_text(page, encoding="utf-8")
     for stage, reason in stages.missing.items():
         print(f"left out: {stage}: {reason}")
     print(f"{out} ({out.stat().st_size / 1e6:.1f} MB)")

@@ -216,25 +216,38 @@ def outlined(
         inner = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
         row, column = np.unravel_index(int(np.argmax(inner)), inner.shape)
         places.append((number, int(column), int(row)))
+    taken: list[tuple[float, float, float, float]] = []
     for number, column, row in places:
-        picture = badge(picture, (labels or {}).get(number, str(number)), column, row, colors[number])
+        text = (labels or {}).get(number, str(number))
+        picture = badge(picture, text, column, row, colors[number], taken)
     return picture
 
 
-def badge(image: np.ndarray, text: str, column: int, row: int, color: tuple[int, int, int]) -> np.ndarray:
-    """Write a short text in a colored pill around a pixel, kept inside the picture."""
+def badge(
+    image: np.ndarray,
+    text: str,
+    column: int,
+    row: int,
+    color: tuple[int, int, int],
+    taken: list[tuple[float, float, float, float]],
+) -> np.ndarray:
+    """Write a short text in a colored pill near a pixel: inside the picture and, if it can, beside those in `taken`."""
     from PIL import Image, ImageDraw
 
     size = max(11, round(image.shape[1] / 44))
     picture = Image.fromarray(image)
     draw, font = ImageDraw.Draw(picture), _font(size)
-    half = draw.textlength(text, font=font) / 2 + 0.36 * size
+    half, tall = draw.textlength(text, font=font) / 2 + 0.36 * size, 0.68 * size
     column = int(np.clip(column, half + 1, image.shape[1] - half - 2))
-    row = int(np.clip(row, 0.7 * size + 1, image.shape[0] - 0.7 * size - 2))
-    box = (column - half, row - 0.68 * size, column + half, row + 0.68 * size)
+    for shift in (0, -1, 1, -2, 2, -3, 3, 0):
+        middle = int(np.clip(row + 2.05 * tall * shift, tall + 1, image.shape[0] - tall - 2))
+        box = (column - half, middle - tall, column + half, middle + tall)
+        if not any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken):
+            break
+    taken.append(box)
     draw.rounded_rectangle(box, radius=0.5 * size, fill=color, outline=(255, 255, 255), width=1)
     dark = 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2] > 140
-    draw.text((column, row), text, font=font, fill=(20, 22, 26) if dark else (255, 255, 255), anchor="mm")
+    draw.text((column, middle), text, font=font, fill=(20, 22, 26) if dark else (255, 255, 255), anchor="mm")
     return np.asarray(picture)
 
 

@@ -1,7 +1,9 @@
 """From a scene to its page: gather, draw, render the template."""
 
+import json
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from reconstruction.evaluation.ground_truth import GroundTruth
 from reconstruction.evaluation.stage_results import StageResults
@@ -9,7 +11,7 @@ from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.report import pictures, sections
 from reconstruction.report.collect import Gathered, gather
 from registry import SceneBundle
-from registry.errors import EnvironmentMissing
+from registry.errors import EnvironmentMissing, UsageError
 
 _SOURCES = ("template.html.j2", "style.css", "script.js")
 
@@ -18,6 +20,7 @@ def build_page(
     bundle: SceneBundle,
     stages: StageResults,
     ground_truth: Path | None = None,
+    evaluation: dict[str, Any] | None = None,
     *,
     progress: Progress = NO_PROGRESS,
 ) -> str:
@@ -26,20 +29,44 @@ def build_page(
     Args:
         bundle: the scene.
         stages: what its stages made, as far as that is kept; what is missing is left out and said so.
-        ground_truth: folder of CONTRACT section 3; None: nothing is compared.
+        ground_truth: folder of CONTRACT section 3; None: there are no error maps.
+        evaluation: what `Evaluation.to_json` gave for this scene; None: measured here where there is a truth.
         progress: told of each part.
 
     Raises:
         UsageError: the truth is malformed, or not of this video.
     """
-    truth = evaluation = None
+    truth = None
     if ground_truth is not None:
         from reconstruction.evaluation.evaluate import evaluate_scene
         from reconstruction.report.truth import Truth
 
         truth = Truth.of(bundle, GroundTruth.load(ground_truth))
-        evaluation = evaluate_scene(bundle, ground_truth, stages=stages, progress=progress).to_json()
+        if evaluation is None:
+            evaluation = evaluate_scene(bundle, ground_truth, stages=stages, progress=progress).to_json()
     return render(gather(bundle, stages, truth, evaluation))
+
+
+def read_evaluation(path: Path, bundle: SceneBundle) -> dict[str, Any]:
+    """Read what `simrecon evaluate --json` wrote about this scene.
+
+    Raises:
+        UsageError: it cannot be read, is something else, or is about another scene or revision.
+    """
+    from reconstruction.evaluation.evaluate import SCHEMA
+
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--evaluation {path}: cannot be read ({error})") from error
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        raise UsageError(f"--evaluation {path}: is not what `simrecon evaluate --json` writes ({SCHEMA})")
+    if found.get("revision") != bundle.revision:
+        raise UsageError(
+            f"--evaluation {path}: is about revision {found.get('revision')} of {found.get('scene')}, this is "
+            f"{bundle.revision} of {bundle.scene['id']}; evaluate it again"
+        )
+    return found
 
 
 def render(g: Gathered) -> str:

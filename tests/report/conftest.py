@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from reconstruction.assembly import AssemblyConfig, assemble
 from reconstruction.assets import AssetsConfig, build_assets
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
+from reconstruction.evaluation.evaluate import evaluate_scene
 from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.pipeline import STAGES, Run
@@ -40,6 +42,12 @@ class Reconstructed:
     def registry(self) -> Path:
         """The registry's root."""
         return self.home / "registry"
+
+    @cached_property
+    def evaluation(self) -> dict:
+        """The scene's figures, from few points."""
+        bundle, stages = self.open()
+        return evaluate_scene(bundle, self.truth, stages=stages, composition_points=40_000).to_json()
 
     def open(self) -> tuple[SceneBundle, StageResults]:
         """Return the bundle and its stage results, freshly read."""
@@ -100,7 +108,8 @@ def page(reconstructed) -> str:
 @pytest.fixture(scope="session")
 def page_with_truth(reconstructed) -> str:
     """The page with the truth beside everything."""
-    return build_page(*reconstructed.open(), reconstructed.truth)
+    bundle, stages = reconstructed.open()
+    return build_page(bundle, stages, reconstructed.truth, reconstructed.evaluation)
 
 
 def publish(home: Path, results: dict, config: PipelineConfig) -> None:

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -135,7 +136,14 @@ def test_a_bundle_of_someone_else_gives_a_page(reconstructed):
 def test_with_the_truth_there_are_error_maps_and_figures(page, page_with_truth, reconstructed):
     assert re.findall(r'<section id="([\w-]+)"', page_with_truth) == ["truth", *SECTIONS]
     assert len(images(page_with_truth)) > len(images(page)) + 12
-    for text in ("camera error", "depth error of frame", "true instances in frame", "scene error"):
+    for text in (
+        "camera error",
+        "depth error of frame",
+        "true instances in frame",
+        "error of the scene",
+        "error of the surface",
+        "lacks of the truth",
+    ):
         assert text in page_with_truth
 
 
@@ -173,6 +181,22 @@ def test_the_command_writes_the_page(reconstructed, tmp_path, capsys):
     assert out.read_text().rstrip().endswith("</html>")
     assert out.stat().st_size < 8e6
     assert str(out) in capsys.readouterr().out
+
+
+def test_a_stored_evaluation_is_shown_and_one_of_another_scene_refused(reconstructed, tmp_path, capsys):
+    stored = dict(reconstructed.evaluation)
+    stored["metrics"] = {**stored["metrics"], "cd_cm": 123.4}
+    figures, out = tmp_path / "figures.json", tmp_path / "page.html"
+    figures.write_text(json.dumps(stored))
+    command = ["report", "small_room", "--out", str(out), "--registry", str(reconstructed.registry)]
+    command += ["--evaluation", str(figures)]
+    assert main(command) == 0
+    assert "123.4 cm" in out.read_text()
+    figures.write_text(json.dumps({**stored, "revision": "0" * 16}))
+    assert main(command) == 2
+    assert "evaluate it again" in capsys.readouterr().err
+    figures.write_text("[]")
+    assert main(command) == 2
 
 
 @pytest.mark.parametrize(
