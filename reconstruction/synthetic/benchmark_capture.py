@@ -70,7 +70,7 @@ class CaptureSpec:
     def sensor(self) -> Sensor:
         """Return what the phone does to light."""
         shutter = self.motion_blur_s * self.fps
-        return Sensor(self.noise, self.exposure_drift, shutter, blur_samples=4, blur_jitter=True)
+        return Sensor(self.noise, self.exposure_drift, shutter, 4 if shutter <= 0.15 else 6, blur_jitter=True)
 
 
 @dataclass(frozen=True)

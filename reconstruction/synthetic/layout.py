@@ -15,7 +15,7 @@ from reconstruction.synthetic.furnishing import CENTER_KINDS, SIDE_KINDS, WALL_K
 from reconstruction.synthetic.furniture import Workshop
 from reconstruction.synthetic.shapes import COARSE
 from reconstruction.synthetic.things import SMALL_KINDS, Kind, Place, Thing
-from registry.geometry import rigid
+from registry.geometry import invert_rigid, rigid, transform_points
 
 KINDS: dict[str, Kind] = {
     **CENTER_KINDS, **SIDE_KINDS, **WALL_KINDS, **CONTAINER_KINDS, **VESSEL_KINDS, **SMALL_KINDS,
@@ -28,8 +28,6 @@ _WALK_HALF_M = 0.36  # half the width of the band that stays free
 _ZONE_M = 0.52  # between the band and the walls
 _WALL_YAW = {"wall_north": 0.0, "wall_west": np.pi / 2, "wall_south": np.pi, "wall_east": -np.pi / 2}
 _EDGE_M, _IN_CONTAINER_M, _ABOVE_M = 0.012, 0.008, 0.01
-_SUPPORTS = ("book", "book", "box", "package", "plate", "tin", "carton")
-_SHORT = ("package", "tin", "block", "can", "jar", "mug", "cup", "candle", "wedge", "ball", "lemon")
 _TRIES = 60
 _LIKED = {"board": 4.0}  # wall shelves are small, but nobody hangs one to leave it empty
 
@@ -125,10 +123,10 @@ class Shape:
 class Layout:
     """A room while it is being filled."""
 
-    def __init__(self, seed: tuple[int, ...], max_stack: int, gap_m: float) -> None:
+    def __init__(self, seed: tuple[int, ...], max_stack: int, gap_m: float, crowding: float) -> None:
         """Start with an empty room; every draw depends on `seed` only."""
         self.rng = np.random.default_rng(seed)
-        self.seed, self.max_stack, self.gap_m = seed, max_stack, gap_m
+        self.seed, self.max_stack, self.gap_m, self.crowding = seed, max_stack, gap_m, crowding
         self.items: list[Item] = []
         self.shape: RoomShape | None = None
         self._drawn = 0
@@ -274,6 +272,8 @@ class Layout:
         x, y = self.rng.uniform(low, high)
         if place.stack:  # stacks are built with a little care
             x, y = place.area.mean(0) + 0.35 * (np.array([x, y]) - place.area.mean(0))
+        elif self.crowding > 0 and not place.inside:
+            x, y = self._beside(shape, owner, place, (x, y))
         outline = plane.turned(shape.silhouette, yaw, x, y)
         margin = _IN_CONTAINER_M if place.rim_m > 0 else _EDGE_M
         overhangs = place.stack and place.rim_m == 0
@@ -297,6 +297,20 @@ class Layout:
         if not self._is_free(world, bottom, bottom + height, owner, gap):
             return None
         return pose, contact
+
+    def _beside(
+        self, shape: Shape, owner: Item, place: Place, at: tuple[float, float]
+    ) -> tuple[float, float]:
+        """Return a point close to a thing that stands there already, as often as `crowding` says."""
+        neighbors = [c for c, p in owner.children if p is place]
+        if not neighbors or self.rng.random() > self.crowding:
+            return at
+        other = neighbors[int(self.rng.integers(len(neighbors)))]
+        reach = np.sqrt(plane.area(shape.silhouette) / np.pi) + np.sqrt(plane.area(other.silhouette) / np.pi)
+        away = reach + self.gap_m + self.rng.uniform(0.0, 0.03)
+        turn = self.rng.uniform(0, 2 * np.pi)
+        middle = transform_points(invert_rigid(owner.pose), other.pose[None, :3, 3])[0]
+        return float(middle[0] + away * np.cos(turn)), float(middle[1] + away * np.sin(turn))
 
     def _stands(self, owner: Item, shape: Shape, center: np.ndarray, contact: np.ndarray) -> bool:
         """Check that the joint center of mass lies well inside every contact from here down."""
@@ -358,37 +372,3 @@ class Layout:
 def _upright(yaw: float, x: float, y: float, z: float) -> np.ndarray:
     c, s = np.cos(yaw), np.sin(yaw)
     return rigid(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]), np.array([x, y, z], float))
-
-
-def support_keys() -> tuple[str, ...]:
-    """Return kinds with a flat top."""
-    return tuple(dict.fromkeys(_SUPPORTS))
-
-
-def content_keys() -> tuple[str, ...]:
-    """Return kinds that are put into containers."""
-    return _SHORT
-
-
-def free_keys() -> tuple[str, ...]:
-    """Return kinds that may stand anywhere."""
-    return tuple(k for k in (*SMALL_KINDS, *VESSEL_KINDS) if not KINDS[k].rolls)
-
-
-def stacked_keys() -> tuple[str, ...]:
-    """Return kinds that are put on top of others."""
-    return (
-        "book",
-        "package",
-        "tin",
-        "block",
-        "can",
-        "jar",
-        "mug",
-        "cup",
-        "candle",
-        "box",
-        "bottle",
-        "wedge",
-        "calendar",
-    )

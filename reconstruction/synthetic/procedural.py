@@ -8,17 +8,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.synthetic import layout, textures
+from reconstruction.synthetic import textures
+from reconstruction.synthetic.containers import CONTAINER_KINDS, VESSEL_KINDS
 from reconstruction.synthetic.furnishing import SIDE_KINDS, WALL_KINDS
 from reconstruction.synthetic.furniture import Workshop
 from reconstruction.synthetic.layout import KINDS, Item, Layout, RoomIsFull, RoomShape
 from reconstruction.synthetic.room import WALL_HEIGHT_M, Entity, Room
 from reconstruction.synthetic.shapes import COARSE, Solid, box, moved, shifted
 from reconstruction.synthetic.textures import Texture
+from reconstruction.synthetic.things import SMALL_KINDS
 from registry.errors import UsageError
 
 _WALL_THICKNESS_M = 0.1
 _ATTEMPTS = 40
+_SUPPORTS = ("book", "box", "package", "plate", "tin", "carton")
+_STACKED = (
+    "book", "package", "tin", "block", "can", "jar", "mug", "cup", "candle", "box", "bottle", "wedge", "calendar",
+)  # fmt: skip
+_CONTENTS = ("package", "tin", "block", "can", "jar", "mug", "cup", "candle", "wedge", "ball", "lemon")
+_FREE = tuple(key for key in (*SMALL_KINDS, *VESSEL_KINDS) if not KINDS[key].rolls)
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,8 @@ class RoomSpec:
     """Share of the small things that stand on other small things."""
     containers: float = 0.08
     """Share of all things that are open containers; each holds one to three others."""
+    side_furniture: float = 0.16
+    """Share of all things that is furniture along the walls; one table stands in the middle, two beyond 16 things."""
     wall_things: float = 0.12
     """Share of all things that hang on walls."""
     textureless_share: float = 0.0
@@ -43,6 +53,8 @@ class RoomSpec:
     """Walls and floor without any texture."""
     clutter_gap_m: float = 0.05
     """Smallest distance between neighbors on the same support; inside containers at most 12 mm."""
+    crowding: float = 0.0
+    """Share of the things that are put right beside another one, where there is room."""
     walls: int = 3
     """3: the side that the camera comes from is open; 4: a closed room."""
     step_m: float = 0.03
@@ -57,7 +69,14 @@ class RoomSpec:
                 f"RoomSpec: objects={self.objects} (3 or more), max_stack={self.max_stack} (1 or more), "
                 f"walls={self.walls} (3 or 4)"
             )
-        for name in ("stacks", "containers", "wall_things", "textureless_share"):
+        for name in (
+            "stacks",
+            "containers",
+            "wall_things",
+            "side_furniture",
+            "textureless_share",
+            "crowding",
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"RoomSpec: {name}={getattr(self, name)}, expected a share between 0 and 1")
 
@@ -78,7 +97,7 @@ def plan_room(spec: RoomSpec) -> RoomPlan:
     for attempt in range(_ATTEMPTS):
         seed = (spec.seed, spec.objects, attempt)
         try:
-            filled = _fill(spec, Layout(seed, spec.max_stack, spec.clutter_gap_m))
+            filled = _fill(spec, Layout(seed, spec.max_stack, spec.clutter_gap_m, spec.crowding))
         except RoomIsFull as full:
             stuck = str(full)
             continue
@@ -95,7 +114,7 @@ def _fill(spec: RoomSpec, room: Layout) -> Layout:
     count = spec.objects
     middle = 1 if count <= 16 else 2
     hanging = min(round(spec.wall_things * count), count - middle - 1)
-    side = min(max(round(0.16 * count - 0.3), 0), count - middle - hanging - 1)
+    side = min(max(round(spec.side_furniture * count - 0.3), 0), count - middle - hanging - 1)
     walls = ("wall_north", "wall_west", "wall_east", "wall_south")[: spec.walls]
     room.furnish_middle(middle, walls)
     for number in range(side):
@@ -113,17 +132,17 @@ def _fill(spec: RoomSpec, room: Layout) -> Layout:
     inside = min(int(sum(room.rng.integers(1, 4) for _ in range(holders))), left)
     free = left - inside
     for _ in range(containers):
-        room.put(layout.CONTAINER_KINDS, room.open_places)
+        room.put(CONTAINER_KINDS, room.open_places)
     for _ in range(supports):
-        room.put(layout.support_keys(), room.open_places)
+        room.put(_SUPPORTS, room.open_places)
     for number in range(stacked):
         # Every other one has a flat top, so that stacks can grow.
-        keys = layout.support_keys() if number % 2 == 0 and number + 1 < stacked else layout.stacked_keys()
+        keys = _SUPPORTS if number % 2 == 0 and number + 1 < stacked else _STACKED
         room.put(keys, lambda: room.stack_places() or room.open_places(), 20)
     for _ in range(inside):
-        room.put(layout.content_keys(), room.container_places, 20)
+        room.put(_CONTENTS, room.container_places, 20)
     for _ in range(free):
-        room.put(layout.free_keys(), room.open_places)
+        room.put(_FREE, room.open_places)
     return room
 
 

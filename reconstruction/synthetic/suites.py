@@ -23,7 +23,9 @@ CI_CAPTURES: dict[str, CaptureSpec] = {
 PRESETS: dict[str, CaptureSpec] = {
     "easy": CaptureSpec(RoomSpec(stacks=0.0, containers=0.0, clutter_gap_m=0.1)),
     "default": CaptureSpec(),
-    "cluttered": CaptureSpec(RoomSpec(clutter_gap_m=0.012, containers=0.15, stacks=0.35)),
+    "cluttered": CaptureSpec(
+        RoomSpec(clutter_gap_m=0.012, crowding=0.9, containers=0.12, stacks=0.2, side_furniture=0.05)
+    ),
     "stacked": CaptureSpec(RoomSpec(stacks=0.65, containers=0.0, wall_things=0.08)),
     "containers": CaptureSpec(RoomSpec(containers=0.25, stacks=0.1)),
     "textureless": CaptureSpec(RoomSpec(textureless_share=0.7)),
@@ -43,9 +45,9 @@ SUITE: dict[str, CaptureSpec] = {
     "easy05": _named("easy", 5, 11),
     "shaky08": _named("shaky", 8, 12),
     "stacked12": _named("stacked", 12, 13),
-    "containers12": _named("containers", 12, 14),
     "textureless12": _named("textureless", 12, 15),
-    "cluttered20": _named("cluttered", 20, 16, 160, "two_heights"),
+    "cluttered16": _named("cluttered", 16, 16, path="two_heights"),
+    "containers20": _named("containers", 20, 14, 160),
     "room30": _named("default", 30, 17, 180, "two_heights"),
     "room40": _named("default", 40, 18, 220, "loop", walls=4),
 }

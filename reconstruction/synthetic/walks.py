@@ -61,8 +61,8 @@ def _aim(shape: RoomShape, ground: np.ndarray, t: np.ndarray, looks_up: float) -
     follow = np.clip(ground, -0.6 * reach, 0.6 * reach)  # along a long row of tables, look at the near one
     near = np.column_stack([follow, np.full(len(t), 0.52)])
     away = -ground / np.linalg.norm(ground, axis=1, keepdims=True)
-    far = np.column_stack([0.4 * follow + away * (np.mean(shape.half) + 0.2), np.full(len(t), 0.72)])
-    share = (0.5 - 0.5 * np.cos(2 * np.pi * looks_up * t))[:, None]
+    far = np.column_stack([0.4 * follow + away * (np.mean(shape.half) + 0.2), np.full(len(t), 0.78)])
+    share = 0.85 * (0.5 - 0.5 * np.cos(2 * np.pi * looks_up * t))[:, None]
     return (1 - share) * near + share * far
 
 
