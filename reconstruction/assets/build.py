@@ -6,6 +6,7 @@ from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.hanging import hanging_slab
 from reconstruction.assets.mass import physical_attributes
 from reconstruction.assets.materials import choose_material
 from reconstruction.assets.solid import Solid
@@ -144,6 +145,9 @@ def object_solid(
     if len(seen.points) < config.min_points:
         return *box_fallback(item, seen.points), "box-fallback"
     frame = frame_object(item, seen, stands.level(item.id), found)
+    hanging = hanging_slab(frame, posed, config)
+    if hanging is not None:
+        return hanging.body, frame, "observed+slab" + ("+completed" if hanging.completed else "")
     noise = object_noise(posed, depth, pixels, seen, item.id)
     volume = fuse_volume(item.id, frame, noise, posed, depth, pixels, config)
     size = np.ptp(frame.points, axis=0)

@@ -1,0 +1,79 @@
+"""Flat things on walls become slabs; what the image's edge cut goes on, what was seen whole does not."""
+
+import numpy as np
+import pytest
+
+from reconstruction.assets import AssetsConfig
+from reconstruction.assets.hanging import hanging_slab
+from reconstruction.assets.volume import ObjectFrame
+from reconstruction.types import Camera, PosedFrames, VideoSource
+from registry.geometry import rigid
+
+CAMERA = Camera(320, 240, 280.0, 280.0, 160.0, 120.0)
+# Looks along +y at the wall: right is +x, down is -z.
+FACING = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def frames(*eyes) -> PosedFrames:
+    poses = np.array([rigid(FACING, np.array(eye, float)) for eye in eyes])
+    n = len(poses)
+    none = np.zeros((0, 240, 320, 3), np.uint8)
+    source = VideoSource("x.mp4", "0" * 64, 320, 240, 12.0, n, n / 12)
+    return PosedFrames(
+        source, CAMERA, np.zeros((n, 240, 320, 3), np.uint8), np.arange(n, dtype=np.int32), np.arange(n) / 12, poses,
+        np.ones(n, np.float32), none, np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 3)),
+        np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros((0, 2), np.int32), n, True, 0.3,
+    )  # fmt: skip
+
+
+def seen(width=0.8, height=0.3, thickness=0.03, noise=0.004, wall_y=0.02, seed=0) -> ObjectFrame:
+    """Points on the front of a picture whose lower edge is at z = 0; the wall is 2 m before the cameras."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack(
+        [
+            rng.uniform(-width / 2, width / 2, 4000),
+            np.full(4000, wall_y - thickness) + rng.normal(0, noise, 4000),
+            rng.uniform(0, height, 4000),
+        ]
+    )
+    normals = np.tile([0.0, -1.0, 0.0], (4000, 1))
+    return ObjectFrame(rigid(translation=np.array([0, 2.0, 1.2])), points, normals, False, wall_y)
+
+
+def size_of(hanging) -> np.ndarray:
+    return np.ptp(hanging.body.vertices, axis=0)
+
+
+def test_a_picture_seen_whole_is_a_slab_of_its_size():
+    found = hanging_slab(seen(), frames((0, 0, 1.3), (0.3, 0, 1.3)), AssetsConfig())
+    assert not found.completed
+    assert size_of(found) == pytest.approx([0.8, 0.03, 0.3], abs=0.02)
+    assert found.body.vertices[:, 1].max() == pytest.approx(0.02)  # its back is on the wall
+    assert found.body.volume == pytest.approx(np.prod(size_of(found)))
+
+
+def test_a_picture_cut_at_the_top_goes_on_to_a_square():
+    """The camera looks at z = 0.7: the image ends at z = 1.55, just above what was seen of the picture."""
+    low_eye = (0.0, 0.0, 0.68)
+    found = hanging_slab(seen(), frames(low_eye), AssetsConfig())
+    assert found.completed
+    assert size_of(found) == pytest.approx([0.8, 0.03, 0.8], abs=0.03)
+    assert found.body.vertices[:, 2].min() == pytest.approx(0.0, abs=0.02)  # only the unseen side moves
+
+
+def test_one_frame_that_looked_beyond_is_enough_to_end_it():
+    found = hanging_slab(seen(), frames((0.0, 0.0, 0.68), (0.0, 0.0, 1.3)), AssetsConfig())
+    assert not found.completed
+
+
+def test_a_flush_print_gets_the_least_thickness():
+    config = AssetsConfig()
+    found = hanging_slab(seen(thickness=0.001), frames((0, 0, 1.3)), config)
+    assert size_of(found)[1] == pytest.approx(config.flat_thickness_m)
+
+
+def test_what_is_thick_or_bent_or_stands_is_no_slab():
+    assert hanging_slab(seen(thickness=0.25), frames((0, 0, 1.3)), AssetsConfig()) is None
+    assert hanging_slab(seen(noise=0.05), frames((0, 0, 1.3)), AssetsConfig()) is None
+    standing = ObjectFrame(np.eye(4), seen().points, seen().normals, True, None)
+    assert hanging_slab(standing, frames((0, 0, 1.3)), AssetsConfig()) is None
