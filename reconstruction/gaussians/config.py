@@ -11,7 +11,7 @@ class GaussiansConfig:
     backend: Literal["cpu", "gsplat"] = "cpu"
     """Rasterizer: `cpu` is built in; `gsplat` needs CUDA and the extra `simrecon[gpu]`."""
 
-    iterations: int = 900
+    iterations: int = 700
     """Gradient steps in all, one frame each."""
 
     side_px: int = 480
@@ -74,7 +74,7 @@ class GaussiansConfig:
     color_rate: float = 1.5e-2
     """Adam step of the colors (SH degree 0)."""
 
-    exposure_rate: float = 2e-3
+    exposure_rate: float = 5e-3
     """Adam step of gains and biases."""
 
     pose_rate: float = 3e-4

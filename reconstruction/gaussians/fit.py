@@ -23,6 +23,7 @@ from reconstruction.types import DepthMaps, PosedFrames
 from registry.errors import InputError
 
 _REPORT_EVERY = 10
+_EXPOSURE_SIDE = 96  # pixels: enough to compare mean colors
 _EXPOSURE_PULL = 1e-3  # towards gain 1 and bias 0, which colors and exposures leave open together
 
 
@@ -91,7 +92,6 @@ def fit_gaussians(
     backend = load_backend(config.backend)
     unit = median_depth_of(depth)
     settings = settings_of(config, unit)
-    progress.start(config.iterations, "fitting Gaussians")
     seeds = seed_from_depth(
         posed, depth, int(config.seed_share * config.max_gaussians), config.initial_opacity
     )
@@ -102,6 +102,9 @@ def fit_gaussians(
         Adam((frames, 6)), Adam((frames, 6)),
     )  # fmt: skip
     rng = np.random.default_rng(config.seed)
+    progress.start(config.iterations, "fitting Gaussians")
+    if config.optimize_exposure:
+        cameras.gain[:] = _first_gains(backend, state, posed, depth, settings)
     coarse_until = round(config.coarse_share * config.iterations)
     added = 0
     order: list[int] = []
@@ -134,6 +137,21 @@ def fit_gaussians(
     return from_packed(
         state.parameters, cameras.gain.astype(np.float32), cameras.bias.astype(np.float32), cameras.poses
     )
+
+
+def _first_gains(
+    backend: Backend, state: SplatState, posed: PosedFrames, depth: DepthMaps, settings: RasterSettings
+) -> np.ndarray:
+    """Return gains (k, 3): each frame's mean color over that of the seeds, which average all frames; mean gain 1."""
+    gains = np.ones((len(posed.images), 3))
+    for row, pose in enumerate(posed.world_from_camera):
+        target = make_target(posed, depth, row, _EXPOSURE_SIDE, 1.0)
+        render = backend.render(state.parameters, target.camera, pose, settings)
+        solid = render.opacity > 0.5
+        if solid.mean() > 0.1:
+            color = render.color[solid] / render.opacity[solid, None]
+            gains[row] = target.image[solid].mean(axis=0) / np.maximum(color.mean(axis=0), 0.02)
+    return np.clip(gains / np.exp(np.log(gains).mean(axis=0)), 0.3, 3.0)
 
 
 def _fill(

@@ -43,6 +43,9 @@ _TWO = np.float32(2.0)
 # exp(-rho / 2) = exp(x)^64 with x = -rho / 128, by its Taylor polynomial.
 _FALLOFF_STEP = np.float32(-1.0 / 128.0)
 _E2, _E3, _E4, _E5 = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120)
+# Where the screen-space filter shapes a splat, its depth still follows its plane, within this factor: with the depth
+# of the center, slanted surfaces of splats smaller than a pixel would come out too near.
+_FLAT_LOW, _FLAT_HIGH = np.float32(0.9), np.float32(1.1)
 _MIN_COSINE = 0.01  # a splat seen more edge-on than this has no usable intersection
 _FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
 
@@ -365,8 +368,9 @@ def _blend_tile(
                 rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
                 on_disk = (w > zero) & (rho3 <= rho2)
                 rho = rho3 if on_disk else rho2
-                inverse_z = w * inverse_zc if on_disk else inverse_zc
-                z = zc * inverse_w if on_disk else zc
+                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                w = w if on_disk else w_flat
+                inverse_z, z = w * inverse_zc, zc / w
                 alpha = min(opacity * _falloff(rho), alpha_max)
                 alpha = alpha if (rho <= reach2) & (t >= stop) else zero
                 weight = alpha * t
@@ -507,9 +511,11 @@ def _blend_tile_backward(
                 rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
                 on_disk = (w > zero) & (rho3 <= rho2)
                 rho = rho3 if on_disk else rho2
-                inverse_z = w * inverse_zc if on_disk else inverse_zc
-                inverse_w = inverse_w if on_disk else _ONE
-                z = zc * inverse_w
+                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                moves = on_disk | (w == w_flat)
+                w = w if on_disk else w_flat
+                inverse_w = _ONE / w
+                inverse_z, z = w * inverse_zc, zc * inverse_w
                 falloff = _falloff(rho)
                 inside = (rho <= reach2) & (t >= stop)
                 falloff = falloff if inside else zero
@@ -537,7 +543,7 @@ def _blend_tile_backward(
                 flat_rho = zero if on_disk else d_rho
                 d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
                 d_w = -(d_u * u + d_v * v) - d_z * z * inverse_w
-                d_w = d_w if on_disk else zero
+                d_w = d_w if moves else zero
                 lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
                 lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
                 lanes[ZC, j] += d_z * inverse_w

@@ -52,7 +52,8 @@ def render(parameters, xi, camera, world_from_camera, reference_depth=1.0, alpha
     rho_disk, rho_screen = u * u + v * v, 2 * (dx * dx + dy * dy)
     on_disk = (z_disk > 0) & (rho_disk <= rho_screen)
     rho = torch.where(on_disk, rho_disk, rho_screen)
-    z = torch.where(on_disk, z_disk, center[:, 2:].expand_as(z_disk))
+    # Under the screen-space filter the depth follows the plane within a factor.
+    z = torch.where(on_disk, z_disk, center[:, 2:] / (center[:, 2:] / z_disk).clamp(0.9, 1.1))
     alpha = (torch.sigmoid(parameters[:, 9:10]) * torch.exp(-0.5 * rho)).clamp(max=alpha_max)
     order = torch.argsort(center[:, 2])
     alpha, z, normal = alpha[order], z[order], normal[order]

@@ -22,10 +22,10 @@ SMALL = GaussiansConfig(
 
 @pytest.fixture(scope="module")
 def noisy(small_capture):
-    """The capture with depth as a sweep gives it: noise of 0.5 %, holes, and a darker frame."""
+    """The capture with depth as a sweep gives it: noise of 1 %, holes, and a darker frame."""
     rng = np.random.default_rng(0)
     depth = small_capture.depth
-    z = np.asarray(depth.depth) * (1 + 0.005 * rng.normal(size=depth.depth.shape)).astype(np.float32)
+    z = np.asarray(depth.depth) * (1 + 0.01 * rng.normal(size=depth.depth.shape)).astype(np.float32)
     confidence = np.where(rng.uniform(size=z.shape) < 0.1, 0, depth.confidence).astype(np.uint8)
     images = small_capture.posed.images.copy()
     images[2] = (images[2] * 0.8).astype(np.uint8)
@@ -48,10 +48,11 @@ def test_fitting_makes_images_better_and_depth_better_than_the_input(noisy, fitt
     seeds = from_packed(seed_from_depth(posed, depth, 6000, 0.7))
     before = figures(seeds, posed, small_capture.held_out_depth, unit=unit)
     after = figures(fitted, posed, small_capture.held_out_depth, unit=unit)
-    assert after.mean_psnr_db > before.mean_psnr_db + 3
-    assert after.mean_psnr_db > 24
-    assert after.mean_ssim > before.mean_ssim
-    assert after.median_depth_error < 0.0034  # 0.5 % Gaussian noise has a median of 0.34 %
+    inside = 1  # the first kept-out frame looks beyond what the keyframes saw
+    assert after.psnr_db[inside] > before.psnr_db[inside] + 3
+    assert after.psnr_db[inside] > 25
+    assert after.ssim[inside] > before.ssim[inside] + 0.05
+    assert after.depth_error[inside] < 0.0067  # 1 % Gaussian noise has a median of 0.67 %
     assert len(fitted) <= SMALL.max_gaussians
 
 

@@ -177,11 +177,21 @@ def test_gaussians_are_an_artifact(tmp_path):
 
 def test_evaluation_forgives_exposure_and_nothing_else(small_capture):
     posed = small_capture.posed
-    plain = from_packed(plate(2.0, (0.5, 0.5, 0.5)))
-    figures = evaluate_gaussians(plain, posed, small_capture.held_out_depth, side_px=96)
+    pose, image = posed.held_out_world_from_camera[0], posed.held_out_images[0]
+    # A gray card before the first kept-out camera: every pixel has the image's mean color after the exposure.
+    local = plate(1.0, (0.5, 0.5, 0.5))
+    points = local[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    normals = np.tile(-pose[:3, 2], (len(points), 1))
+    card = from_packed(
+        disks(points, normals, np.full((len(points), 3), 0.5), np.full(len(points), 0.03), 0.97)
+    )
+    figures = evaluate_gaussians(card, posed, small_capture.held_out_depth)
     assert figures.indices.tolist() == posed.held_out_indices.tolist()
-    assert figures.mean_psnr_db < 25
-    assert figures.median_depth_error > 0.05
+    deviation = (image / 255 - (image / 255).mean((0, 1))).std()
+    assert figures.psnr_db[0] == pytest.approx(-20 * np.log10(deviation), abs=0.3)
+    truth = small_capture.held_out_depth[0]
+    assert figures.depth_error[0] == pytest.approx(np.median(np.abs(1 / truth - 1)), rel=0.02)
+    assert figures.coverage[0] > 0.99
 
 
 def test_unknown_backend_is_wrong_use_and_missing_gsplat_is_said():
