@@ -8,7 +8,7 @@ from reconstruction.synthetic.benchmark_capture import CaptureSpec
 from reconstruction.synthetic.procedural import RoomSpec
 from registry.errors import UsageError
 
-_SMALL = CaptureSpec(frames=60, width=480, height=360, noise=1.4)
+_SMALL = CaptureSpec(frames=50, width=480, height=360, noise=1.4)
 
 CI_CAPTURES: dict[str, CaptureSpec] = {
     "ci_table": replace(
