@@ -16,7 +16,7 @@ class InstancesConfig:
     min_object_area_m2: float = 0.003
     """Things of which less surface than this was seen are scraps."""
 
-    min_object_image_share: float = 2.5e-4
+    min_object_image_share: float = 4e-4
     """Things that cover less of every keyframe than this are scraps."""
 
     min_floating_m: float = 0.45

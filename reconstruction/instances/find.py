@@ -15,6 +15,7 @@ from reconstruction.instances.base_planes import (
 )
 from reconstruction.instances.boxes import UprightBox, upright_box, with_bottom
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.feet import merge_feet
 from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.labels import ShapeFacts, coarse_label
 from reconstruction.instances.mesh_graph import MeshGraph
@@ -55,6 +56,7 @@ def find_instances(
     for vertices, number in crumbs:
         owner[vertices] = number
     things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
+    things = merge_feet(graph, things, progress)
     things = _without_fragments(graph, things, base[0].observed, config, progress)
     for thing in things:
         if thing.attached:

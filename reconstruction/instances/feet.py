@@ -1,0 +1,62 @@
+"""A thin slice below a single thing, no wider than it, is that thing's foot and not another thing.
+
+Cutting things at the level of their support sometimes leaves the flare of a pot's bottom or a bowl's ring behind. What
+really carries a thing alone (a plate, a book, a coaster) reaches beyond it.
+"""
+
+import cv2
+import numpy as np
+
+from reconstruction.instances.mesh_graph import MeshGraph
+from reconstruction.instances.segmentation import Thing
+from reconstruction.progress import Progress
+
+_MAX_HEIGHT_M = 0.04
+_MAX_HEIGHT_SHARE = 0.5  # of the thing above
+_MAX_AREA_SHARE = 0.9
+_REACH_M = 0.01
+_MIN_INSIDE = 0.6
+
+
+def merge_feet(graph: MeshGraph, things: list[Thing], progress: Progress) -> list[Thing]:
+    """Join feet with what stands on them, from the top of each pile down."""
+    merged = 0
+    while True:
+        foot = next((thing for thing in things if _foot_of(graph, thing, things) is not None), None)
+        if foot is None:
+            break
+        above = _foot_of(graph, foot, things)
+        above.vertices = np.union1d(above.vertices, foot.vertices)
+        above.rests_on = foot.rests_on
+        things = [thing for thing in things if thing is not foot]
+        merged += 1
+    if merged:
+        progress.note(f"{merged} thin slices below things are taken for their feet")
+    return things
+
+
+def _foot_of(graph: MeshGraph, thing: Thing, things: list[Thing]) -> Thing | None:
+    """Return the thing that `thing` is the foot of, or None."""
+    if thing.attached:
+        return None
+    carried = [other for other in things if other.rests_on is thing]
+    if len(carried) != 1:
+        return None
+    low, high = np.percentile(graph.points[thing.vertices, 2], [1, 99])
+    above_low, above_high = np.percentile(graph.points[carried[0].vertices, 2], [1, 99])
+    if high - low > min(_MAX_HEIGHT_M, _MAX_HEIGHT_SHARE * (above_high - above_low)):
+        return None
+    own, other = _outline(graph, thing), _outline(graph, carried[0])
+    if cv2.contourArea(own) > _MAX_AREA_SHARE * cv2.contourArea(other):
+        return None
+    flat = graph.points[thing.vertices, :2]
+    inside = [cv2.pointPolygonTest(other, (float(x), float(y)), True) > -_REACH_M for x, y in flat]
+    return carried[0] if np.mean(inside) > _MIN_INSIDE else None
+
+
+def _outline(graph: MeshGraph, thing: Thing) -> np.ndarray:
+    """Return the convex footprint, float32 (k, 1, 2), without the outermost stray vertices."""
+    flat = graph.points[thing.vertices, :2]
+    middle = np.median(flat, axis=0)
+    far = np.linalg.norm(flat - middle, axis=1)
+    return cv2.convexHull(flat[far <= np.percentile(far, 98)].astype(np.float32))
