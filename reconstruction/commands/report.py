@@ -45,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the page."""
     from reconstruction.commands.reporting import make_listener
     from reconstruction.evaluation.stage_results import StageResults
+    from reconstruction.report.collect import by_reason
     from reconstruction.report.page import build_page, read_evaluation
     from registry import SceneRegistry
     from registry.errors import UsageError
@@ -62,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         page = build_page(bundle, stages, arguments.ground_truth, evaluation, progress=listener)
         listener.end_stage("report", None)
     out.write_text(page, encoding="utf-8")
-    for stage, reason in stages.missing.items():
-        print(f"left out: {stage}: {reason}")
+    for reason, names in by_reason(stages.missing).items():
+        print(f"left out: {', '.join(names)}: {reason}")
     print(f"{out} ({out.stat().st_size / 1e6:.1f} MB)")
     return 0

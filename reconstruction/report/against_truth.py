@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from reconstruction.report.blocks import Block, Cell, Details, Section, Table, Text, Tile, Tiles
-from reconstruction.report.collect import Gathered
+from reconstruction.report.blocks import Block, Cell, Details, Section, Table, Text, Tile, Tiles, left_out
+from reconstruction.report.collect import Gathered, by_reason
 
 # Metric, name, unit, factor, digits: what a reader looks at first.
 _HEADLINE = (
@@ -39,9 +39,8 @@ def truth_section(g: Gathered) -> Section | None:
     blocks.append(_stages_table(g.evaluation["stages"]))
     lines = [f"{key} = {value:.6g}" for key, value in metrics.items() if value is not None]
     blocks.append(Details("All metrics", "\n".join(lines)))
-    left = g.evaluation["left_out"]
-    if left:
-        blocks += [Text(f"{name} left out: {why}.", left_out=True) for name, why in sorted(left.items())]
+    for reason, names in by_reason(g.evaluation["left_out"]).items():
+        blocks.append(left_out(", ".join(sorted(names)), reason))
     return Section(
         "truth", "Against the truth", blocks, "After aligning the cameras with the true ones.", "Truth"
     )

@@ -40,9 +40,12 @@ class Gathered:
 
     def why_missing(self, *names: str) -> str:
         """Say which of these stages' results are missing and why; an empty string if none is."""
-        return "; ".join(
-            f"{name}: {self.stages.missing[name]}" for name in names if name in self.stages.missing
-        )
+        gone = {
+            name: self.stages.missing.get(name, "not kept")
+            for name in names
+            if name not in self.stages.folders
+        }
+        return "; ".join(f"{', '.join(stages)}: {reason}" for reason, stages in by_reason(gone).items())
 
     @cached_property
     def _in_world(self) -> tuple[PosedFrames | None, DepthMaps | None]:
@@ -146,3 +149,11 @@ def gather(
 ) -> Gathered:
     """Put together what a report is made from."""
     return Gathered(bundle, stages, truth, evaluation)
+
+
+def by_reason(missing: dict[str, str]) -> dict[str, list[str]]:
+    """Group missing stages by the reason that they share."""
+    out: dict[str, list[str]] = {}
+    for stage, reason in missing.items():
+        out.setdefault(reason, []).append(stage)
+    return out

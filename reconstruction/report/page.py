@@ -9,7 +9,7 @@ from reconstruction.evaluation.ground_truth import GroundTruth
 from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.report import pictures, sections
-from reconstruction.report.collect import Gathered, gather
+from reconstruction.report.collect import Gathered, by_reason, gather
 from registry import SceneBundle
 from registry.errors import EnvironmentMissing, UsageError
 
@@ -92,5 +92,5 @@ def render(g: Gathered) -> str:
         picture=pictures.preview(g),
         tiles=sections.summary_tiles(g),
         sections=sections.all_sections(g),
-        missing=g.stages.missing,
+        missing=by_reason(g.stages.missing),
     )

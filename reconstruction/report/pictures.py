@@ -69,7 +69,7 @@ def camera_path(g: Gathered) -> Picture:
 def depth_rows(g: Gathered, count: int = 4) -> tuple[list[Picture], list[float]]:
     """Color, depth, normals (and the error against the truth) of some keyframes; median errors in metres."""
     out, errors = [], []
-    camera = g.depth.camera
+    camera, compared = g.depth.camera, depth_is_compared(g, count)
     for row in g.keyframe_rows(count):
         index, depth = int(g.posed.indices[row]), np.asarray(g.depth.depth[row])
         pose = g.posed.world_from_camera[row]
@@ -84,11 +84,19 @@ def depth_rows(g: Gathered, count: int = 4) -> tuple[list[Picture], list[float]]
             _frame(colored, f"depth of frame {index}", f"{near:.1f} to {far:.1f} m; {shares}"),
             _frame(drawing.normal_colors(normals), f"normals of frame {index}"),
         ]
-        if g.truth is not None:
+        if compared:
             drawn, median = _depth_error(g, index, pose, depth)
             out.append(drawn)
             errors += [] if median is None else [median]
     return out, errors
+
+
+def depth_is_compared(g: Gathered, count: int = 4) -> bool:
+    """Tell whether the true depth of any keyframe shown is known."""
+    if g.truth is None:
+        return False
+    shown = [int(g.posed.indices[row]) for row in g.keyframe_rows(count)]
+    return g.truth.has_meshes or any(g.truth.known.depth(index) is not None for index in shown)
 
 
 def _depth_error(

@@ -124,7 +124,7 @@ def depth_section(g: Gathered) -> Section:
         section.blocks.append(left_out("Depth and normals", g.why_missing("poses", "depth", "world")))
         return section
     items, errors = pictures.depth_rows(g)
-    heads = ["color", "depth", "normals"] + (["error"] if g.truth is not None else [])
+    heads = ["color", "depth", "normals"] + (["error"] if pictures.depth_is_compared(g) else [])
     section.blocks.append(
         Pictures(items, len(heads), heads, phone_columns=len(heads) if len(heads) == 4 else 3)
     )
@@ -132,6 +132,8 @@ def depth_section(g: Gathered) -> Section:
     if errors:
         limit = f"{100 * pictures.DEPTH_ERROR_M:.0f} cm or more"
         section.blocks.append(Legend(drawing.gradient(drawing.ERROR_MAP), "0", limit, "error of the depth"))
+    elif g.truth is not None:
+        section.blocks.append(left_out("The depth's error map", "no true depth of these frames is known"))
     section.blocks.append(
         Text(
             "Normals have world axes as colors: the floor is even lavender, facing walls are even red or green."
@@ -150,6 +152,8 @@ def surface_section(g: Gathered) -> Section:
     section.blocks.append(Pictures(items, 3, heads, phone_columns=3))
     if g.truth is not None and g.truth.has_meshes:
         section.blocks.append(_distance_legend())
+    elif g.truth is not None:
+        section.blocks.append(left_out("The surface's error map", "the truth has no meshes"))
     surface = g.surface
     unseen = (np.asarray(surface.space.state) == 0).mean()
     section.blocks.append(

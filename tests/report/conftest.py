@@ -79,7 +79,14 @@ def reconstructed(tmp_path_factory) -> Reconstructed:
     )
     found = find_instances(capture.posed, capture.depth, surface, InstancesConfig(), progress=NO_PROGRESS)
     coarse = AssetsConfig(
-        cells_along_longest=32, max_voxels=100_000, texture_max_px=128, texture_frames=4, base_texel_m=0.04
+        cells_along_longest=32,
+        max_voxels=100_000,
+        texture_max_px=128,
+        texture_frames=4,
+        base_texel_m=0.04,
+        faces_small=500,
+        faces_furniture=800,
+        collision_faces=200,
     )
     assets = build_assets(capture.posed, capture.depth, surface, found, coarse)
     graph = infer_scene_graph(assets, SceneGraphConfig())
