@@ -182,13 +182,16 @@ def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
     assert result.metrics["peak_memory_mb"] > 100
     assert "### room" in page.read_text()
 
-    # A run whose stages all come from the cache tells what they cost when they were computed.
-    again = subprocess.run([*line, "--force"], cwd=ROOT, capture_output=True, text=True, timeout=600)
+    # A run whose stages all come from the cache tells what they cost when they were computed. Without the truth
+    # (another input, so it is done again) the evaluation is quick.
+    (tmp_path / "captures" / "room" / "ground_truth").rename(tmp_path / "ground_truth")
+    again = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert again.returncode == 0, again.stdout + again.stderr
     repeated = load_results(out)[0]
     assert "assembly: already done" in log.read_text()
     assert repeated.wall_s["reconstruct"] < 0.5 * repeated.metrics["time_s"]
     for stage in STAGE_NAMES:
         assert repeated.report["timings_s"][stage] == result.report["timings_s"][stage]
-    same = {key for key in result.metrics if key not in ("time_s", "peak_memory_mb")}
-    assert {key: repeated.metrics[key] for key in same} == {key: result.metrics[key] for key in same}
+    for key in ("psnr_db", "ssim", "coverage", "stable_rate", "registered_share", "objects"):
+        assert repeated.metrics[key] == result.metrics[key], key
+    assert repeated.reason("cd_cm") == "no ground truth was given"
