@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 INK, MUTED, LINE, ACCENT = "#1d2330", "#6b7280", "#d5d9e0", "#2f6fde"
 _STYLE = {
     "svg.fonttype": "none",  # text stays text: small, selectable, and set in the page's font
+    "text.parse_math": False,  # a label with dollar signs is no formula
     "font.family": "sans-serif",
     "font.size": 10,
     "axes.edgecolor": LINE,

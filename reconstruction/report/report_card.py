@@ -65,7 +65,7 @@ def physics_section(g: Gathered) -> Section:
         f"All {physics['dynamic_objects']} movable objects together for {physics['duration_s']:.0f} s at "
         f"1/{1 / physics['timestep_s']:.0f} s, undamped, never asleep; {physics['fixed_objects']} objects are fixed."
     )
-    blocks: list[Block] = [Tiles(tiles)]
+    blocks: list[Block] = [Tiles(tiles, columns=len(tiles))]
     if rows:
         blocks.append(Table(columns, rows, numeric=[1, 2, 3]))
     return Section("physics", "Physics", blocks, lead)

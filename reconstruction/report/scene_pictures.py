@@ -19,7 +19,8 @@ SURFACE_ERROR_M = 0.05
 
 def side_views(g: Gathered, width: int = VIEW_PX) -> list[tuple[str, Camera, np.ndarray]]:
     """Three far cameras around the scene: where the video was taken from, and to both sides of that."""
-    things = [m.vertices for m in g.object_meshes] or [m.vertices for m in g.meshes]
+    centers = g.bundle.cameras.world_from_camera[:, :3, 3]
+    things = [m.vertices for m in g.object_meshes] or [m.vertices for m in g.meshes] or [centers]
     points = np.concatenate([_box(v) for v in things])
     floor = [m for m in g.meshes if m.label == "floor"]
     for mesh in floor:  # as much floor as lies around the things
@@ -27,7 +28,7 @@ def side_views(g: Gathered, width: int = VIEW_PX) -> list[tuple[str, Camera, np.
         inside = np.clip(_box(mesh.vertices), low, high)
         points = np.concatenate([points, inside])
     center = points.mean(axis=0)
-    toward = g.bundle.cameras.world_from_camera[:, :3, 3].mean(axis=0) - center
+    toward = centers.mean(axis=0) - center
     azimuth = float(np.degrees(np.arctan2(toward[1], toward[0])))
     out = []
     for name, turn in (("from the left", -55.0), ("from the video's side", 0.0), ("from the right", 55.0)):

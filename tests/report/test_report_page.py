@@ -83,7 +83,7 @@ def test_text_from_outside_cannot_become_markup(page, reconstructed):
     bundle, _ = reconstructed.open()
     bundle.scene["source"]["file"] = '"><script>alert(1)</script>.mp4'
     for item in bundle.scene["objects"]:
-        item["label"] = "</svg><script>alert(2)</script>"
+        item["label"] = "</svg><script>alert(2)</script> $\\x"
     stages = StageResults({}, {"depth": "<script>alert(3)</script>"})
     assert "<script>alert" not in build_page(bundle, stages)
 
@@ -128,6 +128,17 @@ def test_a_bundle_of_someone_else_gives_a_page(reconstructed):
     for frame in scene["cameras"]["frames"]:
         frame.pop("held_out")
     assert "The report card left out" in " ".join(left_out(build_page(bundle, StageResults({}, {}))))
+
+
+@pytest.mark.parametrize("kept", ["base", "nothing"])
+def test_a_scene_without_objects_gives_a_page(reconstructed, kept):
+    bundle, _ = reconstructed.open()
+    bundle.scene["objects"], bundle.scene["graph"]["edges"] = [], []
+    bundle.scene["report"]["physics"]["objects"] = []
+    if kept == "nothing":
+        bundle.scene["base"] = []
+    page = build_page(bundle, StageResults({}, {}))
+    assert re.findall(r'<section id="([\w-]+)"', page) == SECTIONS
 
 
 def test_with_the_truth_there_are_error_maps_and_figures(page, page_with_truth, reconstructed):
