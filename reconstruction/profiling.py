@@ -79,7 +79,13 @@ class UsageMeter:
 
     def _memory(self, process: psutil.Process) -> int:
         try:
-            return process.memory_info().rss if process == self._process else process.memory_full_info().uss
+            own = self._process.memory_info()
+            if process == self._process:
+                return own.rss
+            other = process.memory_full_info()
+            # Between vfork and exec a child has no memory of its own, but the parent's: it must not count twice.
+            borrowed = other.vms == own.vms and other.uss > 0.5 * own.rss
+            return 0 if borrowed else other.uss
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             return 0
 
