@@ -203,8 +203,8 @@ def make_open_box(shop: Workshop, name: str) -> Thing:
 
 
 def make_crate(shop: Workshop, name: str) -> Thing:
-    """A wooden crate for the floor."""
-    size = tuple(shop.rng.uniform((0.38, 0.28, 0.14), (0.48, 0.34, 0.2)).tolist())
+    """A wooden crate for the floor, low enough that a standing person sees what lies in it."""
+    size = tuple(shop.rng.uniform((0.38, 0.28, 0.09), (0.48, 0.34, 0.13)).tolist())
     look = {
         "*": textures.wood(shop.rng, 0.7, 0.5, 1000 * shop.density, shop.color((190, 150, 96)), boards=0.08),
         "front": textures.cardboard(shop.rng, size[0], size[2], 1200 * shop.density, "ORANGES"),
