@@ -118,6 +118,13 @@ class StageStore:
         """Return what was recorded when the stage finished: time, memory, notes, config."""
         return json.loads((self._folder(number, stage, key) / _MANIFEST).read_text())
 
+    def note_published(self, scene_id: str, revision: str, keys: dict[str, str]) -> None:
+        """Remember what a scene was made of: an equal bundle that was published before keeps its own report."""
+        path = self.work_dir / f"published-{scene_id}.json"
+        partial = self.work_dir / f"tmp-{os.getpid()}-{path.name}"
+        partial.write_text(canonical_json({"revision": revision, "stage_keys": keys}))
+        os.replace(partial, path)
+
     def scratch(self, stage: str) -> Path:
         """Make an empty folder for a stage's temporary files; `discard` it when done."""
         folder = self.work_dir / f"tmp-{os.getpid()}-{stage}-scratch"
@@ -160,6 +167,8 @@ class StageStore:
             owner = leftover.name.split("-")[1]
             if not (owner.isdigit() and _is_alive(int(owner))):
                 logger.info("removing %s, left by a run that ended early", leftover)
+                if leftover.is_file():
+                    leftover.unlink(missing_ok=True)
                 shutil.rmtree(leftover, ignore_errors=True)
 
 

@@ -72,7 +72,9 @@ class Oracle:
 
     def of_stage(self, stage: str) -> list[str]:
         """Return what belongs into a stage's fingerprint: nothing where the stage runs as usual."""
-        return [self.digest] if stage in self.stages else []
+        from reconstruction.cache import source_digest
+
+        return [self.digest, source_digest(__name__)] if stage in self.stages else []
 
     def poses(
         self, frames: FrameSet, config: PosesConfig, *, work_dir: Path, progress: Progress

@@ -268,6 +268,7 @@ def reconstruct(
         run.execute()
         run = _with_object_scale(run)
         record = publish_scene(run, registry, scene_id, require_stable=require_stable)
+        run.store.note_published(scene_id, record.revision, run.keys)
     return Reconstruction(record, run)
 
 

@@ -33,7 +33,7 @@ class Raster:
         return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _clip_near(triangle, near, out):  # pragma: no cover - compiled
     """Clip a camera-space triangle (3, 6: xyz + barycentric) at z = near into `out` (4, 6); return its corners."""
     count = 0
@@ -49,7 +49,7 @@ def _clip_near(triangle, near, out):  # pragma: no cover - compiled
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _draw(points, faces, fx, fy, cx, cy, near, depth, face_map, bary):  # pragma: no cover - compiled
     height, width = depth.shape
     triangle = np.empty((3, 6))

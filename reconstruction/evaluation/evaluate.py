@@ -28,6 +28,7 @@ from reconstruction.evaluation.surfaces import (
     sample,
     sample_seen,
 )
+from reconstruction.evaluation.visibility import spread_poses
 from reconstruction.progress import NO_PROGRESS, Progress
 from registry import SceneBundle
 from registry.errors import UsageError
@@ -212,7 +213,7 @@ def _composition(
 ) -> None:
     from reconstruction.evaluation.stages import sensor_surface, surface_figures
 
-    poses = list(truth.world_from_camera.values())
+    poses = spread_poses(list(truth.world_from_camera.values()))
     if truth.entities:
         true_seen = sample_seen(*joined([e.mesh for e in truth.entities]), truth.camera, poses, count)
     else:

@@ -1,5 +1,6 @@
 """What the stages of a scene made, where the work folder still holds it."""
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,10 @@ class StageResults:
             reason = "the bundle does not say which stage results it was made from"
             return cls({}, {stage.name: reason for stage in STAGES})
         folder = work_dir or registry_root.parent / "work" / work["input_digest"][:16]
+        keys = {**work["stage_keys"], **_noted_keys(folder, bundle)}
         folders, missing = {}, {}
         for number, stage in enumerate(STAGES, start=1):
-            key = work["stage_keys"].get(stage.name)
+            key = keys.get(stage.name)
             place = folder / f"{number:02d}_{stage.name}-{key}"
             if key is None:
                 missing[stage.name] = "this scene was made without the stage"
@@ -63,3 +65,12 @@ class StageResults:
         if world is None:
             return None, None
         return posed and world.apply_to(posed), depth and world.scale_depth(depth)
+
+
+def _noted_keys(folder: Path, bundle: SceneBundle) -> dict[str, str]:
+    """Return the stages of the latest run that gave this very bundle, where the work folder knows of it."""
+    try:
+        noted = json.loads((folder / f"published-{bundle.scene['id']}.json").read_text())
+    except (OSError, json.JSONDecodeError):
+        return {}
+    return noted["stage_keys"] if noted.get("revision") == bundle.revision else {}

@@ -10,6 +10,7 @@ from reconstruction.evaluation.ground_truth import GroundTruth
 from reconstruction.evaluation.matching import match
 from reconstruction.evaluation.scene import joined
 from reconstruction.evaluation.surfaces import Samples, compare, sample_seen
+from reconstruction.evaluation.visibility import spread_poses
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import DepthMaps, InstanceSet, PosedFrames, Surface
 from registry.geometry import transform_points
@@ -101,7 +102,7 @@ def surface_figures(
 ) -> dict[str, float]:
     """Chamfer distance, F-score and normal consistency of the visible surface, before it is cut into objects."""
     vertices = alignment.to_true(surface.vertices)
-    poses = list(truth.world_from_camera.values())
+    poses = spread_poses(list(truth.world_from_camera.values()))
     seen = sample_seen(vertices, surface.faces, truth.camera, poses, count)
     score = compare(seen, true_seen, bound_m)
     if score is None:

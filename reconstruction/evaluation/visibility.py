@@ -1,6 +1,8 @@
 """Which points of a surface some camera sees: the triangle at each pixel, compared with each point's own ray."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numba import njit, prange
@@ -10,6 +12,7 @@ from reconstruction.types import Camera
 from registry.geometry import invert_rigid
 
 MAX_DISTANCE_M = 5.0  # CONTRACT section 4: what is farther does not count
+MAX_CAMERAS = 200
 _SIDE_PX = 960
 _TOLERANCE_M = 0.001
 
@@ -77,10 +80,18 @@ def seen_points(
     offsets = np.einsum("fc,fc->f", normals, corners[:, 0])
     seen = np.zeros(len(points), np.bool_)
     points = np.ascontiguousarray(points, np.float64)
-    for pose in world_from_camera:
-        face = rasterize_mesh(vertices, faces, small, pose).face
-        _mark_seen(
-            points, invert_rigid(pose), np.ascontiguousarray(pose[:3, 3]), small.fx, small.fy, small.cx, small.cy,
-            face, normals, offsets, max_distance_m, _TOLERANCE_M, seen,
-        )  # fmt: skip
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        # Drawing leaves the interpreter to other threads; marking is parallel in itself and runs here alone.
+        drawn = pool.map(lambda pose: rasterize_mesh(vertices, faces, small, pose).face, world_from_camera)
+        for pose, face in zip(world_from_camera, drawn):
+            _mark_seen(
+                points, invert_rigid(pose), np.ascontiguousarray(pose[:3, 3]), small.fx, small.fy, small.cx, small.cy,
+                face, normals, offsets, max_distance_m, _TOLERANCE_M, seen,
+            )  # fmt: skip
     return seen
+
+
+def spread_poses(world_from_camera: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return at most 200 poses, evenly spread: neighbors of a long film see the same."""
+    rows = np.unique(np.linspace(0, len(world_from_camera) - 1, MAX_CAMERAS).round().astype(int))
+    return [world_from_camera[row] for row in rows]
