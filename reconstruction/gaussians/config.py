@@ -35,7 +35,7 @@ class GaussiansConfig:
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the color loss; the rest is L1."""
 
-    depth_weight: float = 0.3
+    depth_weight: float = 1.0
     """Weight of the relative difference to the depth maps."""
 
     completed_depth_weight: float = 0.2
@@ -59,19 +59,19 @@ class GaussiansConfig:
     optimize_poses: bool = False
     """Refine the cameras, too; kept-out frames then no longer share exactly the same space."""
 
-    mean_rate: float = 3e-4
+    mean_rate: float = 1.2e-3
     """Adam step of the means, relative to the scene's median depth; all rates fall to `final_rate` of themselves."""
 
-    quaternion_rate: float = 6e-3
+    quaternion_rate: float = 2.4e-2
     """Adam step of the quaternions."""
 
-    scale_rate: float = 1.2e-2
+    scale_rate: float = 4.8e-2
     """Adam step of the log scales."""
 
-    opacity_rate: float = 4e-2
+    opacity_rate: float = 0.12
     """Adam step of the opacity logits."""
 
-    color_rate: float = 1.5e-2
+    color_rate: float = 6e-2
     """Adam step of the colors (SH degree 0)."""
 
     exposure_rate: float = 5e-3
@@ -80,7 +80,7 @@ class GaussiansConfig:
     pose_rate: float = 3e-4
     """Adam step of the cameras: radians, and relative to the median depth."""
 
-    final_rate: float = 0.1
+    final_rate: float = 0.05
     """Share of every rate that is left at the end (exponential decay)."""
 
     densify_every: int = 60
