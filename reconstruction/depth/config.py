@@ -55,6 +55,9 @@ class DepthConfig:
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""
 
+    edge_rounds: int = 2
+    """Rounds in which pixels beside a depth jump choose anew the surface that they lie on."""
+
     threads: int = 0
     """Frames worked on at once; 0 = one per processor. Does not change the result."""
 
@@ -63,7 +66,9 @@ class DepthConfig:
 
 
 DEPTH_PRESETS: dict[str, DepthConfig] = {
-    "fast": DepthConfig(depth_side_px=384, sweep_side_px=256, planes=72, refine_rounds=1, neighbors=8),
+    "fast": DepthConfig(
+        depth_side_px=384, sweep_side_px=256, planes=72, refine_rounds=1, neighbors=8, edge_rounds=1
+    ),
     "default": DepthConfig(),
     "quality": DepthConfig(depth_side_px=640, sweep_side_px=426, planes=128, sources=6, refine_rounds=3),
 }

@@ -87,6 +87,47 @@ def check_view(
             fused[y, x] = amount / total
 
 
+@numba.njit(cache=True, nogil=True)
+def count_witnesses(i, neighbors, depth, mask, relative, k, agree, through):  # pragma: no cover - compiled
+    """Count per masked pixel of view i the neighbors that see the same point, and those that look through it.
+
+    Args:
+        i: Row of the view in `depth`.
+        neighbors: (k,) rows, -1 = none.
+        depth: (n, h, w).
+        mask: bool (h, w) pixels to ask about.
+        relative: (k, 4, 4) neighbour_from_view.
+        k: fx, fy, cx, cy.
+        agree: (h, w) uint8, written.
+        through: (h, w) uint8, written.
+    """
+    h, w = depth.shape[1:]
+    fx, fy, cx, cy = k
+    for y in range(h):
+        for x in range(w):
+            z = float(depth[i, y, x])
+            if not mask[y, x] or z <= 0.0:
+                continue
+            xn, yn = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            for s in range(len(neighbors)):
+                j = neighbors[s]
+                if j < 0:
+                    break
+                m = relative[s]
+                qz = z * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
+                if qz <= 1e-9:
+                    continue
+                u = fx * (z * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
+                v = fy * (z * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
+                if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
+                    continue
+                d = depth[j, int(v), int(u)]
+                if d > 1.025 * qz:
+                    through[y, x] += 1
+                elif abs(d - qz) < 0.015 * qz:
+                    agree[y, x] += 1
+
+
 def remove_speckles(depth: np.ndarray, min_px: int, jump: float) -> np.ndarray:
     """Return a mask (h, w) of pixels in connected pieces of at least `min_px`, cut where depth jumps by `jump`."""
     label = np.zeros(depth.shape, np.int32)

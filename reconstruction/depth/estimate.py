@@ -12,6 +12,9 @@ from reconstruction.types import Camera, DepthMaps, PosedFrames
 from registry.errors import InputError
 from registry.geometry import invert_rigid
 
+_COMPLETED_SAY = 0.3  # what a completed pixel is worth beside the correlation of a measured one
+_SURE_CORRELATION = 0.5  # a pixel that changed its surface counts as measured from here on
+
 
 def sized_camera(camera: Camera, side: int) -> Camera:
     """Return the camera at a resolution whose longer side is at most `side` pixels."""
@@ -145,6 +148,76 @@ def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthCon
     return fused, count
 
 
+def _resolve(
+    posed, camera: Camera, plan: ViewPlan, depth, confidence, score, config: DepthConfig, workers, progress
+):
+    """Put depth edges where the image has them, and drop what other views look through; return both maps anew."""
+    from reconstruction.depth.consistency import count_witnesses
+    from reconstruction.depth.outlines import mark_doubt, resolve_edges
+    from reconstruction.depth.refine import fit_slopes
+
+    gray = _gray(posed.images, camera)
+    shape = (camera.height, camera.width)
+    moved, trust = np.zeros_like(depth), confidence.copy()
+    doubts = np.zeros(depth.shape, bool)
+
+    def work(i: int) -> None:
+        sources = plan.sources[i][plan.sources[i] >= 0]
+        moved[i] = depth[i]
+        if len(sources) == 0:
+            return
+        h_inf, shift = _warps(posed, camera, i, sources)
+        color = _small_color(posed.images[i], camera)
+        rho = np.where(depth[i] > 0, 1.0 / np.maximum(depth[i], 1e-12), 0).astype(np.float32)
+        sure = np.choose(confidence[i], [np.float32(0), np.float32(_COMPLETED_SAY), score[i]]).astype(
+            np.float32
+        )
+        before = rho
+        # A skirt is wider than a step: what was put right in the first round speaks in the next ones.
+        for band in (8, 4)[: config.edge_rounds]:
+            fitted, gx, gy = (np.empty(shape, np.float32) for _ in range(3))
+            fit_slopes(rho, 0.012, fitted, gx, gy)
+            doubt = np.empty(shape, bool)
+            mark_doubt(rho, gx, gy, 0.025, band, doubt)
+            out, out_sure = np.empty_like(rho), np.empty_like(sure)
+            resolve_edges(
+                gray[i],
+                color,
+                gray[sources],
+                h_inf,
+                shift,
+                rho,
+                gx,
+                gy,
+                sure,
+                doubt,
+                config.noise_gray,
+                out,
+                out_sure,
+            )
+            rho, sure = out, out_sure
+            doubts[i] |= doubt
+        changed = rho != before
+        moved[i][changed] = 1.0 / rho[changed]
+        trust[i][changed] = np.where(sure[changed] >= _SURE_CORRELATION, 2, 1)
+
+    workers.each(len(depth), work, "placing edges", progress)
+    k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    out = moved.copy()
+
+    def check(i: int) -> None:
+        rows = plan.neighbors[i]
+        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
+        agree, through = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+        count_witnesses(i, rows, moved, doubts[i], relative, k, agree, through)
+        drop = doubts[i] & (through >= 3) & (through > agree + 1)
+        out[i][drop] = 0
+        trust[i][drop] = 0
+
+    workers.each(len(depth), check, "looking through", progress)
+    return out, trust
+
+
 def estimate_depth(posed: PosedFrames, config: DepthConfig, *, progress: Progress = NO_PROGRESS) -> DepthMaps:
     """Estimate one depth map for every posed keyframe, in the units of the poses.
 
@@ -170,6 +243,8 @@ def estimate_depth(posed: PosedFrames, config: DepthConfig, *, progress: Progres
         from reconstruction.depth.complete import complete_depth
 
         depth, confidence = complete_depth(posed, camera, plan, depth, raw, config, workers.each, progress)
+    if config.edge_rounds > 0:
+        depth, confidence = _resolve(posed, camera, plan, depth, confidence, score, config, workers, progress)
     progress.note(
         f"depth: {100 * share:.0f} % of the pixels measured, {100 * float((confidence == 1).mean()):.0f} % completed"
     )
