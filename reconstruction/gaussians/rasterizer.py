@@ -87,7 +87,7 @@ def rasterize(
         pixel_weights: (h, w) sums alpha T of every Gaussian over the pixels with these weights; None: not wanted.
         scratch: Memory for the result, which is then valid until the next call with it.
     """
-    from reconstruction.gaussians import kernels
+    from reconstruction.gaussians import blend_kernels, kernels
 
     dtype, scratch = parameters.dtype, scratch or Scratch()
     camera_from_world = invert_rigid(world_from_camera)
@@ -122,7 +122,7 @@ def rasterize(
     entry_values = np.empty((len(bins[1]) if wanted else 0, 1), dtype)
     run_over(
         tiles_x * tiles_y,
-        kernels.blend,
+        blend_kernels.blend,
         near_splats,
         near_boxes,
         bins[0],
@@ -167,7 +167,7 @@ def rasterize_backward(
         error: (h, w) per-pixel error to attribute to the Gaussians that made it.
         scratch: Memory for the result, which is then valid until the next call with it.
     """
-    from reconstruction.gaussians import kernels
+    from reconstruction.gaussians import blend_kernels, kernels
 
     height, width = image.features.shape[:2]
     dtype, n, scratch = image.parameters.dtype, len(image.parameters), scratch or Scratch()
@@ -177,7 +177,7 @@ def rasterize_backward(
         error = np.zeros((height, width), dtype)
     run_over(
         tiles_x * tiles_y,
-        kernels.blend_backward,
+        blend_kernels.blend_backward,
         image.splats,
         image.boxes,
         image.bins[0],

@@ -1,0 +1,355 @@
+"""Compiled kernels that blend the splats of a tile front to back, and the derivatives of that."""
+
+import numba
+import numpy as np
+
+from reconstruction.gaussians.kernels import (
+    AX,
+    AY,
+    BLUE,
+    BX,
+    BY,
+    F_ALPHA,
+    F_DEPTH,
+    F_DISTORTION,
+    F_FIRST,
+    F_MEDIAN,
+    F_MOMENT1,
+    F_MOMENT2,
+    F_NORMAL,
+    GREEN,
+    N_FEATURES,
+    N_SPLAT_GRADIENTS,
+    NX,
+    NY,
+    NZ,
+    OPACITY,
+    REACH2,
+    RED,
+    TILE,
+    WX,
+    WY,
+    XC,
+    YC,
+    ZC,
+)
+
+_HALF = np.float32(0.5)
+_ONE = np.float32(1.0)
+_TWO = np.float32(2.0)
+_FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
+# exp(-rho / 2) = exp(x)^64 with x = -rho / 128, by its Taylor polynomial.
+_FALLOFF_STEP = np.float32(-1.0 / 128.0)
+_E2, _E3, _E4, _E5 = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120)
+# Where the screen-space filter shapes a splat, its depth still follows its plane, within this factor: with the depth
+# of the center, slanted surfaces of splats smaller than a pixel would come out too near.
+_FLAT_LOW, _FLAT_HIGH = np.float32(0.9), np.float32(1.1)
+
+
+@numba.njit(cache=True, inline="always", fastmath=_FAST)
+def _falloff(rho):  # pragma: no cover - compiled
+    """Return exp(-rho / 2) as exp(-rho / 128)^64: plain arithmetic, which compilers turn into vector code.
+
+    Right to 1e-5 of its value for rho < 100, and never negative.
+    """
+    x = rho * _FALLOFF_STEP
+    e = _ONE + x * (_ONE + x * (_E2 + x * (_E3 + x * (_E4 + x * _E5))))
+    e = max(e, x - x)
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    return e * e
+
+
+@numba.njit(cache=True, nogil=True)
+def blend(
+    start,
+    stop,
+    splats,
+    boxes,
+    tile_start,
+    entries,
+    tile_order,
+    tiles_x,
+    scalars,
+    weights,
+    features,
+    contributions,
+):  # pragma: no cover - compiled
+    """Blend the splats of every tile front to back.
+
+    The innermost loops always run over the 16 pixels of a tile's row, without branches, on arrays with one plane a
+    quantity, so that they compile to vector instructions; pixels that a splat does not touch get alpha 0.
+
+    Args:
+        splats: (k, 17) near to far; boxes (k, 4) alike.
+        tile_start: Of `bin_to_tiles`; entries alike.
+        tile_order: (t,) order of the tiles over the threads.
+        tiles_x: Tiles in a row.
+        scalars: (3,) largest alpha, transmittance at which a pixel is finished, reference depth.
+        weights: (h, w) of the pixels in `contributions`; (0, 0) to leave those out.
+        features: (h, w, 13) filled.
+        contributions: (e,) filled: sum over the tile's pixels of weight alpha T of every entry.
+    """
+    for k in range(start, stop):
+        _blend_tile(
+            tile_order[k],
+            splats,
+            boxes,
+            tile_start,
+            entries,
+            tiles_x,
+            scalars,
+            weights,
+            features,
+            contributions,
+        )
+
+
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy")
+def _blend_tile(
+    tile, splats, boxes, tile_start, entries, tiles_x, scalars, weights, features, contributions
+):  # pragma: no cover - compiled
+    """Do one tile of `blend`."""
+    height, width = features.shape[0], features.shape[1]
+    alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
+    zero = alpha_max - alpha_max
+    with_weights = weights.shape[0] > 0
+    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    image = np.zeros((N_FEATURES, TILE, TILE), features.dtype)
+    light = np.ones((TILE, TILE), features.dtype)
+    xs, ys = np.empty(TILE, features.dtype), np.empty(TILE, features.dtype)
+    factors = np.zeros((TILE, TILE), features.dtype)
+    for j in range(TILE):
+        xs[j], ys[j] = tx + j, ty + j
+    if with_weights:
+        contributions[tile_start[tile] : tile_start[tile + 1]] = 0
+        for y in range(ty, y_end):
+            for x in range(tx, x_end):
+                factors[y - ty, x - tx] = weights[y, x]
+    sums = np.zeros(TILE, features.dtype)
+    for e in range(tile_start[tile], tile_start[tile + 1]):
+        if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
+            break
+        s = splats[entries[e]]
+        box = boxes[entries[e]]
+        xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
+        ax, bx, wx, reach2, opacity = s[AX], s[BX], s[WX], s[REACH2], s[OPACITY]
+        red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
+        inverse_zc = _ONE / zc
+        if with_weights:
+            sums[:] = 0
+        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
+            dy = ys[i] - yc
+            u_row, v_row, w_row, dy2 = s[AY] * dy, s[BY] * dy, _ONE + s[WY] * dy, dy * dy
+            for j in range(TILE):
+                t = light[i, j]
+                dx = xs[j] - xc
+                w = w_row + wx * dx
+                inverse_w = _ONE / w
+                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
+                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+                on_disk = (w > zero) & (rho3 <= rho2)
+                rho = rho3 if on_disk else rho2
+                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                w = w if on_disk else w_flat
+                inverse_z, z = w * inverse_zc, zc / w
+                alpha = min(opacity * _falloff(rho), alpha_max)
+                alpha = alpha if (rho <= reach2) & (t >= stop) else zero
+                weight = alpha * t
+                first = inverse_z if (t == _ONE) else image[F_FIRST, i, j]
+                m = reference * (first - inverse_z)
+                before, m1, m2 = image[F_ALPHA, i, j], image[F_MOMENT1, i, j], image[F_MOMENT2, i, j]
+                after = t * (_ONE - alpha)
+                median = image[F_MEDIAN, i, j]
+                image[0, i, j] += weight * red
+                image[1, i, j] += weight * green
+                image[2, i, j] += weight * blue
+                image[F_DEPTH, i, j] += weight * z
+                image[F_NORMAL, i, j] += weight * nx
+                image[F_NORMAL + 1, i, j] += weight * ny
+                image[F_NORMAL + 2, i, j] += weight * nz
+                image[F_FIRST, i, j] = first
+                image[F_DISTORTION, i, j] += weight * (m * m * before + m2 - _TWO * m * m1)
+                image[F_ALPHA, i, j] = before + weight
+                image[F_MOMENT1, i, j] = m1 + weight * m
+                image[F_MOMENT2, i, j] = m2 + weight * m * m
+                image[F_MEDIAN, i, j] = z if (t > _HALF) & (after <= _HALF) else median
+                light[i, j] = after
+                sums[j] += weight * factors[i, j]
+        if with_weights:
+            contributions[e] = sums.sum()
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            for c in range(N_FEATURES):
+                features[y, x, c] = image[c, y - ty, x - tx]
+
+
+@numba.njit(cache=True, nogil=True)
+def blend_backward(
+    start,
+    stop,
+    splats,
+    boxes,
+    tile_start,
+    entries,
+    tile_order,
+    tiles_x,
+    scalars,
+    features,
+    image_gradients,
+    error,
+    entry_gradients,
+):  # pragma: no cover - compiled
+    """Differentiate `blend`: front to back again, with what lies behind as total minus prefix.
+
+    With q_i the derivative of the loss by the weight w_i = alpha_i T_i, dL/dalpha_i = T_i q_i - sum_{j>i} w_j q_j /
+    (1 - alpha_i), and sum_j w_j q_j is known from the rendered image alone.
+
+    Args:
+        splats: As for `blend`, up to scalars.
+        features: (h, w, 13) of `blend`.
+        image_gradients: (h, w, 9).
+        error: (h, w) weight of the pixels in the last column of the result (for densification).
+        entry_gradients: (e, 18) filled.
+    """  # fmt: skip
+    for k in range(start, stop):
+        _blend_tile_backward(
+            tile_order[k],
+            splats,
+            boxes,
+            tile_start,
+            entries,
+            tiles_x,
+            scalars,
+            features,
+            image_gradients,
+            error,
+            entry_gradients,
+        )
+
+
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy")
+def _blend_tile_backward(
+    tile,
+    splats,
+    boxes,
+    tile_start,
+    entries,
+    tiles_x,
+    scalars,
+    features,
+    image_gradients,
+    error,
+    entry_gradients,
+):  # pragma: no cover - compiled
+    """Do one tile of `blend_backward`."""
+    height, width = features.shape[0], features.shape[1]
+    alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
+    zero = alpha_max - alpha_max
+    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    light = np.ones((TILE, TILE), features.dtype)
+    # Planes: gradients 0..8, error 9, what lies behind 10, opacity 11, moments 12 and 13, first inverse depth 14.
+    given = np.zeros((15, TILE, TILE), features.dtype)
+    lanes = np.empty((N_SPLAT_GRADIENTS, TILE), features.dtype)
+    xs, ys = np.empty(TILE, features.dtype), np.empty(TILE, features.dtype)
+    for j in range(TILE):
+        xs[j], ys[j] = tx + j, ty + j
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            f, g, i, j = features[y, x], image_gradients[y, x], y - ty, x - tx
+            total = _TWO * g[8] * f[F_DISTORTION]
+            for c in range(8):
+                total += g[c] * f[c]
+                given[c, i, j] = g[c]
+            given[8, i, j], given[9, i, j], given[10, i, j] = g[8], error[y, x], total
+            given[11, i, j], given[12, i, j] = f[F_ALPHA], f[F_MOMENT1]
+            given[13, i, j], given[14, i, j] = f[F_MOMENT2], f[F_FIRST]
+    done = False
+    for e in range(tile_start[tile], tile_start[tile + 1]):
+        out = entry_gradients[e]
+        if (e - tile_start[tile]) % 32 == 31:
+            done = done or light[: y_end - ty, : x_end - tx].max() < stop
+        if done:
+            out[:] = 0
+            continue
+        s = splats[entries[e]]
+        box = boxes[entries[e]]
+        xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
+        ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
+        opacity, reach2 = s[OPACITY], s[REACH2]
+        red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
+        inverse_zc = _ONE / zc
+        lanes[:] = 0
+        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
+            dy = ys[i] - yc
+            u_row, v_row, w_row, dy2 = ay * dy, by * dy, _ONE + wy * dy, dy * dy
+            for j in range(TILE):
+                t = light[i, j]
+                dx = xs[j] - xc
+                w = w_row + wx * dx
+                inverse_w = _ONE / w
+                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
+                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+                on_disk = (w > zero) & (rho3 <= rho2)
+                rho = rho3 if on_disk else rho2
+                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                moves = on_disk | (w == w_flat)
+                w = w if on_disk else w_flat
+                inverse_w = _ONE / w
+                inverse_z, z = w * inverse_zc, zc * inverse_w
+                falloff = _falloff(rho)
+                inside = (rho <= reach2) & (t >= stop)
+                falloff = falloff if inside else zero
+                full = opacity * falloff
+                alpha = min(full, alpha_max)
+                weight = alpha * t
+                after = t * (_ONE - alpha)
+                light[i, j] = after
+                g_d, g_x = given[3, i, j], given[8, i, j]
+                g_r, g_g, g_b = given[0, i, j], given[1, i, j], given[2, i, j]
+                g_nx, g_ny, g_nz = given[4, i, j], given[5, i, j], given[6, i, j]
+                m = reference * (given[14, i, j] - inverse_z)
+                spread = m * given[11, i, j] - given[12, i, j]
+                q = (
+                    g_r * red + g_g * green + g_b * blue + g_d * z + g_nx * nx + g_ny * ny + g_nz * nz
+                    + given[7, i, j] + g_x * (m * spread + given[13, i, j] - m * given[12, i, j])
+                )  # fmt: skip
+                rest = given[10, i, j] - weight * q
+                given[10, i, j] = rest
+                d_z = weight * (g_d + _TWO * g_x * spread * reference * inverse_z * inverse_z)
+                d_alpha = t * q - rest / (_ONE - alpha)
+                d_alpha = d_alpha if inside & (full <= alpha_max) else zero
+                d_rho = -_HALF * d_alpha * alpha
+                disk_rho = d_rho if on_disk else zero
+                flat_rho = zero if on_disk else d_rho
+                d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
+                d_w = -(d_u * u + d_v * v) - d_z * z * inverse_w
+                d_w = d_w if moves else zero
+                lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
+                lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
+                lanes[ZC, j] += d_z * inverse_w
+                lanes[AX, j] += d_u * dx
+                lanes[AY, j] += d_u * dy
+                lanes[BX, j] += d_v * dx
+                lanes[BY, j] += d_v * dy
+                lanes[WX, j] += d_w * dx
+                lanes[WY, j] += d_w * dy
+                lanes[OPACITY, j] += d_alpha * falloff
+                lanes[10, j] += weight * g_r
+                lanes[11, j] += weight * g_g
+                lanes[12, j] += weight * g_b
+                lanes[13, j] += weight * g_nx
+                lanes[14, j] += weight * g_ny
+                lanes[15, j] += weight * g_nz
+                lanes[16, j] += weight
+                lanes[17, j] += weight * given[9, i, j]
+        for c in range(N_SPLAT_GRADIENTS):
+            total = zero
+            for j in range(TILE):
+                total += lanes[c, j]
+            out[c] = total
