@@ -9,7 +9,8 @@ with (dx, dy) the pixel's offset from the projected center
 
 exact, with six coefficients a splat. `G` below is H^-1.
 
-Blending is in `blend_kernels`. Kernels with `start, stop` do their share of the rows and release the interpreter lock (see `threads.run_over`).
+Blending is in `blend_kernels`.
+Kernels with `start, stop` do their share of the rows and release the interpreter lock (see `threads.run_over`).
 Nothing races: a tile is one unit of work; what belongs to a splat is written once per (splat, tile) entry and then
 summed per splat in the order of its entries. Results do not depend on the number of threads.
 All kernels are generic in the floating-point type of their arrays: float32 in use, float64 to check derivatives.
