@@ -152,7 +152,7 @@ def _resolve(
     posed, camera: Camera, plan: ViewPlan, depth, confidence, score, config: DepthConfig, workers, progress
 ):
     """Put depth edges where the image has them, and drop what other views look through; return both maps anew."""
-    from reconstruction.depth.consistency import count_witnesses
+    from reconstruction.depth.consistency import count_witnesses, remove_speckles
     from reconstruction.depth.outlines import mark_doubt, resolve_edges
     from reconstruction.depth.refine import fit_slopes
 
@@ -211,6 +211,8 @@ def _resolve(
         agree, through = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
         count_witnesses(i, rows, moved, doubts[i], relative, k, agree, through)
         drop = doubts[i] & (through >= 3) & (through > agree + 1)
+        # Single pixels that chose otherwise than all around them become flakes in the air.
+        drop |= doubts[i] & (moved[i] > 0) & ~remove_speckles(moved[i], config.min_speckle_px // 4, 0.02)
         out[i][drop] = 0
         trust[i][drop] = 0
 
