@@ -84,7 +84,9 @@ class UsageMeter:
                 return own.rss
             other = process.memory_full_info()
             # Between vfork and exec a child has no memory of its own, but the parent's: it must not count twice.
-            borrowed = other.vms == own.vms and other.uss > 0.5 * own.rss
+            # The two are read one after the other, while the parent goes on, so that they agree but nearly.
+            alike = abs(other.vms - own.vms) < 0.05 * own.vms and abs(other.rss - own.rss) < 0.1 * own.rss
+            borrowed = alike and other.uss > 0.5 * own.rss
             return 0 if borrowed else other.uss
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             return 0
