@@ -87,7 +87,8 @@ class UsageMeter:
             # The two are read one after the other, while the parent goes on, so that they agree but nearly.
             alike = abs(other.vms - own.vms) < 0.05 * own.vms and abs(other.rss - own.rss) < 0.1 * own.rss
             borrowed = alike and other.uss > 0.5 * own.rss
-            return 0 if borrowed else other.uss
+            # If it began its own program between the two reads, what it had for itself is the parent's still.
+            return 0 if borrowed else min(other.uss, other.rss)
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             return 0
 
