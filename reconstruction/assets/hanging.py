@@ -1,7 +1,7 @@
 """Flat things on walls: pictures, mirrors, boards. A slab fits them better than any volume.
 
 Their depth hardly differs from the wall's, so a fused volume is as thick as its noise. And they are often cut by the
-image's edge: where no frame ever looked beyond a side, that side is not the thing's own, and the slab goes on until
+image's edge: where no frame ever saw wall beyond a side, that side is not the thing's own, and the slab goes on until
 it is as long as it is wide, which is the likeliest guess for a picture.
 """
 
@@ -12,15 +12,16 @@ import numpy as np
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid, box_solid
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.types import PosedFrames
+from reconstruction.types import Camera, InstanceSet, PosedFrames
 from registry.geometry import transform_points
 
 _MAX_THICKNESS_M = 0.10
 _MAX_SPREAD_M = 0.018
 _MIN_FLAT_SHARE = 0.6
-_TRIM_PERCENT = 1.5
+_CELL_M, _MAX_CELLS = 0.008, 120
+_MIN_COVERED = 0.5  # of what a well covered strip has
 _BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02
-_IMAGE_MARGIN = 0.01
+_MIN_WITNESSES = 2
 _PROBES = 7
 
 
@@ -32,12 +33,16 @@ class Hanging:
     completed: bool  # it goes on where no frame looked
 
 
-def hanging_slab(frame: ObjectFrame, posed: PosedFrames, config: AssetsConfig) -> Hanging | None:
+def hanging_slab(
+    frame: ObjectFrame, posed: PosedFrames, camera: Camera, found: InstanceSet, config: AssetsConfig
+) -> Hanging | None:
     """Return the slab of a thing that hangs flat on its wall; None for what is thick, bent or not on a wall.
 
     Args:
         frame: What was seen of the thing; +y of its grid frame looks into the wall.
-        posed: The cameras, in world space: they tell how far the video looked.
+        posed: The keyframes' poses, in world space.
+        camera: The camera at the resolution of the instance maps.
+        found: Its instance maps tell where wall was seen beyond the thing.
         config: `flat_thickness_m` is the least thickness.
     """
     if frame.wall_y is None or len(frame.points) < config.min_points:
@@ -49,11 +54,7 @@ def hanging_slab(frame: ObjectFrame, posed: PosedFrames, config: AssetsConfig) -
     if thickness > _MAX_THICKNESS_M or spread > _MAX_SPREAD_M or flat.mean() < _MIN_FLAT_SHARE:
         return None
     thickness = max(thickness, config.flat_thickness_m)
-    across = frame.points[flat][:, [0, 2]]
-    low, high = np.percentile(across, [_TRIM_PERCENT, 100 - _TRIM_PERCENT], axis=0)
-    # Seen points cover the rectangle evenly, so that the trimmed range tells the whole one.
-    lost = (high - low) * (0.5 / (1 - 0.02 * _TRIM_PERCENT) - 0.5)
-    low, high = low - lost, high + lost
+    low, high = _covered_rectangle(frame.points[flat][:, [0, 2]])
     size = high - low
     if size.min() < 2 * thickness:
         return None
@@ -63,8 +64,7 @@ def hanging_slab(frame: ObjectFrame, posed: PosedFrames, config: AssetsConfig) -
         if missing <= 0:
             continue
         open_low, open_high = (
-            not _looked_beyond(frame, posed, frame.wall_y - thickness, low, high, axis, upper)
-            for upper in (False, True)
+            not _wall_beyond(frame, posed, camera, found, low, high, axis, upper) for upper in (False, True)
         )
         if open_low or open_high:
             share = 0.5 if open_low and open_high else 1.0
@@ -76,34 +76,52 @@ def hanging_slab(frame: ObjectFrame, posed: PosedFrames, config: AssetsConfig) -
     return Hanging(body, completed)
 
 
-def _looked_beyond(
-    frame: ObjectFrame,
-    posed: PosedFrames,
-    y: float,
-    low: np.ndarray,
-    high: np.ndarray,
-    axis: int,
-    upper: bool,
-) -> bool:
-    """Tell whether some frame holds most of a strip just beyond one side of the rectangle."""
-    size = high - low
-    beyond = max(_BEYOND_SHARE * float(size.max()), _BEYOND_MIN_M)
+def _covered_rectangle(across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners (2,) of the rectangle that points (k, 2) cover.
+
+    What counts is that a strip is covered, not how often: the part at the image's edge is in few frames only.
+    """
+    start, end = across.min(axis=0), across.max(axis=0)
+    cell = max(_CELL_M, float((end - start).max()) / _MAX_CELLS)
+    index = np.floor((across - start) / cell).astype(int)
+    shape = tuple(index.max(axis=0) + 1)
+    filled = (
+        np.bincount(np.ravel_multi_index(index.T, shape), minlength=int(np.prod(shape))).reshape(shape) > 0
+    )
+    low, high = np.empty(2), np.empty(2)
+    for axis in (0, 1):
+        covered = filled.sum(axis=1 - axis)
+        strips = np.flatnonzero(covered >= _MIN_COVERED * np.percentile(covered, 90))
+        low[axis] = start[axis] + strips[0] * cell
+        high[axis] = start[axis] + (strips[-1] + 1) * cell
+    return np.maximum(low, start), np.minimum(high, end)
+
+
+def _wall_beyond(
+    frame: ObjectFrame, posed: PosedFrames, camera: Camera, found: InstanceSet, low: np.ndarray, high: np.ndarray,
+    axis: int, upper: bool,
+) -> bool:  # fmt: skip
+    """Tell whether frames show floor or wall in most of a strip just beyond one side of the rectangle.
+
+    That the image goes on there is not enough: depth is missing along the image's edges.
+    """
+    beyond = max(_BEYOND_SHARE * float((high - low).max()), _BEYOND_MIN_M)
     probes = np.empty((_PROBES, 3))
-    along = np.linspace(low[1 - axis], high[1 - axis], _PROBES)
-    edge = high[axis] + beyond if upper else low[axis] - beyond
-    probes[:, 1] = y
-    probes[:, 0 if axis == 0 else 2] = edge
-    probes[:, 2 if axis == 0 else 0] = along
+    probes[:, 1] = frame.wall_y
+    probes[:, 0 if axis == 0 else 2] = high[axis] + beyond if upper else low[axis] - beyond
+    probes[:, 2 if axis == 0 else 0] = np.linspace(low[1 - axis], high[1 - axis], _PROBES)
     world = transform_points(frame.world_from_grid, probes)
-    camera = posed.camera
-    margin = _IMAGE_MARGIN * camera.width
-    for pose in posed.world_from_camera:
+    base = np.array([entity.id for entity in found.base])
+    witnesses = 0
+    for pose, ids in zip(posed.world_from_camera, found.id_maps):
         local = (world - pose[:3, 3]) @ pose[:3, :3]
         z = np.maximum(local[:, 2], 1e-6)
-        u = camera.fx * local[:, 0] / z + camera.cx
-        v = camera.fy * local[:, 1] / z + camera.cy
-        inside = (local[:, 2] > 0.05) & (u > margin) & (u < camera.width - margin)
-        inside &= (v > margin) & (v < camera.height - margin)
-        if inside.mean() > 0.5:
+        column = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(int)
+        row = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(int)
+        inside = (local[:, 2] > 0.05) & (column >= 0) & (row >= 0)
+        inside &= (column < camera.width) & (row < camera.height)
+        seen = np.isin(ids[row[inside], column[inside]], base)
+        witnesses += bool(seen.sum() > 0.5 * _PROBES)
+        if witnesses >= _MIN_WITNESSES:
             return True
     return False

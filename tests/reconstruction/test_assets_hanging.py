@@ -6,7 +6,7 @@ import pytest
 from reconstruction.assets import AssetsConfig
 from reconstruction.assets.hanging import hanging_slab
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.types import Camera, PosedFrames, VideoSource
+from reconstruction.types import BaseEntity, Camera, InstanceSet, Plane, PosedFrames, VideoSource
 from registry.geometry import rigid
 
 CAMERA = Camera(320, 240, 280.0, 280.0, 160.0, 120.0)
@@ -26,6 +26,9 @@ def frames(*eyes) -> PosedFrames:
     )  # fmt: skip
 
 
+TWICE = ((0.0, 0.0, 1.3), (0.1, 0.0, 1.3))
+
+
 def seen(width=0.8, height=0.3, thickness=0.03, noise=0.004, wall_y=0.02, seed=0) -> ObjectFrame:
     """Points on the front of a picture whose lower edge is at z = 0; the wall is 2 m before the cameras."""
     rng = np.random.default_rng(seed)
@@ -40,12 +43,23 @@ def seen(width=0.8, height=0.3, thickness=0.03, noise=0.004, wall_y=0.02, seed=0
     return ObjectFrame(rigid(translation=np.array([0, 2.0, 1.2])), points, normals, False, wall_y)
 
 
+WALL = BaseEntity(1, "wall", Plane(np.array([0, -1.0, 0, 2.0]), np.zeros((3, 3))), True)
+
+
+def slab(frame: ObjectFrame, posed: PosedFrames, config: AssetsConfig | None = None, blind_rows: int = 0):
+    """Ask for the slab; instance maps show wall all over but in the uppermost `blind_rows`, where nothing is known."""
+    maps = np.ones((len(posed.images), 240, 320), np.uint16)
+    maps[:, :blind_rows] = 0
+    found = InstanceSet(np.zeros(0, np.int32), (WALL,), (), maps)
+    return hanging_slab(frame, posed, CAMERA, found, config or AssetsConfig())
+
+
 def size_of(hanging) -> np.ndarray:
     return np.ptp(hanging.body.vertices, axis=0)
 
 
 def test_a_picture_seen_whole_is_a_slab_of_its_size():
-    found = hanging_slab(seen(), frames((0, 0, 1.3), (0.3, 0, 1.3)), AssetsConfig())
+    found = slab(seen(), frames((0, 0, 1.3), (0.3, 0, 1.3)))
     assert not found.completed
     assert size_of(found) == pytest.approx([0.8, 0.03, 0.3], abs=0.02)
     assert found.body.vertices[:, 1].max() == pytest.approx(0.02)  # its back is on the wall
@@ -53,27 +67,46 @@ def test_a_picture_seen_whole_is_a_slab_of_its_size():
 
 
 def test_a_picture_cut_at_the_top_goes_on_to_a_square():
-    """The camera looks at z = 0.7: the image ends at z = 1.55, just above what was seen of the picture."""
-    low_eye = (0.0, 0.0, 0.68)
-    found = hanging_slab(seen(), frames(low_eye), AssetsConfig())
+    """The camera is at z = 0.66: the image ends at z = 1.51, just above what was seen of the picture."""
+    low_eye = (0.0, 0.0, 0.655)
+    found = slab(seen(), frames(low_eye, low_eye))
     assert found.completed
     assert size_of(found) == pytest.approx([0.8, 0.03, 0.8], abs=0.03)
     assert found.body.vertices[:, 2].min() == pytest.approx(0.0, abs=0.02)  # only the unseen side moves
 
 
-def test_one_frame_that_looked_beyond_is_enough_to_end_it():
-    found = hanging_slab(seen(), frames((0.0, 0.0, 0.68), (0.0, 0.0, 1.3)), AssetsConfig())
+def test_what_few_frames_saw_belongs_to_it():
+    """The upper third is at the image's edge, in one of fifty frames: it is as much part of the picture."""
+    frame = seen(height=0.3)
+    rare = frame.points[:, 2] > 0.2
+    keep = ~rare | (np.random.default_rng(1).random(len(rare)) < 0.3)
+    many = np.concatenate([frame.points[~rare]] * 20 + [frame.points[rare & keep]])
+    frame = ObjectFrame(
+        frame.world_from_grid, many, np.tile([0.0, -1.0, 0.0], (len(many), 1)), False, frame.wall_y
+    )
+    found = slab(frame, frames(*TWICE))
+    assert size_of(found) == pytest.approx([0.8, 0.03, 0.3], abs=0.03)
+
+
+def test_two_frames_that_saw_wall_beyond_end_it():
+    found = slab(seen(), frames((0.0, 0.0, 0.655), *TWICE))
     assert not found.completed
+
+
+def test_an_image_that_goes_on_without_depth_is_no_wall():
+    """Along the image's edge depth is missing: nothing is known there, though the camera looked."""
+    found = slab(seen(), frames(*TWICE), blind_rows=100)
+    assert found.completed
 
 
 def test_a_flush_print_gets_the_least_thickness():
     config = AssetsConfig()
-    found = hanging_slab(seen(thickness=0.001), frames((0, 0, 1.3)), config)
+    found = slab(seen(thickness=0.001), frames(*TWICE), config)
     assert size_of(found)[1] == pytest.approx(config.flat_thickness_m)
 
 
 def test_what_is_thick_or_bent_or_stands_is_no_slab():
-    assert hanging_slab(seen(thickness=0.25), frames((0, 0, 1.3)), AssetsConfig()) is None
-    assert hanging_slab(seen(noise=0.05), frames((0, 0, 1.3)), AssetsConfig()) is None
+    assert slab(seen(thickness=0.25), frames(*TWICE)) is None
+    assert slab(seen(noise=0.05), frames(*TWICE)) is None
     standing = ObjectFrame(np.eye(4), seen().points, seen().normals, True, None)
-    assert hanging_slab(standing, frames((0, 0, 1.3)), AssetsConfig()) is None
+    assert slab(standing, frames(*TWICE)) is None
