@@ -13,7 +13,7 @@ from reconstruction.progress import Progress
 
 _MAX_HEIGHT_M = 0.04
 _MAX_HEIGHT_SHARE = 0.5  # of the thing above
-_MAX_AREA_SHARE = 0.9
+_MAX_AREA_SHARE = 0.5
 _REACH_M = 0.01
 _MIN_INSIDE = 0.6
 
