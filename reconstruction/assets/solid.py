@@ -6,6 +6,9 @@ import numpy as np
 
 from reconstruction.assets.completion import CompletedField
 
+_LEG_SHARE, _LEG_HEIGHT_SHARE = 0.003, 0.4  # of the largest body's volume, of the thing's height
+_LEG_GAP_M, _LEG_OVERLAP_M = 0.06, 0.003
+
 
 @dataclass(frozen=True)
 class Solid:
@@ -40,7 +43,10 @@ def extract(field: CompletedField) -> Solid | None:
 
 
 def _without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
-    """Drop small bodies, and bodies inside others (closed cavities)."""
+    """Drop small bodies, and bodies inside others (closed cavities); legs that lost their joint are kept and reach up.
+
+    A leg is slim, so that its share of the volume says little: what stands as high as much of the thing belongs to it.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -49,16 +55,35 @@ def _without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
     edges = coo_matrix(
         (np.ones(2 * len(f)), (np.r_[f[:, 0], f[:, 1]], np.r_[f[:, 1], f[:, 2]])), shape=(n, n)
     )
-    _, label = connected_components(edges, directed=False)
+    count, label = connected_components(edges, directed=False)
     face_label = label[f[:, 0]]
     a, b, c = (solid.vertices[f[:, k]] for k in range(3))
-    volumes = np.bincount(
-        face_label, weights=np.einsum("nk,nk->n", a, np.cross(b, c)) / 6, minlength=label.max() + 1
-    )
-    keep = volumes > share * volumes.max()
+    volumes = np.bincount(face_label, weights=np.einsum("nk,nk->n", a, np.cross(b, c)) / 6, minlength=count)
     if volumes.max() <= 0:
         return None
-    return compact(Solid(solid.vertices, f[keep[face_label]]))
+    main = int(np.argmax(volumes))
+    keep = volumes > share * volumes.max()
+    vertices = solid.vertices.copy()
+    height = float(np.ptp(vertices[:, 2]))
+    for body in np.flatnonzero(volumes > _LEG_SHARE * volumes[main]):
+        own = label == body
+        if body == main or np.ptp(vertices[own, 2]) < _LEG_HEIGHT_SHARE * height:
+            continue
+        keep[body] = True
+        vertices[own, 2] = _reaching(vertices[own], vertices[label == main])
+    return compact(Solid(vertices, f[keep[face_label]]))
+
+
+def _reaching(leg: np.ndarray, main: np.ndarray) -> np.ndarray:
+    """Return the heights (k,) of a leg stretched upwards to the body above it, where a small gap is between them."""
+    low, high = leg.min(axis=0), leg.max(axis=0)
+    over = np.all((main[:, :2] > low[:2]) & (main[:, :2] < high[:2]), axis=1)
+    if not over.any():
+        return leg[:, 2]
+    gap = float(main[over, 2].min() - high[2])
+    if not 0.0 < gap < _LEG_GAP_M:
+        return leg[:, 2]
+    return low[2] + (leg[:, 2] - low[2]) * (1 + (gap + _LEG_OVERLAP_M) / (high[2] - low[2]))
 
 
 def compact(solid: Solid) -> Solid:

@@ -111,3 +111,30 @@ def test_a_ball_dropped_into_a_cup_stays_there():
     x, y, z = ball.pose.p
     assert np.hypot(x, y) < 0.08
     assert 0.01 < z < 0.04, "the ball rests on the cup's floor, not on a filled cavity"
+
+
+def _field_of(boxes, voxel_m=0.01):
+    """Return a field that is inside in each of some boxes (low, high)."""
+    from types import SimpleNamespace
+
+    axes = [np.arange(-0.05, top, voxel_m) + voxel_m / 2 for top in (1.05, 0.65, 0.55)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    distance = np.full(grid.shape[:3], 1.0)
+    for low, high in boxes:
+        outside = np.maximum(np.asarray(low) - grid, grid - np.asarray(high)).max(axis=-1)
+        distance = np.minimum(distance, outside)
+    return SimpleNamespace(distance=distance.astype(np.float32), origin=np.full(3, -0.05), voxel_m=voxel_m)
+
+
+def test_legs_that_lost_their_joint_stay_and_reach_the_top():
+    from reconstruction.assets.solid import extract
+
+    top = ((0.0, 0.0, 0.40), (1.0, 0.6, 0.46))
+    legs = [((x, y, 0.0), (x + 0.05, y + 0.05, 0.37)) for x in (0.05, 0.9) for y in (0.05, 0.5)]
+    crumb = ((0.4, 0.3, 0.50), (0.45, 0.33, 0.52))
+    body = extract(_field_of([top, *legs, crumb]))
+    assert body.vertices[:, 2].min() == pytest.approx(0.0, abs=0.01)  # the legs stand on the floor ...
+    assert body.vertices[:, 2].max() < 0.48  # ... and the crumb on the top is gone
+    below = body.vertices[body.vertices[:, 2] < 0.405]
+    near_leg = below[(below[:, 0] < 0.11) & (below[:, 1] < 0.11)]
+    assert near_leg[:, 2].max() >= 0.395  # no gap of 3 cm below the top
