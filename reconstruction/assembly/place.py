@@ -28,6 +28,7 @@ _FURNITURE_LABELS = (
     "wardrobe",
 )
 _TOUCH_GAP_M = 2e-4  # hanging things and furniture stop this far short of what they touch
+_MAX_CUTS = 8
 
 
 @dataclass(frozen=True)
@@ -228,9 +229,33 @@ class Placer:
         moved = pose_change(item.pose, pose)[0]
         if moved > 1e-3:
             item = item.noted(f"shifted {moved * 1000:.0f} mm out of its neighbors")
-        if not clear:
-            item = item.noted("still overlaps a neighbor")
-        return replace(item, pose=pose, stands=clear)
+        item = replace(item, pose=pose, stands=clear)
+        return item if clear else self._cut_clear(item)
+
+    def _cut_clear(self, item: Placement) -> Placement:
+        """Cut off the collision shape of a thing that stays fixed where it still reaches into its neighbors."""
+        tolerance_m = self.config.penetration_mm * 1e-3
+        whole, removed_m = item, 0.0
+        for _ in range(_MAX_CUTS):
+            self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+            contacts = self.bench.probe(item.asset.id, item.pose, tolerance_m)
+            if not contacts:
+                return replace(
+                    item.noted(f"its collision shape was cut off {removed_m * 100:.1f} cm inside a neighbor"),
+                    stands=True,
+                )
+            deepest = min(contacts, key=lambda c: c.separation_m)
+            removed_m = max(removed_m, -deepest.separation_m)
+            # The neighbor ends at the contact; what lies deeper than that, along its normal, goes.
+            level = deepest.normal @ deepest.position - deepest.separation_m + _TOUCH_GAP_M
+            inward = item.pose[:3, :3].T @ deepest.normal
+            offset = float(deepest.normal @ item.pose[:3, 3] - level)
+            parts, unflattened = cut(item.parts, inward, offset), cut(item.unflattened, inward, offset)
+            if not parts or not unflattened:
+                break
+            item = replace(item, parts=parts, unflattened=unflattened)
+        self.bench.put(object_spec(whole.asset, whole.parts, whole.pose, dynamic=True))
+        return whole.noted("still overlaps a neighbor")
 
     # Everything else: cleared, let go, repaired where it does not stand.
 

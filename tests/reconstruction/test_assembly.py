@@ -187,3 +187,17 @@ def test_flat_patch_of_a_sphere_has_the_expected_radius():
     assert np.linalg.norm(low[:, :2], axis=1).max() == pytest.approx(np.sqrt(2 * radius * band), rel=0.6)
     turned = rigid(tilt(40))[:3, :3]
     assert np.ptp(foot.vertices @ turned.T, axis=0).max() < 2 * radius + 1e-3
+
+
+def test_furniture_deep_inside_other_furniture_is_cut_not_left_overlapping():
+    """10 cm are more than a thing may be shifted by: the collision shape gives way, the looks stay."""
+    first = box(3, (0.8, 0.5, 0.9), (0.0, 0.0, 0.0), label="cabinet", mass=40.0)
+    second = box(4, (0.8, 0.5, 0.7), (0.7, 0.0, 0.0), label="cabinet", mass=30.0)
+    assets = room(first, second)
+    graph = SceneGraph(tuple(Edge(i, "supported_by", 1, 1.0, "") for i in (3, 4)))
+    scene = assemble(assets, graph, AssemblyConfig())
+    assert scene.physics_report["spawn_penetration_mm"] < 1.0
+    assert all(not item.dynamic for item in scene.placed)
+    cut_off = [item for item in scene.placed if "inside a neighbor" in item.repair]
+    assert len(cut_off) == 1
+    assert cut_off[0].moved_m < 0.05
