@@ -140,12 +140,9 @@ class Oracle:
         entities = [e for e in entities if (owner == e.id).sum() >= _MIN_VERTICES]
         graph = MeshGraph.from_surface(surface)
         base = _base(entities, owner, graph, posed)
-        numbers = {e.id: b.id for e, b in zip([e for e in entities if e.base], base)}
-        floor_missing = not base or base[0].label != "floor"
-        if floor_missing:
-            raise UsageError(
-                "--oracle instances: no floor is in view, which the oracle does not know how to handle"
-            )
+        planes = [e for e in entities if e.base]
+        # An assumed floor, where none was seen, stands before them and is nobody's truth.
+        numbers = {e.id: b.id for e, b in zip(planes, base[len(base) - len(planes) :])}
         things = _things(entities, owner)
         vertex_instance = np.zeros(len(owner), np.int32)
         for true_id, number in numbers.items():

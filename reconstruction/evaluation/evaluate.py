@@ -29,6 +29,7 @@ from reconstruction.evaluation.surfaces import (
     sample_seen,
 )
 from reconstruction.evaluation.visibility import spread_poses
+from reconstruction.frames import HELD_OUT_EVERY
 from reconstruction.progress import NO_PROGRESS, Progress
 from registry import SceneBundle
 from registry.errors import UsageError
@@ -161,7 +162,7 @@ def _rendering(
     bundle: SceneBundle, scene: list[PlacedMesh], stages: StageResults, video: Path | None, out: Evaluation
 ) -> None:
     camera = bundle_camera(bundle)
-    poses = {i: pose for i, pose in bundle_poses(bundle).items() if i % 10 == 0}
+    poses = {i: pose for i, pose in bundle_poses(bundle).items() if i % HELD_OUT_EVERY == 0}
     posed = stages.get("poses")
     if posed is not None:
         frames = {int(i): np.asarray(x) for i, x in zip(posed.held_out_indices, posed.held_out_images)}

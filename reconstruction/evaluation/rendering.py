@@ -8,7 +8,6 @@ import numpy as np
 from reconstruction.preview import render_textured
 from reconstruction.types import Camera, TexturedMesh
 
-HELD_OUT_EVERY = 10
 _SSIM_SIGMA = 1.5
 
 
@@ -20,8 +19,6 @@ class RenderScore:
     ssim: float
     coverage: float  # share of the pixels that the scene covers
     frames: int
-    lpips: float | None = None
-    musiq: float | None = None
 
 
 def score_pictures(

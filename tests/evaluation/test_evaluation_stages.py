@@ -138,6 +138,30 @@ def test_oracle_instances_are_perfect_and_merged_ones_are_not(capture, truth, su
     assert found["mean_iou"] < whole["mean_iou"] - 0.9 / len(KINDS)
 
 
+def test_oracle_instances_without_a_floor_in_view_keep_walls_and_floor_apart(capture, truth, surface):
+    """No vertex is of the floor: one is assumed, and the walls keep ids of their own."""
+    high = surface.vertices[:, 2] > 0.2
+    keep = high[surface.faces].all(axis=1)
+    number = np.cumsum(high) - 1
+    cut = replace(
+        surface,
+        vertices=surface.vertices[high],
+        faces=number[surface.faces[keep]].astype(np.int32),
+        normals=surface.normals[high],
+        colors=surface.colors[high],
+        weights=surface.weights[high],
+    )
+    found = oracle(truth, "instances").instances(capture.posed, capture.depth, cut)
+    assert found.base[0].label == "floor"
+    assert not found.base[0].observed
+    for base in found.base[1:]:
+        on_it = cut.vertices[found.vertex_instance == base.id]
+        assert base.label == "wall"
+        assert len(on_it) > 100
+        assert np.median(np.abs(on_it @ base.surface.plane[:3] + base.surface.plane[3])) < 0.02
+    assert not (found.vertex_instance == found.base[0].id).any()
+
+
 def test_oracle_depth_and_world_live_in_the_space_of_the_poses(capture, truth):
     scale = 0.37
     sfm_from_world = np.diag([scale, scale, scale, 1.0]) @ rigid(translation=np.array([1.0, 2.0, 3.0]))
