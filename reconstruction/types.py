@@ -93,6 +93,7 @@ class PosedFrames:
     )
     ordered: bool  # frames follow each other in time
     reprojection_error_px: float
+    metric: bool = False  # poses were imported from a tracker that measures metres (ARKit)
 
 
 @dataclass(frozen=True)
@@ -110,8 +111,8 @@ class DepthMaps:
 class ScaleEstimate:
     """How metres were found."""
 
-    # "marker" | "user-camera-height" | "user-distance" | "user-object" | "user-factor" | "metric-depth" |
-    # "camera-height-prior" | "table-height-prior" | "subject-distance-prior" | "unknown"
+    # "marker" | "user-camera-height" | "user-distance" | "user-object" | "user-factor" | "imported-poses" |
+    # "metric-depth" | "camera-height-prior" | "table-height-prior" | "subject-distance-prior" | "unknown"
     method: str
     uncertainty: float  # relative 1-sigma of the scale
     detail: str  # one sentence for people

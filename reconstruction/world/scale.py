@@ -1,6 +1,7 @@
 """The ladder of metric scale: the first rung that holds gives metres per sfm unit, with its 1-sigma.
 
-marker of known size -> what the user says -> metric depth backend -> how people hold cameras.
+marker of known size -> what the user says -> imported poses in metres -> metric depth backend -> how people
+hold cameras.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ _USER_DISTANCE_SIGMA = 0.015
 _TABLE_SIGMA = 0.30
 _SUBJECT_SIGMA = 0.5
 _MARKER_SIGMA = 0.005  # print and measuring
+_IMPORTED_SIGMA = 0.03  # visual-inertial tracking of a phone over a room
 _NEIGHBOURS = 6
 _SEARCH_PX = 3.0
 
@@ -49,6 +51,9 @@ def find_scale(
     found = _by_marker(posed, config, progress)
     if found is None and request is not None:
         found = _by_user(request, posed, depth, eye_height, floor, progress)
+    if found is None and posed.metric:
+        detail = "the imported poses are in metres, as the phone's motion tracking measured them"
+        found = Metres(1.0, ScaleEstimate("imported-poses", _IMPORTED_SIGMA, detail))
     if found is None:
         backend = load_backend(config)
         if backend is not None:

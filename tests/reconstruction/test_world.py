@@ -289,6 +289,18 @@ def test_camera_height_of_the_user_sets_the_scale(room):
     assert errors(world, true)["scale"] == pytest.approx(1, abs=0.01)
 
 
+def test_metric_poses_keep_their_metres_until_the_user_knows_better(room):
+    posed, depth = room
+    posed = replace(posed, metric=True)
+    world = find_world(posed, depth, WorldConfig())
+    assert world.scale.method == "imported-poses"
+    assert errors(world, np.eye(4))["scale"] == pytest.approx(1, abs=1e-9)
+    assert 0.01 < world.scale.uncertainty < 0.1
+    assert (
+        find_world(posed, depth, WorldConfig(scale="camera-height=2.8")).scale.method == "user-camera-height"
+    )
+
+
 def _pixel(posed: PosedFrames, row: int, point: np.ndarray) -> np.ndarray:
     camera = np.linalg.inv(posed.world_from_camera[row]) @ [*point, 1]
     xy = camera[:2] / camera[2] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
