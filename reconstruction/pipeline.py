@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, fingerprint
+from reconstruction.compiling import compilation_shown
 from reconstruction.config import PipelineConfig
 from reconstruction.overrides import Overrides
 from reconstruction.profiling import Usage, UsageMeter
@@ -104,8 +105,8 @@ class Run:
         self.listener.begin_stage(stage.name, number, len(STAGES), cached)
         if not cached:
             notes: list[str] = []
-            with UsageMeter() as meter:
-                result = self._compute(stage, config, _NoteTaker(self.listener, notes))
+            with UsageMeter() as meter, compilation_shown(self.listener) as shown:
+                result = self._compute(stage, config, _NoteTaker(shown, notes))
             record = {
                 "stage": stage.name,
                 "key": key,
