@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.progress import Progress
 
 _DESCRIPTOR_SCALE = 512.0
@@ -30,12 +31,16 @@ def extract_features(
     images: np.ndarray, max_features: int, contrast_threshold: float, progress: Progress
 ) -> list[Features]:
     """Detect SIFT features in every image (n, h, w, 3)."""
-    sift = cv2.SIFT_create(max_features, 3, contrast_threshold, 10.0, 1.6, enable_precise_upscale=True)
-    out = []
-    for image in images:
+
+    def extract(image: np.ndarray) -> Features:
+        sift = cv2.SIFT_create(max_features, 3, contrast_threshold, 10.0, 1.6, enable_precise_upscale=True)
         gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
         keypoints, descriptors = sift.detectAndCompute(gray, None)
-        out.append(_pack(keypoints, descriptors, max_features))
+        return _pack(keypoints, descriptors, max_features)
+
+    out = []
+    for found in ordered_map(extract, images):
+        out.append(found)
         progress.advance()
     return out
 
@@ -90,8 +95,9 @@ def overlap_scores(features: list[Features], progress: Progress, count: int = 25
         largest = np.argsort(-feature.sizes, kind="stable")[:count]
         stacked[row, : len(largest)] = feature.descriptors[largest]
     scores = np.zeros((n, n), np.int32)
-    for row in range(n - 1):
-        scores[row, row + 1 :] = _coarse_matches(stacked[row], stacked[row + 1 :])
+    rows = range(n - 1)
+    for row, counts in zip(rows, ordered_map(lambda r: _coarse_matches(stacked[r], stacked[r + 1 :]), rows)):
+        scores[row, row + 1 :] = counts
         progress.advance()
     return scores + scores.T
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.progress import Progress
 
 _NEIGHBORS = 8
@@ -31,15 +32,20 @@ def locate_frames(
     tracked = {row: _tracked_features(model, row) for row in sorted({r for rows in candidates for r in rows})}
     positions = {i: model.point3D(i).xyz for i in sorted(model.point3D_ids())}
     camera = model.cameras[min(model.cameras)]
-    out = []
-    for query, rows in zip(queries, candidates):
+
+    def locate(task: tuple[Features, list[int]]) -> np.ndarray | None:
+        query, rows = task
         votes: dict[tuple[int, int], int] = {}
         for row in rows[:_NEIGHBORS]:
             feature_rows, point_ids = tracked[row]
             for a, b in match(query.descriptors, features[row].descriptors[feature_rows]):
                 key = (int(a), int(point_ids[b]))
                 votes[key] = votes.get(key, 0) + 1
-        out.append(_solve(query, votes, positions, camera, config))
+        return _solve(query, votes, positions, camera, config)
+
+    out = []
+    for pose in ordered_map(locate, list(zip(queries, candidates))):
+        out.append(pose)
         progress.advance()
     return out
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.progress import Progress
 
 _MIN_OVERLAP_SCORE = (
@@ -74,15 +75,15 @@ def verify_pairs(
     options.ransac.random_seed = config.seed
     options.ransac.max_error = _MAX_EPIPOLAR_ERROR_PX
     options.ransac.max_num_trials = 2000  # the matches given are inliers already
-    out = []
-    for i, j, near in pairs:
-        progress.advance()
+
+    def verify(pair: tuple[int, int, bool]) -> VerifiedPair | None:
+        i, j, near = pair
         a, b = features[i], features[j]
         limit = config.max_features if near else max(512, config.max_features // 2)
         matches = match(a.descriptors[:limit], b.descriptors[:limit])
         matches = _epipolar_inliers(a.keypoints, b.keypoints, matches, config.min_inliers)
         if len(matches) < config.min_inliers:
-            continue
+            return None
         geometry = pycolmap.estimate_two_view_geometry(
             camera,
             a.keypoints.astype(np.float64),
@@ -91,8 +92,14 @@ def verify_pairs(
             matches.astype(np.uint32),
             options,
         )
-        if len(geometry.inlier_matches) >= config.min_inliers:
-            out.append(VerifiedPair((i, j), np.asarray(geometry.inlier_matches), geometry))
+        if len(geometry.inlier_matches) < config.min_inliers:
+            return None
+        return VerifiedPair((i, j), np.asarray(geometry.inlier_matches), geometry)
+
+    out = []
+    for found in ordered_map(verify, pairs):
+        out += [] if found is None else [found]
+        progress.advance()
     return out
 
 
