@@ -11,7 +11,9 @@ from contextlib import contextmanager
 
 from reconstruction.progress import Progress
 
-_PAUSE_NOTE = "compiling kernels on their first use (tens of seconds, once on this machine; doctor shows where they are kept)"
+_PAUSE_NOTE = (
+    "compiling kernels on their first use: tens of seconds, once on this machine (see `simrecon doctor`)"
+)
 
 
 class CompilationShown:

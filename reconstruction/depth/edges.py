@@ -1,16 +1,18 @@
 """Put depth edges where the image has its edges: windows that straddle an edge drag depth across it."""
 
-import math
-
 import numba
 import numpy as np
 
 _REACH = 9
 _STRIDE = 3
 _MAX_CANDIDATES = 5
+# Weights by difference of color (whole levels) and by place.
+_LEVELS = np.arange(256)
+_BY_TONE = np.where(_LEVELS > 30, 0, np.exp(-0.5 * (_LEVELS / 9.0) ** 2)).astype(np.float32)
+_BY_STEP = np.exp(-0.5 * np.arange(_REACH + 1) ** 2 / 50.0).astype(np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _near_jump(rho, y, x, jump):  # pragma: no cover - compiled
     h, w = rho.shape
     r = rho[y, x]
@@ -22,7 +24,7 @@ def _near_jump(rho, y, x, jump):  # pragma: no cover - compiled
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compiled
     """Let pixels near a depth jump choose among the surfaces around them: the one that pixels of their colour are on.
 
@@ -77,13 +79,14 @@ def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compile
                     i = x + dx
                     if i < 0 or i >= w:
                         continue
-                    d = 0.0
-                    for a in range(3):
-                        d = max(d, abs(color[j, i, a] - color[y, x, a]))
-                    if d > 30.0:
+                    d = abs(color[j, i, 0] - color[y, x, 0])
+                    d = max(d, abs(color[j, i, 1] - color[y, x, 1]))
+                    q = _BY_TONE[int(max(d, abs(color[j, i, 2] - color[y, x, 2])))]
+                    if q == 0.0:
                         continue
-                    q = math.exp(-0.5 * (d / 9.0) ** 2 - 0.5 * (dx * dx + dy * dy) / 50.0)
-                    q *= max(0.15, score[j, i]) * (0.25 if doubt[j, i] else 1.0)
+                    q *= _BY_STEP[abs(dx)] * _BY_STEP[abs(dy)] * max(np.float32(0.15), score[j, i])
+                    if doubt[j, i]:
+                        q *= np.float32(0.25)
                     for c in range(count):
                         expected = candidates[c, 0] + candidates[c, 1] * dx + candidates[c, 2] * dy
                         if abs(rho[j, i] - expected) < 0.012 * expected:

@@ -60,10 +60,8 @@ class _Workers:
 
     def each(self, n: int, work: Callable[[int], None], label: str, progress: Progress) -> None:
         progress.start(n, label)
-        work(0)  # compiles the kernels once, before threads start
-        progress.advance()
         with ThreadPoolExecutor(self.threads) as pool:
-            for _ in pool.map(work, range(1, n)):
+            for _ in pool.map(work, range(n)):
                 progress.advance()
 
 

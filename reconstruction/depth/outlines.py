@@ -6,21 +6,31 @@ Here each pixel beside a depth jump chooses anew among the surfaces around it. E
 in which only pixels of its own color count, and which surface the pixels of its color around it lie on.
 """
 
-import math
-
 import numba
 import numpy as np
+
+from reconstruction.depth.windows import make_correlate, offsets, project, source_maps
 
 _REACH = 15  # pixels of the same color have a say from so far
 _VOTE_STRIDE = 3
 _MAX_CANDIDATES = 4
 _RADIUS = 4  # 9x9 windows, every second pixel of them
 _STRIDE = 2
-_SAMPLES = ((2 * _RADIUS) // _STRIDE + 1) ** 2
+_DX, _DY = offsets(_RADIUS, _STRIDE)
+_SAMPLES = len(_DX)
+_correlate = make_correlate(_SAMPLES)
 _SAME = 0.012  # relative difference up to which two inverse depths are one surface
 _WINDOW_TONE, _VOTE_TONE, _VOTE_PX = 10.0, 9.0, 11.0
 _DOUBTED_SAY = 0.1
 _STAY = 0.05
+# Weights by difference of color (whole levels) and by place; 0 where a vote or a sample would hardly count.
+_LEVELS = np.arange(256)
+_VOTE_BY_TONE = np.where(_LEVELS > 3.5 * _VOTE_TONE, 0, np.exp(-0.5 * (_LEVELS / _VOTE_TONE) ** 2)).astype(
+    np.float32
+)
+_VOTE_BY_STEP = np.exp(-0.5 * (np.arange(_REACH + 1) / _VOTE_PX) ** 2).astype(np.float32)
+_SAMPLE_BY_TONE = np.exp(-_LEVELS / _WINDOW_TONE).astype(np.float32)
+_SAMPLE_BY_PLACE = np.exp(-(_DX**2 + _DY**2) / (2.0 * _RADIUS * _RADIUS)).astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -91,12 +101,20 @@ def _candidates(rho, gx, gy, doubt, y, x, out):  # pragma: no cover - compiled
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _differ(color, j, i, y, x):  # pragma: no cover - compiled
+    """Return by how many levels two pixels differ, in the channel where they differ most."""
+    d = abs(color[j, i, 0] - color[y, x, 0])
+    d = max(d, abs(color[j, i, 1] - color[y, x, 1]))
+    return int(max(d, abs(color[j, i, 2] - color[y, x, 2])))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _vote(rho, score, color, doubt, y, x, candidates, count, votes):  # pragma: no cover - compiled
     """Count for each candidate surface the pixels of the same color around that lie on it; return all their say."""
     h, w = rho.shape
     votes[:] = 0.0
-    total = 1e-6
+    total = np.float32(1e-6)
     for dy in range(-_REACH, _REACH + 1, _VOTE_STRIDE):
         j = y + dy
         if j < 0 or j >= h:
@@ -105,89 +123,55 @@ def _vote(rho, score, color, doubt, y, x, candidates, count, votes):  # pragma: 
             i = x + dx
             if i < 0 or i >= w or rho[j, i] <= 0.0:
                 continue
-            d = 0.0
-            for a in range(3):
-                d = max(d, abs(color[j, i, a] - color[y, x, a]))
-            if d > 3.5 * _VOTE_TONE:
+            q = _VOTE_BY_TONE[_differ(color, j, i, y, x)]
+            if q == 0.0:
                 continue
-            q = math.exp(-0.5 * (d / _VOTE_TONE) ** 2 - 0.5 * (dx * dx + dy * dy) / (_VOTE_PX * _VOTE_PX))
-            q *= max(0.15, score[j, i]) * (_DOUBTED_SAY if doubt[j, i] else 1.0)
+            q *= _VOTE_BY_STEP[abs(dx)] * _VOTE_BY_STEP[abs(dy)]
+            q *= max(np.float32(0.15), score[j, i])
+            if doubt[j, i]:
+                q *= np.float32(_DOUBTED_SAY)
             total += q
+            r, fx, fy = rho[j, i], np.float32(dx), np.float32(dy)
             for c in range(count):
-                e = candidates[c, 0] + candidates[c, 1] * dx + candidates[c, 2] * dy
-                if abs(rho[j, i] - e) < _SAME * e:
+                e = candidates[c, 0] + candidates[c, 1] * fx + candidates[c, 2] * fy
+                if abs(r - e) < np.float32(_SAME) * e:
                     votes[c] += q
     return total
 
 
-@numba.njit(cache=True, nogil=True)
-def _window(reference, color, y, x, weight, values):  # pragma: no cover - compiled
-    """Write weights (by likeness of color) and gray levels of the window; return weighted mean and variance."""
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _window(reference, color, y, x, weight, centered):  # pragma: no cover - compiled
+    """Write the window's weights (by likeness of color), and weighted gray levels less their mean; return variance."""
     h, w = reference.shape
-    n, total = 0, np.float32(0.0)
+    n, total, mean = 0, np.float32(0.0), np.float32(0.0)
     for dy in range(-_RADIUS, _RADIUS + 1, _STRIDE):
         j = min(max(y + dy, 0), h - 1)
         for dx in range(-_RADIUS, _RADIUS + 1, _STRIDE):
             i = min(max(x + dx, 0), w - 1)
-            d = np.float32(0.0)
-            for a in range(3):
-                d = max(d, abs(color[j, i, a] - color[y, x, a]))
-            q = math.exp(-d / _WINDOW_TONE - (dx * dx + dy * dy) / (2.0 * _RADIUS * _RADIUS))
-            weight[n], values[n] = q, reference[j, i]
-            total += np.float32(q)
+            q = _SAMPLE_BY_TONE[_differ(color, j, i, y, x)] * _SAMPLE_BY_PLACE[n]
+            weight[n], centered[n] = q, reference[j, i]
+            total += q
+            mean += q * reference[j, i]
             n += 1
-    mean, variance = np.float32(0.0), np.float32(0.0)
+    share, variance = np.float32(1.0) / total, np.float32(0.0)
+    mean *= share
     for n in range(_SAMPLES):
-        weight[n] /= total
-        mean += weight[n] * values[n]
-    for n in range(_SAMPLES):
-        variance += weight[n] * (values[n] - mean) ** 2
-    return mean, variance
+        weight[n] *= share
+        e = centered[n] - mean
+        centered[n] = weight[n] * e
+        variance += weight[n] * e * e
+    return variance
 
 
-@numba.njit(cache=True, nogil=True)
-def _correlation(values, weight, mean, variance, source, m, rho, gx, gy, zero):  # pragma: no cover - compiled
-    """Weighted correlation of a slanted window with one source; -2 where the source does not see it."""
-    sh, sw = source.shape
-    top_u, top_v = np.float32(sw - 1.01), np.float32(sh - 1.01)
-    one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    u0, v0, z0 = m[0] + rho * m[9], m[1] + rho * m[10], m[2] + rho * m[11]
-    if z0 <= np.float32(1e-9):
-        return np.float32(-2.0)
-    u, v = u0 / z0 - half, v0 / z0 - half
-    if not (u >= nil and v >= nil and u < top_u and v < top_v):
-        return np.float32(-2.0)
-    ux, vx, zx = m[3] + gx * m[9], m[4] + gx * m[10], m[5] + gx * m[11]
-    uy, vy, zy = m[6] + gy * m[9], m[7] + gy * m[10], m[8] + gy * m[11]
-    sb, sbb, sab = nil, nil, nil
-    n = 0
-    for dy in range(-_RADIUS, _RADIUS + 1, _STRIDE):
-        for dx in range(-_RADIUS, _RADIUS + 1, _STRIDE):
-            q = weight[n]
-            if q > np.float32(0.002):
-                fx, fy = np.float32(dx), np.float32(dy)
-                inv = one / (z0 + fx * zx + fy * zy)
-                u = min(max(nil, (u0 + fx * ux + fy * uy) * inv - half), top_u)
-                v = min(max(nil, (v0 + fx * vx + fy * vy) * inv - half), top_v)
-                ix, iy = int(u), int(v)
-                fx, fy = u - np.float32(ix), v - np.float32(iy)
-                top = source[iy, ix] + fx * (source[iy, ix + 1] - source[iy, ix])
-                low = source[iy + 1, ix] + fx * (source[iy + 1, ix + 1] - source[iy + 1, ix])
-                b = top + fy * (low - top)
-                sb += q * b
-                sbb += q * b * b
-                sab += q * (values[n] - mean) * b
-            n += 1
-    return sab / np.float32(math.sqrt((variance + zero) * (max(sbb - sb * sb, nil) + zero)))
-
-
-@numba.njit(cache=True, nogil=True)
-def _seen(values, weight, mean, variance, sources, maps, candidate, zero):  # pragma: no cover - compiled
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _seen(
+    weight, centered, variance, flat, sh, sw, maps, candidate, zero, dx, dy
+):  # pragma: no cover - compiled
     """Return the mean correlation of the two best sources: the others may not see the surface."""
     first, second = np.float32(-2.0), np.float32(-2.0)
-    rho, gx, gy = candidate[0], candidate[1], candidate[2]
-    for k in range(sources.shape[0]):
-        s = _correlation(values, weight, mean, variance, sources[k], maps[k], rho, gx, gy, zero)
+    r, gx, gy = candidate[0], candidate[1], candidate[2]
+    for k in range(len(maps)):
+        s = _correlate(weight, centered, variance, flat[k], sh, sw, maps[k], r, gx, gy, zero, dx, dy)
         second = max(second, min(first, s))
         first = max(first, s)
     if second > -1.5:
@@ -218,10 +202,13 @@ def resolve_edges(
     """
     h, w = rho.shape
     zero = np.float32(noise * noise)
-    maps = np.empty((sources.shape[0], 12), np.float32)
-    weight, values = np.empty(_SAMPLES, np.float32), np.empty(_SAMPLES, np.float32)
+    s, sh, sw = sources.shape
+    flat = sources.reshape(s, sh * sw)
+    maps = source_maps(h_inf, shift)
+    dx, dy = _DX.copy(), _DY.copy()
+    weight, centered = np.empty(_SAMPLES, np.float32), np.empty(_SAMPLES, np.float32)
     candidates = np.empty((_MAX_CANDIDATES, 3), np.float32)
-    votes = np.empty(_MAX_CANDIDATES)
+    votes = np.empty(_MAX_CANDIDATES, np.float32)
     for y in range(h):
         for x in range(w):
             known = rho[y, x] > 0.0
@@ -234,21 +221,17 @@ def resolve_edges(
             total = _vote(rho, score, color, doubt, y, x, candidates, count, votes)
             if known and votes[0] > 0.8 * total:
                 continue
-            for k in range(sources.shape[0]):
-                for a in range(3):
-                    maps[k, a] = h_inf[k, a, 0] * (x + 0.5) + h_inf[k, a, 1] * (y + 0.5) + h_inf[k, a, 2]
-                    maps[k, 3 + a], maps[k, 6 + a] = h_inf[k, a, 0], h_inf[k, a, 1]
-                    maps[k, 9 + a] = shift[k, a]
-            mean, variance = _window(reference, color, y, x, weight, values)
+            project(h_inf, y, x, maps)
+            variance = _window(reference, color, y, x, weight, centered) + zero
             best, at, seen = -9.0, 0, np.float32(0.0)
             for c in range(count):
                 own = known and c == 0
                 if not own and votes[c] < 0.05 * total:
                     continue
-                s = _seen(values, weight, mean, variance, sources, maps, candidates[c], zero)
-                e = s + votes[c] / total + (_STAY if own else 0.0)
+                say = _seen(weight, centered, variance, flat, sh, sw, maps, candidates[c], zero, dx, dy)
+                e = say + votes[c] / total + (_STAY if own else 0.0)
                 if e > best:
-                    best, at, seen = e, c, s
+                    best, at, seen = e, c, say
             if best <= -9.0 or (at == 0 and known):
                 continue
             # Without texture only the neighbors of the same color speak, and they must agree among each other.

@@ -1,53 +1,76 @@
 """Local refinement of inverse depth with windows slanted like the surface, at full depth resolution."""
 
-import math
-
 import numba
 import numpy as np
 
-_RADIUS = 3  # 7x7 windows, every second pixel of them
-_STRIDE = 2
+from reconstruction.depth.windows import FAST, make_correlate, offsets, project, source_maps
+
+_RADIUS, _STRIDE = 3, 2  # 7x7 windows, every second pixel of them
+_DX, _DY = offsets(_RADIUS, _STRIDE)
+_SAMPLES = len(_DX)
+_correlate = make_correlate(_SAMPLES)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+def _gather(rho, here, jump, a, b, n, sx, sy, sr, sxx, syy, sxy, sxr, syr):  # pragma: no cover - compiled
+    """Add to the sums of a row of pixels their neighbors (a, b) away, where those continue the surface."""
+    one, nil = np.float32(1.0), np.float32(0.0)
+    reach = np.float32(jump * max(1, abs(a) + abs(b)))
+    a, b = np.float32(a), np.float32(b)
+    for x in range(len(rho)):
+        e = rho[x] - here[x]
+        m = one if abs(e) <= reach * here[x] else nil
+        e *= m
+        n[x] += m
+        sx[x] += a * m
+        sy[x] += b * m
+        sr[x] += e
+        sxx[x] += a * a * m
+        syy[x] += b * b * m
+        sxy[x] += a * b * m
+        sxr[x] += a * e
+        syr[x] += b * e
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+def _solve(here, n, sx, sy, sr, sxx, syy, sxy, sxr, syr, rho, gx, gy):  # pragma: no cover - compiled
+    """Turn the sums of a row of pixels into planes: value and slopes; pixels with few neighbors stay flat."""
+    one, nil, few = np.float32(1.0), np.float32(0.0), np.float32(6.0)
+    for x in range(len(here)):
+        inv = one / n[x]
+        xx, yy, xy = sxx[x] - sx[x] * sx[x] * inv, syy[x] - sy[x] * sy[x] * inv, sxy[x] - sx[x] * sy[x] * inv
+        xr, yr = sxr[x] - sx[x] * sr[x] * inv, syr[x] - sy[x] * sr[x] * inv
+        det = xx * yy - xy * xy
+        many = n[x] >= few
+        scale = one / det if many and det > one else nil
+        a, b = (xr * yy - yr * xy) * scale, (yr * xx - xr * xy) * scale
+        gx[x], gy[x] = a, b
+        rho[x] = here[x] + ((sr[x] - a * sx[x] - b * sy[x]) * inv if many else nil)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_slopes(rho, jump, out_rho, out_gx, out_gy):  # pragma: no cover - compiled
     """Fit a plane in inverse depth to the 5x5 neighbours that continue the surface; write its value and slopes."""
     h, w = rho.shape
+    sums = np.empty((9, w), np.float32)
+    s0, s1, s2, s3, s4, s5, s6, s7, s8 = (
+        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8],
+    )  # fmt: skip
     for y in range(h):
-        for x in range(w):
-            r = rho[y, x]
-            n, sx, sy, sr, sxx, syy, sxy, sxr, syr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for j in range(max(0, y - 2), min(h, y + 3)):
-                for i in range(max(0, x - 2), min(w, x + 3)):
-                    e = rho[j, i] - r
-                    if abs(e) > jump * r * max(1, abs(i - x) + abs(j - y)):
-                        continue
-                    a, b = i - x, j - y
-                    n += 1.0
-                    sx += a
-                    sy += b
-                    sr += e
-                    sxx += a * a
-                    syy += b * b
-                    sxy += a * b
-                    sxr += a * e
-                    syr += b * e
-            sxx -= sx * sx / n
-            syy -= sy * sy / n
-            sxy -= sx * sy / n
-            sxr -= sx * sr / n
-            syr -= sy * sr / n
-            det = sxx * syy - sxy * sxy
-            gx, gy = 0.0, 0.0
-            if n >= 6.0 and det > 1.0:
-                gx, gy = (sxr * syy - syr * sxy) / det, (syr * sxx - sxr * sxy) / det
-            out_gx[y, x], out_gy[y, x] = gx, gy
-            out_rho[y, x] = r + sr / n - gx * sx / n - gy * sy / n if n >= 6.0 else r
+        sums[:] = 0.0
+        for j in range(max(0, y - 2), min(h, y + 3)):
+            for a in range(-2, 3):
+                low, high = max(0, -a), w - max(0, a)
+                n, sx, sy, sr = s0[low:high], s1[low:high], s2[low:high], s3[low:high]
+                xx, yy, xy, xr, yr = s4[low:high], s5[low:high], s6[low:high], s7[low:high], s8[low:high]
+                there, here = rho[j, low + a : high + a], rho[y, low:high]
+                _gather(there, here, jump, a, j - y, n, sx, sy, sr, xx, yy, xy, xr, yr)
+        _solve(rho[y], s0, s1, s2, s3, s4, s5, s6, s7, s8, out_rho[y], out_gx[y], out_gy[y])
 
 
-@numba.njit(cache=True, nogil=True)
-def _window(reference, y, x, values, zero):  # pragma: no cover - compiled
-    """Copy the reference window around (y, x), border repeated; return its mean and floored variance."""
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _window(reference, y, x, centered, zero):  # pragma: no cover - compiled
+    """Write what the window around (y, x), border repeated, differs from its mean; return its floored variance."""
     h, w = reference.shape
     s, q = np.float32(0.0), np.float32(0.0)
     n = 0
@@ -55,124 +78,91 @@ def _window(reference, y, x, values, zero):  # pragma: no cover - compiled
         j = min(max(y + dy, 0), h - 1)
         for dx in range(-_RADIUS, _RADIUS + 1, _STRIDE):
             a = reference[j, min(max(x + dx, 0), w - 1)]
-            values[n] = a
+            centered[n] = a
             s += a
             q += a * a
             n += 1
-    mean = s / n
-    return mean, max(q / n - mean * mean, np.float32(0.0)) + zero
+    share = np.float32(1.0 / _SAMPLES)
+    mean = s * share
+    for n in range(_SAMPLES):
+        centered[n] = (centered[n] - mean) * share
+    return max(q * share - mean * mean, np.float32(0.0)) + zero
 
 
-@numba.njit(cache=True, nogil=True)
-def _score(values, mean, variance, sources, maps, rho, gx, gy, zero, best):  # pragma: no cover - compiled
-    """Correlate a slanted window with all sources; return the mean of the two best.
-
-    `maps` (s, 12) holds, for each source, the projection of the pixel and its change along x, y and inverse depth:
-    over the window the numerators and the denominator are affine, which makes a sample cheap.
-    """
-    s = sources.shape[0]
-    sh, sw = sources.shape[1:]
-    top_u, top_v = np.float32(sw - 1.01), np.float32(sh - 1.01)
-    one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    count = np.float32(((2 * _RADIUS) // _STRIDE + 1) ** 2)
-    for k in range(s):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _disparity_rate(maps, r):  # pragma: no cover - compiled
+    """Return pixels of disparity per unit of inverse depth, in the source where it moves most."""
+    rate = np.float32(1e-24)
+    for k in range(len(maps)):
         m = maps[k]
-        best[k] = -2.0
-        tx, ty, tz = m[9], m[10], m[11]
-        u0, v0, z0 = m[0] + rho * tx, m[1] + rho * ty, m[2] + rho * tz
-        if z0 <= np.float32(1e-9):
-            continue
-        u, v = u0 / z0 - half, v0 / z0 - half
-        if not (u >= nil and v >= nil and u < top_u and v < top_v):
-            continue
-        ux, vx, zx = m[3] + gx * tx, m[4] + gx * ty, m[5] + gx * tz
-        uy, vy, zy = m[6] + gy * tx, m[7] + gy * ty, m[8] + gy * tz
-        sb, sbb, sab = nil, nil, nil
-        n = 0
-        for dy in range(-_RADIUS, _RADIUS + 1, _STRIDE):
-            for dx in range(-_RADIUS, _RADIUS + 1, _STRIDE):
-                fx, fy = np.float32(dx), np.float32(dy)
-                inv = one / (z0 + fx * zx + fy * zy)
-                u = (u0 + fx * ux + fy * uy) * inv - half
-                v = (v0 + fx * vx + fy * vy) * inv - half
-                # Comparisons in this order also catch what is not a number.
-                u = min(max(nil, u), top_u)
-                v = min(max(nil, v), top_v)
-                ix, iy = int(u), int(v)
-                fx, fy = u - np.float32(ix), v - np.float32(iy)
-                top = sources[k, iy, ix] + fx * (sources[k, iy, ix + 1] - sources[k, iy, ix])
-                low = sources[k, iy + 1, ix] + fx * (sources[k, iy + 1, ix + 1] - sources[k, iy + 1, ix])
-                b = top + fy * (low - top)
-                sb += b
-                sbb += b * b
-                sab += values[n] * b
-                n += 1
-        mb = sb / count
-        vb = max(sbb / count - mb * mb, nil) + zero
-        best[k] = (sab / count - mean * mb) / math.sqrt(variance * vb)
-    keep = min(2, s)
-    total, used = 0.0, 0
-    for _ in range(keep):
-        at = int(np.argmax(best))
-        if best[at] <= -2.0:
-            break
-        total += best[at]
-        best[at] = -2.0
-        used += 1
-    if used == 0:
-        return -1.0
-    return total / used if used == keep else 0.5 * total / used
+        z = m[2] + r * m[11]
+        if z > np.float32(1e-9):
+            inv = np.float32(1.0) / z
+            du = (m[9] - (m[0] + r * m[9]) * inv * m[11]) * inv
+            dv = (m[10] - (m[1] + r * m[10]) * inv * m[11]) * inv
+            rate = max(rate, du * du + dv * dv)
+    return np.sqrt(rate)
 
 
-@numba.njit(cache=True, nogil=True)
-def _maps(h_inf, shift, y, x, maps):  # pragma: no cover - compiled
-    for k in range(h_inf.shape[0]):
-        for a in range(3):
-            maps[k, a] = h_inf[k, a, 0] * (x + 0.5) + h_inf[k, a, 1] * (y + 0.5) + h_inf[k, a, 2]
-            maps[k, 3 + a] = h_inf[k, a, 0]
-            maps[k, 6 + a] = h_inf[k, a, 1]
-            maps[k, 9 + a] = shift[k, a]
-
-
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def refine(
     reference, sources, h_inf, shift, rho, gx, gy, px_step, noise, out_rho, out_score
 ):  # pragma: no cover
-    """Try inverse depths around `rho` (h, w) in steps of `px_step` pixels of disparity; keep the best, by parabola."""
+    """Try inverse depths around `rho` (h, w) in steps of `px_step` pixels of disparity; keep the best, by parabola.
+
+    A try's worth is the mean correlation with the two sources that see the unmoved window best: the others may not
+    see it at all.
+    """
     h, w = reference.shape
-    s = sources.shape[0]
-    zero = np.float32(noise * noise)
-    best = np.empty(s)
-    line = np.empty(5)
-    maps = np.empty((s, 12), np.float32)
-    values = np.empty(((2 * _RADIUS) // _STRIDE + 1) ** 2, np.float32)
+    s, sh, sw = sources.shape
+    flat = sources.reshape(s, sh * sw)
+    zero, half, none = np.float32(noise * noise), np.float32(0.5), np.float32(-2.0)
+    px_step = np.float32(px_step)
+    line = np.empty(5, np.float32)
+    maps = source_maps(h_inf, shift)
+    weight = np.full(_SAMPLES, 1.0 / _SAMPLES).astype(np.float32)
+    centered = np.empty(_SAMPLES, np.float32)
+    dx, dy = _DX.copy(), _DY.copy()
     for y in range(h):
         for x in range(w):
-            r = rho[y, x]
-            _maps(h_inf, shift, y, x, maps)
-            # Pixels of disparity per unit of inverse depth, in the source where it moves most.
-            rate = 1e-12
+            r, a, b = rho[y, x], gx[y, x], gy[y, x]
+            project(h_inf, y, x, maps)
+            step = px_step / _disparity_rate(maps, r)
+            variance = _window(reference, y, x, centered, zero)
+            first, second, best, other = none, none, -1, -1
             for k in range(s):
-                m = maps[k]
-                z = m[2] + r * m[11]
-                if z > 1e-9:
-                    u, v = (m[0] + r * m[9]) / z, (m[1] + r * m[10]) / z
-                    rate = max(rate, math.hypot(m[9] - u * m[11], m[10] - v * m[11]) / z)
-            step = px_step / rate
-            mean, variance = _window(reference, y, x, values, zero)
-            top, at = -9.0, 2
+                e = _correlate(weight, centered, variance, flat[k], sh, sw, maps[k], r, a, b, zero, dx, dy)
+                if e > first:
+                    second, other = first, best
+                    first, best = e, k
+                elif e > second:
+                    second, other = e, k
+            line[:] = -1.0
+            line[2] = half * (first + second) if other >= 0 else (half * first if best >= 0 else line[2])
+            for c in (0, 1, 3, 4):
+                q = r + np.float32(c - 2) * step
+                if q <= np.float32(0.0) or best < 0:
+                    continue
+                e = _correlate(
+                    weight, centered, variance, flat[best], sh, sw, maps[best], q, a, b, zero, dx, dy
+                )
+                g = none
+                if other >= 0:
+                    g = _correlate(
+                        weight, centered, variance, flat[other], sh, sw, maps[other], q, a, b, zero, dx, dy
+                    )
+                if e > none or g > none:
+                    line[c] = half * (e + g) if e > none and g > none else half * max(e, g)
+            top, at = np.float32(-9.0), 2
             for c in range(5):
-                q = np.float32(r + (c - 2) * step)
-                line[c] = -1.0
-                if q > 0.0:
-                    line[c] = _score(values, mean, variance, sources, maps, q, gx[y, x], gy[y, x], zero, best)
                 # Where the windows say nothing, the aggregated depth stands.
-                if line[c] - 0.004 * abs(c - 2) > top:
-                    top, at = line[c] - 0.004 * abs(c - 2), c
-            moved = 0.0
+                value = line[c] - np.float32(0.004 * abs(c - 2))
+                if value > top:
+                    top, at = value, c
+            moved = np.float32(0.0)
             if 0 < at < 4:
-                bend = line[at - 1] + line[at + 1] - 2.0 * line[at]
-                if bend < -1e-4:
-                    moved = min(0.5, max(-0.5, 0.5 * (line[at - 1] - line[at + 1]) / bend))
-            out_rho[y, x] = r + (at - 2 + moved) * step
+                bend = line[at - 1] + line[at + 1] - np.float32(2.0) * line[at]
+                if bend < np.float32(-1e-4):
+                    moved = min(half, max(-half, half * (line[at - 1] - line[at + 1]) / bend))
+            out_rho[y, x] = r + (np.float32(at - 2) + moved) * step
             out_score[y, x] = line[at]

@@ -1,11 +1,19 @@
-"""Plane sweep: zero-mean normalised correlation of every pixel's window with the sources, for every inverse depth."""
+"""Plane sweep: zero-mean normalised correlation of every pixel's window with the sources, for every inverse depth.
+
+A source is resampled row by row as the reference would see it if all lay at one inverse depth, and sums over the
+windows run along: the cost of a window does not grow with its height, and all of it stays in the first cache.
+"""
 
 import math
 
 import numba
 import numpy as np
 
+from reconstruction.depth.vector_memory import load_only_read, store_apart
+from reconstruction.depth.windows import FAST
+
 _RADIUS = 2  # 5x5 windows
+_ROWS = 2 * _RADIUS + 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -24,87 +32,78 @@ def _window_moments(reference, mean, inverse_deviation, zero):  # pragma: no cov
             inverse_deviation[y, x] = 1.0 / math.sqrt(max(q / n - (s / n) ** 2, 0.0) + zero)
 
 
-@numba.njit(cache=True, nogil=True)
-def _correlate(
-    warped, inside, reference, mean_r, inverse_deviation, zero, first, second
-):  # pragma: no cover - compiled
-    """Correlation of 5x5 windows by running column sums; the cost does not grow with the window's height.
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+def _warp_row(source, height, width, h_inf, shift, rho, y, out, inside):  # pragma: no cover - compiled
+    """Resample a source for row y of the reference at inverse depth rho (bilinear, border repeated).
 
-    The two best correlations of each pixel so far are kept in `first` and `second`.
-    Gray levels are centred on zero, so that single precision is enough for the running sums.
+    `source` is float32 (height * width,); `out` (w,) and `inside` (w,), 1 or 0, are written.
     """
-    h, w = reference.shape
-    r = _RADIUS
-    columns = np.zeros((3, w + 2 * r), np.float32)
-    share = np.empty(w, np.float32)
-    for x in range(w):
-        share[x] = 1.0 / (min(w - 1, x + r) - max(0, x - r) + 1)
-    for y in range(-r, h):
-        add, drop = y + r, y - r - 1
-        if add < h:
-            for x in range(w):
-                a, b = warped[add, x], reference[add, x]
-                columns[0, x + r] += a
-                columns[1, x + r] += a * a
-                columns[2, x + r] += a * b
-        if drop >= 0:
-            for x in range(w):
-                a, b = warped[drop, x], reference[drop, x]
-                columns[0, x + r] -= a
-                columns[1, x + r] -= a * a
-                columns[2, x + r] -= a * b
-        if y < 0:
-            continue
-        rows = min(h - 1, y + r) - max(0, y - r) + 1
-        row_share = np.float32(1.0 / rows)
-        for x in range(w):
-            scale = row_share * share[x]
-            s = np.float32(0.0)
-            q = np.float32(0.0)
-            p = np.float32(0.0)
-            for i in range(2 * r + 1):
-                s += columns[0, x + i]
-                q += columns[1, x + i]
-                p += columns[2, x + i]
-            s, q, p = s * scale, q * scale, p * scale
-            variance = max(q - s * s, np.float32(0.0)) + zero
-            score = (p - s * mean_r[y, x]) / np.sqrt(variance) * inverse_deviation[y, x]
-            score = score if inside[y, x] else np.float32(-2.0)
-            second[y, x] = max(second[y, x], min(first[y, x], score))
-            first[y, x] = max(first[y, x], score)
-
-
-@numba.njit(cache=True, nogil=True)
-def _warp(source, h_inf, shift, rho, out, inside):  # pragma: no cover - compiled
-    """Resample a source as the reference would see it if all lay at inverse depth rho (bilinear, border repeated)."""
-    h, w = out.shape
-    sh, sw = source.shape
+    py = y + 0.5
     a0, a1, a2 = np.float32(h_inf[0, 0]), np.float32(h_inf[1, 0]), np.float32(h_inf[2, 0])
-    top_u, top_v = np.float32(sw - 1.001), np.float32(sh - 1.001)
-    half, nil, one = np.float32(0.5), np.float32(0.0), np.float32(1.0)
-    for y in range(h):
-        py = y + 0.5
-        b0 = np.float32(h_inf[0, 1] * py + h_inf[0, 2] + rho * shift[0])
-        b1 = np.float32(h_inf[1, 1] * py + h_inf[1, 2] + rho * shift[1])
-        b2 = np.float32(h_inf[2, 1] * py + h_inf[2, 2] + rho * shift[2])
-        for x in range(w):
-            px = np.float32(x) + half
-            z = a2 * px + b2
-            if z <= np.float32(1e-9):
-                out[y, x] = nil
-                inside[y, x] = False
-                continue
-            inv = one / z
-            u = (a0 * px + b0) * inv - half
-            v = (a1 * px + b1) * inv - half
-            inside[y, x] = u > -half and v > -half and u < sw - half and v < sh - half
-            u = min(max(u, nil), top_u)
-            v = min(max(v, nil), top_v)
-            ix, iy = int(u), int(v)
-            fx, fy = u - np.float32(ix), v - np.float32(iy)
-            top = source[iy, ix] + fx * (source[iy, ix + 1] - source[iy, ix])
-            low = source[iy + 1, ix] + fx * (source[iy + 1, ix + 1] - source[iy + 1, ix])
-            out[y, x] = top + fy * (low - top)
+    b0 = np.float32(h_inf[0, 1] * py + h_inf[0, 2] + rho * shift[0])
+    b1 = np.float32(h_inf[1, 1] * py + h_inf[1, 2] + rho * shift[1])
+    b2 = np.float32(h_inf[2, 1] * py + h_inf[2, 2] + rho * shift[2])
+    top_u, top_v = np.float32(width - 1.001), np.float32(height - 1.001)
+    end_u, end_v = np.float32(width - 0.5), np.float32(height - 0.5)
+    half, nil, one, least = np.float32(0.5), np.float32(0.0), np.float32(1.0), np.float32(1e-9)
+    stride, right, below = np.int32(width), np.uint32(1), np.uint32(width)
+    for x in range(len(out)):
+        px = np.float32(np.int32(x)) + half
+        z = a2 * px + b2
+        inv = one / max(z, least)
+        u = (a0 * px + b0) * inv - half
+        v = (a1 * px + b1) * inv - half
+        seen = (z > least) & (u > -half) & (v > -half) & (u < end_u) & (v < end_v)
+        u = min(max(u, nil), top_u)
+        v = min(max(v, nil), top_v)
+        ix, iy = np.int32(u), np.int32(v)
+        fx, fy = u - np.float32(ix), v - np.float32(iy)
+        p = np.uint32(iy * stride + ix)
+        a, b = load_only_read(source, p), load_only_read(source, p + right)
+        c, d = load_only_read(source, p + below), load_only_read(source, p + below + right)
+        top = a + fx * (b - a)
+        low = c + fx * (d - c)
+        store_apart(out, x, top + fy * (low - top))
+        store_apart(inside, x, one if seen else nil)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+def _move_down(new, old, reference_new, reference_old, s, q, p):  # pragma: no cover - compiled
+    """Take a row into the column sums of gray, its square and its product with the reference, and one row out."""
+    for x in range(len(new)):
+        a, c = new[x], old[x]
+        s[x] += a - c
+        q[x] += a * a - c * c
+        p[x] += a * reference_new[x] - c * reference_old[x]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+def _score_row(
+    s, q, p, share, row_share, mean, inverse_deviation, zero, inside, first, second
+):  # pragma: no cover - compiled
+    """Correlation of a row of windows from column sums (w + 4,); `first` and `second` (w,) keep the two best so far."""
+    nil, none = np.float32(0.0), np.float32(-2.0)
+    for x in range(len(first)):
+        f = share[x] * row_share
+        a = (s[x] + s[x + 1] + s[x + 2] + s[x + 3] + s[x + 4]) * f
+        b = (q[x] + q[x + 1] + q[x + 2] + q[x + 3] + q[x + 4]) * f
+        c = (p[x] + p[x + 1] + p[x + 2] + p[x + 3] + p[x + 4]) * f
+        score = (c - a * mean[x]) * inverse_deviation[x] / np.sqrt(max(b - a * a, nil) + zero)
+        score = score if inside[x] > nil else none
+        second[x] = max(second[x], min(first[x], score))
+        first[x] = max(first[x], score)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+def _write_row(first, second, out):  # pragma: no cover - compiled
+    """Write the cost of a row of pixels from its two best correlations."""
+    nil, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+    for x in range(len(first)):
+        a, b = first[x], second[x]
+        # One source alone may match by chance: it counts half.
+        one_or_none = half * a if a > np.float32(-1.5) else nil
+        score = half * (a + b) if b > np.float32(-1.5) else one_or_none
+        out[x] = np.uint8(np.int32(min(np.float32(254.0), max(nil, np.float32(127.0) * (one - score)))))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -113,25 +112,47 @@ def sweep_costs(reference, sources, h_inf, shift, rhos, noise, out):  # pragma: 
 
     Occlusion spoils the others.
 
-    `reference` (h, w) and `sources` (s, h, w) are float32 gray minus 128; source pixel ~ h_inf @ p + rho * shift.
+    `reference` (h, w) and `sources` (s, h, w) are float32 gray minus 128, so that single precision is enough for the
+    running sums; source pixel ~ h_inf @ p + rho * shift.
     """
     h, w = reference.shape
-    s = sources.shape[0]
+    s, sh, sw = sources.shape
+    r = _RADIUS
+    flat = sources.reshape(s, sh * sw)
     zero = np.float32(noise * noise)
-    mean_r, inverse_deviation = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
-    _window_moments(reference, mean_r, inverse_deviation, zero)
-    warped = np.empty((h, w), np.float32)
-    inside = np.empty((h, w), np.bool_)
+    mean, inverse_deviation = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
+    _window_moments(reference, mean, inverse_deviation, zero)
+    share = np.empty(w, np.float32)
+    for x in range(w):
+        share[x] = 1.0 / (min(w - 1, x + r) - max(0, x - r) + 1)
+    columns = np.zeros((3, w + 2 * r), np.float32)  # two empty columns on either side
+    cs, cq, cp = columns[0], columns[1], columns[2]
+    ring, inside = np.empty((_ROWS, w), np.float32), np.empty((_ROWS, w), np.float32)
+    new, blank = np.empty(w, np.float32), np.zeros(w, np.float32)
     first, second = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
     for d in range(len(rhos)):
         first[:] = -2.0
         second[:] = -2.0
         for k in range(s):
-            _warp(sources[k], h_inf[k], shift[k], rhos[d], warped, inside)
-            _correlate(warped, inside, reference, mean_r, inverse_deviation, zero, first, second)
+            columns[:] = 0.0
+            ring[:] = 0.0
+            for y in range(-r, h):
+                add, drop, slot = y + r, y - r - 1, (y + r) % _ROWS
+                taken = blank
+                if add < h:
+                    _warp_row(flat[k], sh, sw, h_inf[k], shift[k], rhos[d], add, new, inside[slot])
+                    taken = reference[add]
+                else:
+                    new[:] = 0.0
+                left = reference[drop] if drop >= 0 else blank
+                _move_down(new, ring[slot], taken, left, cs[r : r + w], cq[r : r + w], cp[r : r + w])
+                ring[slot] = new
+                if y < 0:
+                    continue
+                row_share = np.float32(1.0 / (min(h - 1, y + r) - max(0, y - r) + 1))
+                _score_row(
+                    cs, cq, cp, share, row_share, mean[y], inverse_deviation[y], zero,
+                    inside[y % _ROWS], first[y], second[y],
+                )  # fmt: skip
         for y in range(h):
-            for x in range(w):
-                a, b = first[y, x], second[y, x]
-                # One source alone may match by chance: it counts half.
-                score = 0.5 * (a + b) if b > -1.5 else (0.5 * a if a > -1.5 else 0.0)
-                out[d, y, x] = np.uint8(min(254.0, max(0.0, 127.0 * (1.0 - score))))
+            _write_row(first[y], second[y], out[d, y])

@@ -1,0 +1,96 @@
+"""The vectorized kernels of the depth stage against plain NumPy."""
+
+import numpy as np
+import pytest
+
+from reconstruction.depth.refine import fit_slopes
+from reconstruction.depth.sweep import sweep_costs
+from reconstruction.depth.windows import make_correlate, offsets, project, source_maps
+
+H, W = 30, 41
+K = np.array([[40.0, 0, W / 2], [0, 40.0, H / 2], [0, 0, 1]])
+NOISE = 2.0
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return np.random.default_rng(0).uniform(-100, 100, (3, H, W)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def warps() -> tuple[np.ndarray, np.ndarray]:
+    """Return sources that stand to the left and to the right, turned a little."""
+    turn = np.array([[1, 0.01, 0.02], [-0.01, 1, 0.015], [-0.02, -0.015, 1]])
+    h_inf = np.stack([K @ turn @ np.linalg.inv(K), K @ turn.T @ np.linalg.inv(K)])
+    return h_inf, np.array([[0.2, 0.02, 0.03], [-0.15, 0.05, -0.02]]) @ K.T
+
+
+def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    x, y = np.clip(u - 0.5, 0, W - 1.001), np.clip(v - 0.5, 0, H - 1.001)
+    i, j = x.astype(int), y.astype(int)
+    fx, fy = x - i, y - j
+    top = image[j, i] * (1 - fx) + image[j, i + 1] * fx
+    low = image[j + 1, i] * (1 - fx) + image[j + 1, i + 1] * fx
+    return top * (1 - fy) + low * fy
+
+
+def correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> float:
+    a, b = a - (weight * a).sum(), b - (weight * b).sum()
+    va, vb = (weight * a * a).sum(), (weight * b * b).sum()
+    return float((weight * a * b).sum() / np.sqrt((va + NOISE**2) * (vb + NOISE**2)))
+
+
+def test_sweep_is_the_mean_of_the_two_best_correlations(images, warps) -> None:
+    h_inf, shift = warps
+    rhos = np.array([0.2, 0.9])
+    cost = np.empty((2, H, W), np.uint8)
+    sweep_costs(images[0], images[1:], h_inf, shift, rhos, NOISE, cost)
+    y, x = np.mgrid[:H, :W]
+    pixels = np.stack([x + 0.5, y + 0.5, np.ones((H, W))], -1)
+    for d, rho in enumerate(rhos):
+        projected = [pixels @ m.T + rho * t for m, t in zip(h_inf, shift)]
+        u, v = (np.stack([p[..., a] / p[..., 2] for p in projected]) for a in (0, 1))
+        warped = [bilinear(image, *at) for image, at in zip(images[1:], zip(u, v))]
+        seen = ((u > 0) & (u < W) & (v > 0) & (v < H)).all(0)
+        assert seen.mean() > 0.3
+        for row, column in np.argwhere(seen)[::7]:
+            box = (slice(max(0, row - 2), row + 3), slice(max(0, column - 2), column + 3))
+            weight = np.full(images[0][box].shape, 1.0 / images[0][box].size)
+            score = np.mean([correlation(images[0][box], b[box], weight) for b in warped])
+            assert cost[d, row, column] == pytest.approx(127 * (1 - score), abs=1.1)
+
+
+def test_slanted_window_correlates_as_written_out(images, warps) -> None:
+    h_inf, shift = warps
+    dx, dy = offsets(3, 2)
+    rng = np.random.default_rng(1)
+    weight = rng.uniform(0.2, 1, len(dx)).astype(np.float32)
+    weight /= weight.sum()
+    y, x, rho, gx, gy = 14, 19, 0.5, 0.01, -0.02
+    values = images[0][y + dy.astype(int), x + dx.astype(int)]
+    mean = (weight * values).sum()
+    variance = np.float32((weight * (values - mean) ** 2).sum() + NOISE**2)
+    maps = source_maps(h_inf, shift)
+    project(h_inf, y, x, maps)
+    pixels = np.stack([x + 0.5 + dx, y + 0.5 + dy, np.ones(len(dx))], 1)
+    for k in range(2):
+        at = pixels @ h_inf[k].T + (rho + gx * dx + gy * dy)[:, None] * shift[k]
+        expected = correlation(
+            values, bilinear(images[k + 1], at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]), weight
+        )
+        got = make_correlate(len(dx))(
+            weight, (weight * (values - mean)).astype(np.float32), variance, images[k + 1].ravel(), H, W,
+            maps[k], np.float32(rho), np.float32(gx), np.float32(gy), np.float32(NOISE**2), dx, dy,
+        )  # fmt: skip
+        assert got == pytest.approx(expected, abs=1e-4)
+
+
+def test_slopes_of_a_plane_are_found_and_stop_at_a_jump() -> None:
+    y, x = np.mgrid[:H, :W]
+    rho = (1.0 + 0.004 * x - 0.003 * y).astype(np.float32)
+    rho[:, 20:] += 2.0
+    fitted, gx, gy = (np.empty((H, W), np.float32) for _ in range(3))
+    fit_slopes(rho, 0.012, fitted, gx, gy)
+    assert np.abs(gx - 0.004).max() < 1e-5
+    assert np.abs(gy + 0.003).max() < 1e-5
+    assert np.abs(fitted - rho).max() < 1e-5
