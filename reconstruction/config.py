@@ -17,6 +17,7 @@ from reconstruction.assembly import ASSEMBLY_PRESETS, AssemblyConfig
 from reconstruction.assets import ASSETS_PRESETS, AssetsConfig
 from reconstruction.depth import DEPTH_PRESETS, DepthConfig
 from reconstruction.frames import FRAMES_PRESETS, FramesConfig
+from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig
 from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig
 from reconstruction.poses import POSES_PRESETS, PosesConfig
 from reconstruction.scene_graph import SCENE_GRAPH_PRESETS, SceneGraphConfig
@@ -36,6 +37,7 @@ class PipelineConfig:
     poses: PosesConfig = field(default_factory=PosesConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     world: WorldConfig = field(default_factory=WorldConfig)
+    gaussians: GaussiansConfig = field(default_factory=GaussiansConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     instances: InstancesConfig = field(default_factory=InstancesConfig)
     assets: AssetsConfig = field(default_factory=AssetsConfig)
@@ -52,6 +54,7 @@ class PipelineConfig:
             poses=POSES_PRESETS[name],
             depth=DEPTH_PRESETS[name],
             world=WORLD_PRESETS[name],
+            gaussians=GAUSSIANS_PRESETS[name],
             surface=SURFACE_PRESETS[name],
             instances=INSTANCES_PRESETS[name],
             assets=ASSETS_PRESETS[name],
@@ -77,7 +80,7 @@ class PipelineConfig:
         path, equals, value = text.partition("=")
         stage, dot, name = path.strip().partition(".")
         if not equals or not dot:
-            raise UsageError(f"--set {text}: expected stage.field=value, for example --set depth.side_px=640")
+            raise UsageError(f"--set {text}: expected stage.field=value, for example --set depth.depth_side_px=640")
         stages = [f.name for f in dataclasses.fields(self)]
         if stage not in stages:
             raise UsageError(f"--set {text}: no stage {stage!r}; the stages are {', '.join(stages)}")

@@ -1,10 +1,11 @@
 """From a video to a registered scene: the stages in order, wired, cached and measured. The first file to read.
 
-    frames -> poses -> depth -> world -> surface -> instances -> assets -> scene_graph -> assembly -> publish
+    frames -> poses -> depth -> world -> gaussians -> surface -> instances -> assets -> scene_graph -> assembly -> publish
 
 Each stage is a function from artifacts to an artifact (`reconstruction.types`) with its own config. Depth comes before
-the world frame because the depth maps' normals are what tells gravity; from `surface` on everything is in metres,
-+z up, floor at z = 0. `Run` remembers each stage's result under the fingerprint of what went into it.
+the world frame because the depth maps' normals are what tells gravity. Gaussians are fitted in the space of the
+poses, so that another scale does not ask for another fit, and correct the depth maps; from `surface` on everything is
+in metres, +z up, floor at z = 0. `Run` remembers each stage's result under the fingerprint of what went into it.
 """
 
 import importlib
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, fingerprint
 from reconstruction.compiling import compilation_shown
 from reconstruction.config import PipelineConfig
+from reconstruction.gaussians import GaussianScene
 from reconstruction.overrides import Overrides
 from reconstruction.profiling import Usage, UsageMeter
 from reconstruction.progress import NO_PROGRESS, Progress, StageListener
@@ -55,9 +57,10 @@ STAGES: tuple[Stage, ...] = (
     Stage("poses", "reconstruction.poses", PosedFrames, ("frames",)),
     Stage("depth", "reconstruction.depth", DepthMaps, ("poses",)),
     Stage("world", "reconstruction.world", WorldFrame, ("poses", "depth")),
-    Stage("surface", "reconstruction.surface", Surface, ("poses", "depth", "world")),
-    Stage("instances", "reconstruction.instances", InstanceSet, ("poses", "depth", "world", "surface")),
-    Stage("assets", "reconstruction.assets", AssetSet, ("poses", "depth", "world", "surface", "instances")),
+    Stage("gaussians", "reconstruction.gaussians", GaussianScene, ("poses", "depth")),
+    Stage("surface", "reconstruction.surface", Surface, ("poses", "gaussians", "world")),
+    Stage("instances", "reconstruction.instances", InstanceSet, ("poses", "gaussians", "world", "surface")),
+    Stage("assets", "reconstruction.assets", AssetSet, ("poses", "gaussians", "world", "surface", "instances")),
     Stage("scene_graph", "reconstruction.scene_graph", SceneGraph, ("assets",)),
     Stage("assembly", "reconstruction.assembly", AssembledScene, ("assets", "scene_graph")),
 )
@@ -144,6 +147,10 @@ class Run:
             return module.estimate_depth(done["poses"], config, progress=progress)
         if stage.name == "world":
             return module.find_world(done["poses"], done["depth"], config, progress=progress)
+        if stage.name == "gaussians":
+            if self.oracle is not None and "depth" in self.oracle.stages:
+                config = replace(config, refine_depth=False)  # the truth has nothing to gain
+            return module.make_gaussians(done["poses"], done["depth"], config, progress=progress)
         if stage.name == "scene_graph":
             graph = module.infer_scene_graph(done["assets"], config, progress=progress)
             return self.overrides.apply_to_graph(graph, done["assets"])
@@ -178,9 +185,10 @@ class Run:
         return self.oracle.instances(*self.in_world(), done["surface"])
 
     def in_world(self) -> tuple[PosedFrames, DepthMaps]:
-        """Return the posed frames and depth maps in world space, in metres."""
+        """Return the posed frames and the depth maps that the Gaussians corrected, in world space, in metres."""
         world: WorldFrame = self.results["world"]
-        return world.apply_to(self.results["poses"]), world.scale_depth(self.results["depth"])
+        scene: GaussianScene = self.results["gaussians"]
+        return world.apply_to(scene.posed(self.results["poses"])), world.scale_depth(scene.depth)
 
 
 class _NoteTaker:

@@ -15,6 +15,7 @@ import numpy as np
 from reconstruction.assembly import base_slabs
 from reconstruction.assets.gltf import write_glb, write_obj
 from reconstruction.cache import canonical_json
+from reconstruction.gaussians import write_ply
 from reconstruction.preview import render_preview
 from reconstruction.profiling import OTHER, PUBLISH, Usage, UsageMeter
 from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
@@ -87,6 +88,7 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "base": [_base(item, folder) for item in assets.base],
         "objects": [_object(item, placed[item.id], item.id in attached, folder) for item in assets.objects],
         "graph": {"edges": [dataclasses.asdict(edge) for edge in assembled.graph.edges]},
+        "gaussians": _gaussians(run, folder),
         "report": _report(run),
     }
     picture = render_preview(assets, assembled, posed)
@@ -133,6 +135,12 @@ def _cameras(posed: PosedFrames) -> dict:
         "params": [camera.fx, camera.fy, camera.cx, camera.cy],
         "frames": frames,
     }
+
+
+def _gaussians(run: "Run", folder: Path) -> dict:
+    gaussians = run.results["gaussians"].in_world(run.results["world"])
+    write_ply(gaussians, folder / "gaussians.ply")
+    return {"file": "gaussians.ply", "count": len(gaussians)}
 
 
 def _base(item: BaseAsset, folder: Path) -> dict:
@@ -241,6 +249,7 @@ def _backends(run: "Run") -> dict[str, str]:
     backends = {
         "poses": "pycolmap",
         "depth": "plane-sweep",
+        "gaussians": run.config.gaussians.backend,
         "assets": "embedded",
         "relations": "geometry",
     }

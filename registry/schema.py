@@ -62,6 +62,8 @@ def validate_scene(scene: Any) -> None:
     graph = _mapping(_get(scene, "graph", ""), "graph")
     _edges(_sequence(_get(graph, "edges", "graph"), "graph.edges"), base_ids, object_ids)
     _report(_mapping(_get(scene, "report", ""), "report"))
+    if "gaussians" in scene:  # bundles of before had none
+        _path(_mapping(scene["gaussians"], "gaussians"), "file", "gaussians", ".ply")
 
 
 def referenced_files(scene: dict) -> dict[str, str]:
@@ -73,6 +75,8 @@ def referenced_files(scene: dict) -> dict[str, str]:
     for i, item in enumerate(scene["objects"]):
         found[item["visual"]] = f"objects[{i}].visual"
         found.update({path: f"objects[{i}].collision[{k}]" for k, path in enumerate(item["collision"])})
+    if "gaussians" in scene:
+        found[scene["gaussians"]["file"]] = "gaussians.file"
     return found
 
 

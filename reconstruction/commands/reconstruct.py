@@ -22,7 +22,7 @@ metric scale, best first:
 examples:
   simrecon reconstruct room.mp4
   simrecon reconstruct room.mp4 --scene kitchen --preset quality
-  simrecon reconstruct photos/ --scene dorm --set depth.side_px=640
+  simrecon reconstruct photos/ --scene dorm --set depth.depth_side_px=640
 """
 
 
@@ -53,7 +53,10 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--preset", choices=("fast", "default", "quality"), default="default")
     parser.add_argument(
-        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where stages compute"
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="where Gaussians are fitted: cuda needs gsplat; auto takes it where it is there (default)",
     )
     parser.add_argument("--scale", metavar="HOW", help="where metres come from; see below")
     parser.add_argument(
@@ -101,7 +104,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(
             f"--keep-results {arguments.keep_results}: at least 1 result of each stage is needed"
         )
-    _check_device(arguments.device)
     from reconstruction.commands.reporting import make_listener
     from reconstruction.overrides import Overrides
     from reconstruction.pipeline import reconstruct
@@ -140,28 +142,35 @@ def _oracle(arguments: argparse.Namespace) -> object | None:
     return Oracle.load(stages, arguments.ground_truth)
 
 
-def _check_device(device: str) -> None:
-    """Refuse `--device cuda` where there is none. Every embedded stage computes on the CPU either way."""
-    if device != "cuda":
-        return
+def _gaussians_backend(device: str) -> str:
+    """Choose the rasterizer: gsplat for cuda, and for auto where both are there; every other stage uses the CPU.
+
+    Raises:
+        EnvironmentMissing: `--device cuda` and something that it needs is not there.
+    """
+    from importlib.util import find_spec
+
+    if device == "cpu" or (device == "auto" and find_spec("gsplat") is None):
+        return "cpu"
+    from reconstruction.gaussians.backends import load_backend
     from registry.errors import EnvironmentMissing
 
     try:
-        import torch
-    except ImportError as error:
-        raise EnvironmentMissing("--device cuda: torch is not installed; see `simrecon doctor`") from error
-    if not torch.cuda.is_available():
+        return load_backend("gsplat").name
+    except EnvironmentMissing as error:
+        if device == "auto":
+            return "cpu"
         raise EnvironmentMissing(
-            "--device cuda: torch finds no CUDA device. Leave --device out to compute on the CPU, or install a CUDA "
-            "build of torch; see docs/install.md."
-        )
+            f"--device cuda: {error}. Leave --device out to compute on the CPU; docs/install.md says how to install "
+            "a CUDA build of torch"
+        ) from error
 
 
 def _config(arguments: argparse.Namespace) -> object:
     from reconstruction.config import PipelineConfig
 
     config = PipelineConfig.from_preset(arguments.preset).with_seed(arguments.seed)
-    options = list(arguments.set)
+    options = [f"gaussians.backend={_gaussians_backend(arguments.device)}", *arguments.set]
     if arguments.scale:
         options.append(f"world.scale={arguments.scale}")
     if arguments.marker_size is not None:

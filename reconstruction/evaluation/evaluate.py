@@ -100,6 +100,7 @@ def evaluate_scene(
         lambda: _physics(bundle, out),
         lambda: _rendering(bundle, scene, stages, _video_of(video, ground_truth), out),
     ]
+    alignment = None
     if truth is not None:
         alignment = align(bundle_poses(bundle), truth.world_from_camera, truth.up)
         moved = [mesh.moved(alignment.true_from_estimated) for mesh in scene]
@@ -111,6 +112,7 @@ def evaluate_scene(
         ]
     else:
         out.left_out["cameras, geometry, objects, graph"] = "no ground truth was given"
+    parts.append(lambda: _gaussians(truth, alignment, stages, out))
     progress.start(len(parts), "measuring")
     for part in parts:
         part()
@@ -353,6 +355,19 @@ def _stage_figures(truth: GroundTruth, stages: StageResults, alignment: Alignmen
             out.stages["instances"] = {"surface": on_surface, "per_view": per_view}
         else:
             out.left_out["stage instances"] = "the truth has no entities"
+
+
+def _gaussians(
+    truth: GroundTruth | None, alignment: Alignment | None, stages: StageResults, out: Evaluation
+) -> None:
+    """Kept-out frames as the Gaussians show them, which needs no truth; their depth against it where there is one."""
+    from reconstruction.evaluation import stages as figures
+
+    posed, _ = stages.in_world()
+    gaussians, depth = stages.refined_in_world()
+    if posed is None or gaussians is None:
+        return
+    out.stages["gaussians"] = figures.gaussians_figures(posed, gaussians, depth, alignment, truth)
 
 
 def _keep(out: Evaluation, stage: str, figures: dict | None, reason: str) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction import artifacts
+from reconstruction.gaussians import Gaussians
 from reconstruction.pipeline import STAGES
 from reconstruction.types import DepthMaps, PosedFrames, WorldFrame
 from registry import SceneBundle
@@ -59,12 +60,19 @@ class StageResults:
         return self._loaded[stage]
 
     def in_world(self) -> tuple[PosedFrames | None, DepthMaps | None]:
-        """Return posed frames and depth maps in world space, in metres; None for what is missing."""
+        """Return posed frames and depth maps as measured, in world space, in metres; None for what is missing."""
         world: WorldFrame | None = self.get("world")
         posed, depth = self.get("poses"), self.get("depth")
         if world is None:
             return None, None
         return posed and world.apply_to(posed), depth and world.scale_depth(depth)
+
+    def refined_in_world(self) -> tuple[Gaussians | None, DepthMaps | None]:
+        """Return the Gaussians and the depth maps that they corrected, in world space, in metres."""
+        world, scene = self.get("world"), self.get("gaussians")
+        if world is None or scene is None:
+            return None, None
+        return scene.in_world(world), world.scale_depth(scene.depth)
 
 
 def _noted_keys(folder: Path, bundle: SceneBundle) -> dict[str, str]:

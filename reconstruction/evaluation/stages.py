@@ -11,6 +11,7 @@ from reconstruction.evaluation.matching import match
 from reconstruction.evaluation.scene import joined
 from reconstruction.evaluation.surfaces import Samples, compare, sample_seen
 from reconstruction.evaluation.visibility import spread_poses
+from reconstruction.gaussians import Gaussians, evaluate_gaussians
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import DepthMaps, InstanceSet, PosedFrames, Surface
 from registry.geometry import transform_points
@@ -63,6 +64,42 @@ def depth_figures(
         "completed_median_rel": float(np.median(error[~sure])) if (~sure).any() else float("nan"),
         "frames": len(rows),
     }
+
+
+def gaussians_figures(
+    posed: PosedFrames,
+    gaussians: Gaussians,
+    depth: DepthMaps,
+    alignment: Alignment | None,
+    truth: GroundTruth | None,
+) -> dict[str, float | int | dict]:
+    """Kept-out frames as the Gaussians show them, over all pixels, at the frames' working resolution.
+
+    Where the truth has depth, the median relative error of their expected depth in those frames beside it; where it
+    has meshes, the figures of the keyframes' depth maps after the correction under `depth_maps`.
+    """
+    true_depth = None
+    if truth is not None and alignment is not None:
+        maps = [truth.depth(int(index)) for index in posed.held_out_indices]
+        blank = next((np.zeros_like(d) for d in maps if d is not None), None)
+        if blank is not None:
+            true_depth = np.stack([blank if d is None else d / alignment.scale for d in maps])
+    out: dict[str, float | int | dict] = {"count": len(gaussians), "frames": len(posed.held_out_images)}
+    if len(posed.held_out_images):
+        shown = evaluate_gaussians(gaussians, posed, true_depth)
+        out |= {
+            "psnr_db": shown.mean_psnr_db,
+            "worst_psnr_db": float(shown.psnr_db.min()),
+            "ssim": shown.mean_ssim,
+            "coverage": float(shown.coverage.mean()),
+        }
+        if true_depth is not None:
+            out["depth_median_rel"] = shown.median_depth_error
+    if truth is not None and alignment is not None:
+        corrected = depth_figures(posed, depth, alignment, truth)
+        if corrected is not None:
+            out["depth_maps"] = corrected
+    return out
 
 
 def surface_depth_figures(

@@ -42,13 +42,16 @@ _STAGE_ROWS: tuple[tuple[str, str, str, str], ...] = (
     ("depth", "share_over_5_percent", "{:.1%}", "pixels off by more than 5 %"),
     ("depth", "known_share", "{:.0%}", "pixels that have depth"),
     ("depth", "measured_share", "{:.0%}", "... that is measured rather than completed"),
+    ("gaussians", "psnr_db", "{:.2f} dB", "kept-out frames drawn from the Gaussians"),
+    ("gaussians", "worst_psnr_db", "{:.2f} dB", "... the worst of them"),
+    ("gaussians", "depth_median_rel", "{:.2%}", "median relative depth error on kept-out frames"),
+    ("gaussians", "depth_maps.median_rel", "{:.2%}", "... of the corrected depth maps"),
+    ("gaussians", "depth_maps.share_over_5_percent", "{:.1%}", "pixels of them off by more than 5 %"),
     ("surface", "cd_cm", "{:.2f} cm", "Chamfer distance before objects are cut out"),
     ("surface", "f_5cm", "{:.1f} %", "F-score at 5 cm"),
     ("surface", "nc", "{:.1f} %", "normal consistency"),
     ("surface", "depth_median_rel", "{:.2%}", "median relative depth error on kept-out frames"),
     ("surface", "depth_share_over_5_percent", "{:.1%}", "pixels off by more than 5 %"),
-    ("gaussians", "psnr_db", "{:.2f} dB", "kept-out frames"),
-    ("gaussians", "depth_median_rel", "{:.2%}", "median relative depth error"),
     ("assembly", "median_moved_cm", "{:.2f} cm", "objects moved by, median"),
     ("assembly", "max_moved_cm", "{:.2f} cm", "objects moved by, at most"),
 )
@@ -94,7 +97,9 @@ def _objects(evaluation: Evaluation) -> list[str]:
 def _stages(evaluation: Evaluation) -> list[str]:
     lines = []
     for stage, name, form, meaning in _STAGE_ROWS:
-        value = evaluation.stages.get(stage, {}).get(name)
+        value = evaluation.stages.get(stage, {})
+        for key in name.split("."):
+            value = value.get(key) if isinstance(value, dict) else None
         if value is not None:
             lines.append(f"  {stage:<10} {name:<26} {form.format(value):>10}   {meaning}")
     for part, figures in (evaluation.stages.get("instances") or {}).items():

@@ -1,4 +1,4 @@
-"""Posed frames and depth maps -> 2D Gaussians (Huang et al. 2024), fitted on the CPU or with gsplat.
+"""Stage 5: posed frames and depth maps -> 2D Gaussians (Huang et al. 2024), fitted on the CPU or with gsplat.
 
 `import reconstruction.gaussians` is light; what needs a compiler is imported when it is first used.
 """
@@ -6,16 +6,18 @@
 from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig
 from reconstruction.gaussians.evaluate import GaussiansEvaluation, evaluate_gaussians
 from reconstruction.gaussians.fit import fit_gaussians
-from reconstruction.gaussians.model import Gaussians
+from reconstruction.gaussians.model import Gaussians, moved
 from reconstruction.gaussians.ply import read_ply, write_ply
 from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.rendering import Render, render_gaussians
+from reconstruction.gaussians.stage import GaussianScene, make_gaussians
 
-VERSION = 1
+VERSION = 2
 
 __all__ = [
     "GAUSSIANS_PRESETS",
     "VERSION",
+    "GaussianScene",
     "Gaussians",
     "GaussiansConfig",
     "GaussiansEvaluation",
@@ -23,6 +25,8 @@ __all__ = [
     "Render",
     "evaluate_gaussians",
     "fit_gaussians",
+    "make_gaussians",
+    "moved",
     "read_ply",
     "render_gaussians",
     "write_ply",

@@ -11,7 +11,7 @@ class GaussiansConfig:
     backend: Literal["cpu", "gsplat"] = "cpu"
     """Rasterizer: `cpu` is built in; `gsplat` needs CUDA and the extra `simrecon[gpu]`."""
 
-    iterations: int = 700
+    iterations: int = 450
     """Gradient steps in all, one frame each."""
 
     side_px: int = 480
@@ -95,6 +95,15 @@ class GaussiansConfig:
     prune_opacity: float = 0.05
     """Gaussians less opaque than this are removed."""
 
+    refine_depth: bool = True
+    """Hand the depth of the Gaussians on to the later stages instead of the measured one."""
+
+    clear_depth: float = 0.01
+    """Relative difference of expected and median depth up to which a pixel shows one surface."""
+
+    confirmed_depth: float = 0.02
+    """Where it shows several: relative difference to the median depth up to which the measured depth is kept."""
+
     sigma_cutoff: float = 3.0
     """Standard deviations at which a splat ends."""
 
@@ -118,7 +127,7 @@ class GaussiansConfig:
 
 
 GAUSSIANS_PRESETS: dict[str, GaussiansConfig] = {
-    "fast": GaussiansConfig(iterations=400, side_px=320, coarse_side_px=240, max_gaussians=30_000),
+    "fast": GaussiansConfig(iterations=250, side_px=320, coarse_side_px=240, max_gaussians=30_000),
     "default": GaussiansConfig(),
-    "quality": GaussiansConfig(iterations=3000, side_px=640, max_gaussians=120_000),
+    "quality": GaussiansConfig(iterations=2000, side_px=640, max_gaussians=120_000),
 }

@@ -1,8 +1,10 @@
 """The Gaussians as an artifact, and the packed form that kernels work on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from registry.geometry import matrix_from_quat, quat_from_matrix, split_similarity
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 * coefficient
 N_PARAMETERS = 13  # mean 3, quaternion 4, log scales 2, opacity logit 1, color 3
@@ -71,4 +73,23 @@ def from_packed(
         exposure_gain=np.ones((frames, 3), np.float32) if exposure_gain is None else exposure_gain,
         exposure_bias=np.zeros((frames, 3), np.float32) if exposure_bias is None else exposure_bias,
         world_from_camera=np.zeros((0, 4, 4)) if world_from_camera is None else world_from_camera,
+    )
+
+
+def moved(gaussians: Gaussians, b_from_a: np.ndarray) -> Gaussians:
+    """Return the Gaussians, with their cameras, in space b; b_from_a (4, 4) is a similarity.
+
+    Colors of degree 0 do not depend on the direction, so a rotation leaves them.
+    """
+    scale, rotation, translation = split_similarity(b_from_a)
+    axes = rotation @ matrix_from_quat(gaussians.quaternions)
+    poses = np.array(gaussians.world_from_camera, np.float64)
+    poses[:, :3, :3] = rotation @ poses[:, :3, :3]
+    poses[:, :3, 3] = scale * poses[:, :3, 3] @ rotation.T + translation
+    return replace(
+        gaussians,
+        means=(scale * gaussians.means @ rotation.T + translation).astype(np.float32),
+        quaternions=quat_from_matrix(axes).astype(np.float32),
+        log_scales=(gaussians.log_scales + np.log(scale)).astype(np.float32),
+        world_from_camera=poses,
     )

@@ -9,6 +9,7 @@ import numpy as np
 from reconstruction.evaluation.scene import PlacedMesh, placed_meshes
 from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.report.drawing import object_color
+from reconstruction.gaussians import Gaussians
 from reconstruction.types import (
     AssembledScene,
     AssetSet,
@@ -56,10 +57,19 @@ class Gathered:
         """Keyframes and kept-out frames with cameras, in world space."""
         return self._in_world[0]
 
+    @cached_property
+    def _refined(self) -> tuple[Gaussians | None, DepthMaps | None]:
+        return self.stages.refined_in_world()
+
+    @property
+    def gaussians(self) -> Gaussians | None:
+        """The Gaussians in world space, in metres."""
+        return self._refined[0]
+
     @property
     def depth(self) -> DepthMaps | None:
-        """Depth maps in metres."""
-        return self._in_world[1]
+        """Depth maps in metres: those that the Gaussians corrected, or, where they are gone, as measured."""
+        return self._refined[1] or self._in_world[1]
 
     @property
     def surface(self) -> Surface | None:

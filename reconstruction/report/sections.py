@@ -33,7 +33,7 @@ def all_sections(g: Gathered) -> list[Section]:
     from reconstruction.report.report_card import cost_section, notes_section, physics_section
 
     makers = (
-        truth_section, cameras_section, depth_section,  surface_section, instances_section,
+        truth_section, cameras_section, depth_section, gaussians_section, surface_section, instances_section,
         objects_section, graph_section, assembly_section, kept_out_section, physics_section, cost_section,
         notes_section,
     )  # fmt: skip
@@ -290,6 +290,26 @@ def assembly_section(g: Gathered) -> Section:
         text = "Second row: how far the scene is from the true surface. Third: the other way around."
         blocks += [Text(text), _distance_legend()]
     return Section("assembly", "Assembly", blocks)
+
+
+def gaussians_section(g: Gathered) -> Section:
+    """Color, depth and normals of the Gaussians at the cameras of kept-out frames."""
+    section = Section("gaussians", "Gaussians", [])
+    if g.posed is None or g.gaussians is None:
+        section.blocks.append(left_out("The Gaussians", g.why_missing("poses", "world", "gaussians")))
+        return section
+    if not len(g.posed.held_out_indices):
+        section.blocks.append(left_out("The Gaussians", "no kept-out frame could be registered"))
+        return section
+    heads = ["frame", "color", "depth", "normals"]
+    section.blocks.append(Pictures(pictures.gaussian_rows(g), len(heads), heads, phone_columns=2))
+    section.blocks.append(
+        Text(
+            f"{len(g.gaussians):,} disks, fitted to the keyframes and drawn at the cameras of frames that they were "
+            "never shown. Normals have world axes as colors."
+        )
+    )
+    return section
 
 
 def kept_out_section(g: Gathered) -> Section:

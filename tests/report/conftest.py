@@ -14,6 +14,7 @@ from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
 from reconstruction.evaluation.evaluate import evaluate_scene
 from reconstruction.evaluation.stage_results import StageResults
+from reconstruction.gaussians import GaussiansConfig, make_gaussians
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.pipeline import STAGES, Run
 from reconstruction.profiling import Usage
@@ -28,6 +29,7 @@ from registry import SceneBundle, SceneRegistry
 
 SCENE = "small_room"
 THINGS = ("table", "mug", "box", "picture")
+FEW_GAUSSIANS = GaussiansConfig(iterations=60, side_px=192, coarse_side_px=128, max_gaussians=6000)
 SFM_SCALE = 0.5  # sfm units per metre: what is shown must be in metres all the same
 
 
@@ -95,6 +97,7 @@ def reconstructed(tmp_path_factory) -> Reconstructed:
         "poses": posed,
         "depth": depth,
         "world": world,
+        "gaussians": make_gaussians(posed, depth, FEW_GAUSSIANS),
         "surface": surface,
         "instances": found,
         "assets": assets,

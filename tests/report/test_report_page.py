@@ -20,7 +20,7 @@ from reconstruction.report.collect import gather
 from reconstruction.report.page import build_page
 from reconstruction.report.truth import Truth
 
-SECTIONS = ["cameras", "depth", "surface", "instances", "objects", "graph", "assembly", "kept-out", "physics"]
+SECTIONS = ["cameras", "depth", "gaussians", "surface", "instances", "objects", "graph", "assembly", "kept-out", "physics"]
 SECTIONS += ["cost", "notes"]
 
 
@@ -93,7 +93,7 @@ def test_gone_stage_results_are_named_and_the_rest_is_shown(reconstructed, tmp_p
     kept = tmp_path / "work"
     shutil.copytree(reconstructed.home / "work", kept)
     (folder,) = kept.iterdir()
-    for stage in ("depth", "instances"):
+    for stage in ("depth", "gaussians", "instances"):
         (gone,) = folder.glob(f"*_{stage}-*")
         shutil.rmtree(gone)
     page = build_page(bundle, StageResults.find(bundle, tmp_path / "registry"))
@@ -107,7 +107,7 @@ def test_gone_stage_results_are_named_and_the_rest_is_shown(reconstructed, tmp_p
 def test_a_bundle_alone_gives_a_page(reconstructed):
     bundle, _ = reconstructed.open()
     stages = StageResults(
-        {}, dict.fromkeys(("poses", "depth", "world", "surface", "instances", "assets"), "gone")
+        {}, dict.fromkeys(("poses", "depth", "world", "gaussians", "surface", "instances", "assets"), "gone")
     )
     page = build_page(bundle, stages)
     assert len(left_out(page)) >= 6
