@@ -102,7 +102,7 @@ class GaussiansConfig:
     """Relative difference of expected and median depth up to which a pixel shows one surface."""
 
     confirmed_depth: float = 0.02
-    """Where it shows several: relative difference to the median depth up to which the measured depth is kept."""
+    """Where it shows several: relative difference to one of the two up to which the measured depth is kept."""
 
     sigma_cutoff: float = 3.0
     """Standard deviations at which a splat ends."""

@@ -23,8 +23,8 @@ def rendered_depth_maps(
     """Return the depth maps with the depth of the Gaussians where it is unambiguous.
 
     A pixel takes the expected depth where expected and median depth agree, that is where one surface stops the
-    light. Elsewhere (at outlines the expected depth lies between two surfaces) it keeps its own depth if the median
-    depth confirms it, and becomes unknown if not. Pixels that were unknown stay so: what Gaussians show there was
+    light. Elsewhere (at outlines the expected depth lies between two surfaces) it keeps its own depth if either of
+    them confirms it, and becomes unknown if not. Pixels that were unknown stay so: what Gaussians show there was
     never measured in this view. Confidence is that of the input.
 
     Args:
@@ -60,5 +60,5 @@ def _choose(
     own: np.ndarray, expected: np.ndarray, median: np.ndarray, opacity: np.ndarray, config: GaussiansConfig
 ) -> np.ndarray:
     clear = (opacity > _SOLID) & (np.abs(expected - median) < config.clear_depth * expected)
-    confirmed = np.abs(median - own) < config.confirmed_depth * own
+    confirmed = np.minimum(np.abs(median - own), np.abs(expected - own)) < config.confirmed_depth * own
     return np.where(clear, expected, np.where(confirmed | (opacity <= _SOLID), own, 0))
