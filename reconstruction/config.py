@@ -80,7 +80,9 @@ class PipelineConfig:
         path, equals, value = text.partition("=")
         stage, dot, name = path.strip().partition(".")
         if not equals or not dot:
-            raise UsageError(f"--set {text}: expected stage.field=value, for example --set depth.depth_side_px=640")
+            raise UsageError(
+                f"--set {text}: expected stage.field=value, for example --set depth.depth_side_px=640"
+            )
         stages = [f.name for f in dataclasses.fields(self)]
         if stage not in stages:
             raise UsageError(f"--set {text}: no stage {stage!r}; the stages are {', '.join(stages)}")

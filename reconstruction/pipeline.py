@@ -1,6 +1,7 @@
 """From a video to a registered scene: the stages in order, wired, cached and measured. The first file to read.
 
-    frames -> poses -> depth -> world -> gaussians -> surface -> instances -> assets -> scene_graph -> assembly -> publish
+    frames -> poses -> depth -> world -> gaussians -> surface
+    -> instances -> assets -> scene_graph -> assembly -> publish
 
 Each stage is a function from artifacts to an artifact (`reconstruction.types`) with its own config. Depth comes before
 the world frame because the depth maps' normals are what tells gravity. Gaussians are fitted in the space of the
@@ -60,7 +61,9 @@ STAGES: tuple[Stage, ...] = (
     Stage("gaussians", "reconstruction.gaussians", GaussianScene, ("poses", "depth")),
     Stage("surface", "reconstruction.surface", Surface, ("poses", "gaussians", "world")),
     Stage("instances", "reconstruction.instances", InstanceSet, ("poses", "gaussians", "world", "surface")),
-    Stage("assets", "reconstruction.assets", AssetSet, ("poses", "gaussians", "world", "surface", "instances")),
+    Stage(
+        "assets", "reconstruction.assets", AssetSet, ("poses", "gaussians", "world", "surface", "instances")
+    ),
     Stage("scene_graph", "reconstruction.scene_graph", SceneGraph, ("assets",)),
     Stage("assembly", "reconstruction.assembly", AssembledScene, ("assets", "scene_graph")),
 )

@@ -43,14 +43,16 @@ def rendered_depth_maps(
         render = backend.render(parameters, depth.camera, pose, settings)
         own = np.asarray(depth.depth[row])
         has = (own > 0) & (np.asarray(depth.confidence[row]) > 0)
-        refined[row] = np.where(has, _choose(own, render.depth, render.median_depth, render.opacity, config), 0)
+        refined[row] = np.where(
+            has, _choose(own, render.depth, render.median_depth, render.opacity, config), 0
+        )
         known += int(has.sum())
         changed += int((has & (np.abs(refined[row] - own) > config.clear_depth * own)).sum())
         dropped += int((has & (refined[row] == 0)).sum())
         progress.advance()
     confidence = np.where(refined > 0, depth.confidence, 0).astype(np.uint8)
     progress.note(
-        f"gaussians: {100 * dropped / max(known, 1):.1f} % of the known depth dropped as contradicted by the Gaussians, "
+        f"gaussians: {100 * dropped / max(known, 1):.1f} % of the known depth contradicted and dropped, "
         f"{100 * (changed - dropped) / max(known, 1):.1f} % moved by more than {100 * config.clear_depth:g} %"
     )
     return DepthMaps(depth.camera, refined, confidence)

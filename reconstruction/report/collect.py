@@ -8,8 +8,8 @@ import numpy as np
 
 from reconstruction.evaluation.scene import PlacedMesh, placed_meshes
 from reconstruction.evaluation.stage_results import StageResults
-from reconstruction.report.drawing import object_color
 from reconstruction.gaussians import Gaussians
+from reconstruction.report.drawing import object_color
 from reconstruction.types import (
     AssembledScene,
     AssetSet,

@@ -5,7 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from reconstruction.gaussians import GaussiansConfig, make_gaussians, moved, read_ply, render_gaussians, write_ply
+from reconstruction.gaussians import (
+    GaussiansConfig,
+    make_gaussians,
+    moved,
+    read_ply,
+    render_gaussians,
+    write_ply,
+)
 from reconstruction.pipeline import STAGES
 from reconstruction.types import DepthMaps
 from registry.geometry import matrix_from_quat

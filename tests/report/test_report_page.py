@@ -20,7 +20,18 @@ from reconstruction.report.collect import gather
 from reconstruction.report.page import build_page
 from reconstruction.report.truth import Truth
 
-SECTIONS = ["cameras", "depth", "gaussians", "surface", "instances", "objects", "graph", "assembly", "kept-out", "physics"]
+SECTIONS = [
+    "cameras",
+    "depth",
+    "gaussians",
+    "surface",
+    "instances",
+    "objects",
+    "graph",
+    "assembly",
+    "kept-out",
+    "physics",
+]
 SECTIONS += ["cost", "notes"]
 
 
