@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from registry.errors import BundleError
+
 T = TypeVar("T")
 _MMAP_ABOVE_BYTES = 1 << 22
 
@@ -45,7 +47,11 @@ def save(value: Any, folder: Path) -> None:
 
 
 def load(cls: type[T], folder: Path) -> T:
-    """Read what `save` wrote as an instance of `cls`."""
+    """Read what `save` wrote as an instance of `cls`.
+
+    Raises:
+        BundleError: it was written by a version of the program whose dataclass has other fields.
+    """
 
     def decode(hint: Any, item: Any) -> Any:
         origin = typing.get_origin(hint)
@@ -55,6 +61,8 @@ def load(cls: type[T], folder: Path) -> T:
             return decode(next(a for a in typing.get_args(hint) if a is not type(None)), item)
         if dataclasses.is_dataclass(hint):
             hints = typing.get_type_hints(hint)
+            if set(item) != {f.name for f in dataclasses.fields(hint)}:
+                raise BundleError(f"{folder}: its {hint.__name__} is of another version of the program")
             return hint(**{f.name: decode(hints[f.name], item[f.name]) for f in dataclasses.fields(hint)})
         if hint is np.ndarray:
             path = folder / f"{item['array']:05d}.npy"

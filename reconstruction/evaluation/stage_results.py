@@ -10,6 +10,7 @@ from reconstruction.gaussians import Gaussians
 from reconstruction.pipeline import STAGES
 from reconstruction.types import DepthMaps, PosedFrames, WorldFrame
 from registry import SceneBundle
+from registry.errors import BundleError
 
 _MANIFEST = "manifest.json"
 
@@ -56,7 +57,12 @@ class StageResults:
             return None
         if stage not in self._loaded:
             kind = next(s.produces for s in STAGES if s.name == stage)
-            self._loaded[stage] = artifacts.load(kind, self.folders[stage])
+            try:
+                self._loaded[stage] = artifacts.load(kind, self.folders[stage])
+            except BundleError as error:
+                self.missing[stage] = f"{error}; reconstruct the scene again to have it"
+                del self.folders[stage]
+                return None
         return self._loaded[stage]
 
     def in_world(self) -> tuple[PosedFrames | None, DepthMaps | None]:

@@ -1,5 +1,7 @@
 """Artifacts survive a round trip bit for bit."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from reconstruction.types import (
     SpaceGrid,
     Surface,
 )
+from registry.errors import BundleError
 
 
 def _assembled() -> AssembledScene:
@@ -73,3 +76,12 @@ def test_non_finite_plain_numbers_are_refused(tmp_path):
     )
     with pytest.raises(ValueError, match="JSON"):
         artifacts.save(surface, tmp_path / "s")
+
+
+def test_what_another_version_wrote_is_refused_in_one_sentence(tmp_path):
+    artifacts.save(_assembled(), tmp_path / "a")
+    data = json.loads((tmp_path / "a" / "data.json").read_text())
+    del data["placed"][0]["repair"]
+    (tmp_path / "a" / "data.json").write_text(json.dumps(data))
+    with pytest.raises(BundleError, match="PlacedObject is of another version"):
+        artifacts.load(AssembledScene, tmp_path / "a")
