@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, fingerprint
 from reconstruction.compiling import compilation_shown
 from reconstruction.config import PipelineConfig
@@ -29,18 +31,22 @@ from reconstruction.types import (
     DepthMaps,
     FrameSet,
     InstanceSet,
+    ObjectAsset,
     PosedFrames,
     SceneGraph,
     Surface,
     WorldFrame,
 )
 from registry import SceneRecord, SceneRegistry
-from registry.errors import UsageError
+from registry.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from reconstruction.oracle import Oracle
 
 logger = logging.getLogger(__name__)
+
+_OBJECT_SCALE_PASSES = 3
+_OBJECT_SCALE_TOLERANCE = 0.015  # half of what the scale is said to be sure to
 
 
 @dataclass(frozen=True)
@@ -285,21 +291,55 @@ def reconstruct(
 
 
 def _with_object_scale(run: Run) -> Run:
-    """Apply `--scale object:ID.height=H`: its height in the provisional scale gives the factor; then run again."""
-    from reconstruction.world import parse_scale
+    """Apply `--scale object:ID.height=H`: run again at the scale that its height asks for, until it is that high."""
+    from reconstruction.world import parse_scale, settle_object_height
 
     request = parse_scale(run.config.world.scale) if run.config.world.scale else None
-    if request is None or request.kind != "object":
+    if request is None or request.kind != "object" or run.results["world"].scale.method == "marker":
         return run
-    assets: AssetSet = run.results["assets"]
-    found = [item for item in assets.objects if item.id == request.object_id]
+    found = [item for item in run.results["assets"].objects if item.id == request.object_id]
     if not found:
-        ids = ", ".join(f"{item.id} ({item.label})" for item in assets.objects)
+        ids = ", ".join(f"{item.id} ({item.label})" for item in run.results["assets"].objects)
         raise UsageError(
             f"--scale {run.config.world.scale}: no object {request.object_id}; there are {ids or 'none'}"
         )
-    measured_m = float(found[0].visual.vertices[:, 2].max() - found[0].visual.vertices[:, 2].min())
-    world = replace(run.config.world, object_measured_height_m=measured_m)
-    again = replace(run, config=replace(run.config, world=world), results={}, keys={}, usage={}, notes=[])
-    again.execute()
+    place = _place_in_sfm(run, found[0])
+    passes: dict[float, Run] = {}
+
+    def height_at(measured_m: float) -> float:
+        world = replace(run.config.world, object_measured_height_m=measured_m)
+        again = replace(run, config=replace(run.config, world=world), results={}, keys={}, usage={}, notes=[])
+        again.execute()
+        passes[measured_m] = again
+        objects = again.results["assets"].objects
+        if not objects:
+            raise InputError(
+                f"--scale {run.config.world.scale}: at that scale nothing is found any more. Is it in metres?"
+            )
+        # Ids are given by size and may change with the scale; the place stays.
+        return _height(min(objects, key=lambda item: np.linalg.norm(_place_in_sfm(again, item) - place)))
+
+    best, error = settle_object_height(
+        _height(found[0]),
+        request.value_m,
+        height_at,
+        tolerance=_OBJECT_SCALE_TOLERANCE,
+        passes=_OBJECT_SCALE_PASSES,
+    )
+    again = passes[best]
+    if best != list(passes)[-1]:
+        again.results, again.keys, again.usage, again.notes = {}, {}, {}, []
+        again.execute()
+    again.notes.append(
+        f"world: object {request.object_id} ends {error:.1%} off the {request.value_m:g} m asked for"
+    )
     return again
+
+
+def _height(item: ObjectAsset) -> float:
+    return float(np.ptp(item.visual.vertices[:, 2]))
+
+
+def _place_in_sfm(run: Run, item: ObjectAsset) -> np.ndarray:
+    """Return where an object is in sfm space, which the scale does not change."""
+    return np.linalg.solve(run.results["world"].world_from_sfm, item.world_from_object[:, 3])[:3]

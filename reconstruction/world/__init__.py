@@ -2,9 +2,10 @@
 
 from reconstruction.world.config import WORLD_PRESETS, WorldConfig
 from reconstruction.world.frame import find_world, rescale_for_object
+from reconstruction.world.object_scale import settle_object_height
 from reconstruction.world.request import ScaleRequest, parse_scale
 
-VERSION = 1
+VERSION = 2
 
 __all__ = [
     "VERSION",
@@ -14,4 +15,5 @@ __all__ = [
     "find_world",
     "parse_scale",
     "rescale_for_object",
+    "settle_object_height",
 ]

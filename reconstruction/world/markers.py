@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 
 from reconstruction.types import PosedFrames
+from reconstruction.world.marker_fit import Square, fit_square
 from registry.errors import UsageError
 from registry.geometry import invert_rigid
 
 _MAX_REPROJECTION_PX = 2.0
 _MAX_SIDE_SPREAD = 0.10  # relative: a square has four equal sides
 _MIN_ANGLE_DEG = 2.0  # between the views of a corner
+_LEAST_SIGMA = 0.0016  # relative: what the scatter between views cannot tell
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,26 @@ def measure_markers(posed: PosedFrames, dictionaries: tuple[str, ...]) -> list[M
             or abs(diagonals - 1).max() > 0.1
         ):
             continue
-        pixels = np.mean([np.linalg.norm(q - np.roll(q, -1, axis=0), axis=1).mean() for q in seen.values()])
-        sigma = np.hypot(0.5 / pixels / np.sqrt(len(seen)), lengths.std() / lengths.mean() / 2)
-        sides.append(MarkerSide(name, marker_id, float(lengths.mean()), len(seen), float(max(sigma, 0.003))))
+        fitted = fit_square(posed, sorted(seen), Square.of_corners(corners), printed_cells(name, marker_id))
+        if fitted is None:
+            continue
+        square, scatter, views = fitted
+        sides.append(MarkerSide(name, marker_id, square.side, views, float(np.hypot(scatter, _LEAST_SIGMA))))
     return sides
+
+
+def printed_cells(dictionary: str, marker_id: int) -> np.ndarray:
+    """Return the cells (n, n) of a marker with its black border, 0 or 255.
+
+    Raises:
+        UsageError: the dictionary has no such marker.
+    """
+    table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    if not 0 <= marker_id < len(table.bytesList):
+        raise UsageError(
+            f"marker {marker_id}: {dictionary.removeprefix('DICT_')} has 0 to {len(table.bytesList) - 1}"
+        )
+    return cv2.aruco.generateImageMarker(table, marker_id, table.markerSize + 2)
 
 
 def _triangulate_quad(posed: PosedFrames, seen: dict[int, np.ndarray]) -> np.ndarray | None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reconstruction.types import Camera, DepthMaps
-from reconstruction.world import WorldConfig, parse_scale
+from reconstruction.world import WorldConfig, parse_scale, settle_object_height
 from reconstruction.world.markers import measure_markers
 from reconstruction.world.metric_depth import load_backend, metres_per_unit
 from registry.errors import EnvironmentMissing, InputError, UsageError
@@ -138,6 +138,30 @@ def test_an_unknown_dictionary_is_a_usage_error(make_frames):
     posed = _film_marker("DICT_5X5_100", 7, 0.1, 2, make_frames)
     with pytest.raises(UsageError, match="DICT_APRILTAG_36h11"):
         measure_markers(posed, ("DICT_9X9",))
+
+
+# ---- An object of known height.
+
+
+@pytest.mark.parametrize("grows", [1.0, 0.6, 1.5])
+def test_an_object_that_does_not_grow_with_the_scale_still_ends_at_its_height(grows):
+    asked = []
+
+    def height_at(measured_m: float) -> float:
+        asked.append(measured_m)
+        return 0.6 * (0.74 / measured_m) ** grows
+
+    divisor, error = settle_object_height(0.6, 0.74, height_at, tolerance=0.015, passes=4)
+    assert error <= 0.015
+    assert abs(height_at(divisor) / 0.74 - 1) == pytest.approx(error)
+    assert len(asked) <= 5
+
+
+def test_the_best_pass_is_kept_where_none_is_good_enough():
+    heights = iter([0.70, 0.72, 0.80])
+    divisor, error = settle_object_height(0.6, 0.74, lambda _: next(heights), tolerance=0.015, passes=3)
+    assert error == pytest.approx(0.02 / 0.74)
+    assert divisor == pytest.approx(0.6 * 0.70 / 0.74)
 
 
 # ---- The metric depth seam.

@@ -1,0 +1,32 @@
+"""`simrecon marker`: a sheet with a marker to print, lay into the room and film, so that the scene is in metres."""
+
+import argparse
+from pathlib import Path
+
+
+def add_parser(verbs: argparse._SubParsersAction) -> None:
+    """Register the verb."""
+    parser = verbs.add_parser(
+        "marker",
+        help="write a marker to print: in view, it gives the scene its true size",
+        description="Write an A4 sheet with an AprilTag in its true size. Print it at 100 %, measure the black square, "
+        "lay it flat into the room, and give its side to `simrecon reconstruct --marker-size`.",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="marker.pdf or marker.png")
+    parser.add_argument(
+        "--size", type=float, default=0.15, metavar="METRES", help="side of the black square (default 0.15)"
+    )
+    parser.add_argument("--id", type=int, default=0, metavar="N", help="number of the marker (default 0)")
+    parser.add_argument("--verbose", action="store_true", help="log what is decided")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the sheet and say what to do with it."""
+    from reconstruction.world.config import WorldConfig
+    from reconstruction.world.marker_print import MarkerSheet, write_marker
+
+    sheet = MarkerSheet(WorldConfig().marker_dictionaries[0], arguments.id, arguments.size)
+    write_marker(sheet, arguments.out)
+    print(f"{arguments.out}: {sheet.caption[0]}\nThen film it flat in the room, and: {sheet.caption[1]}")
+    return 0
