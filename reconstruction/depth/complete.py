@@ -16,6 +16,7 @@ from reconstruction.types import Camera, PosedFrames
 from registry.geometry import invert_rigid
 
 _MAX_LABELS = 20
+_LIMITS = (66, 16)
 
 
 def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarray:
@@ -187,10 +188,11 @@ def complete_depth(
         total = np.zeros(cost.shape, np.uint16)
         aggregate(cost, gray, np.int32(20000), np.int32(260), np.int32(12), 3.0, total)
         label = np.empty((small.height, small.width), np.int32)
-        choose_labels(total, cost, maps[i], label)
+        choose_labels(total, cost, maps[i], limit, label)
         label[~_anchored(label, maps[i] > 0, 40)] = -1
         color = cv2.resize(np.ascontiguousarray(posed.images[i]), size, interpolation=cv2.INTER_AREA)
-        _fill_regions(label, cost, maps[i] > 0, color.astype(np.float32))
+        if limit == _LIMITS[0]:
+            _fill_regions(label, cost, maps[i] > 0, color.astype(np.float32))
         label = cv2.resize(label.astype(np.int16), (w, h), interpolation=cv2.INTER_NEAREST)
         y, x = np.nonzero((label >= 0) & (out[i] == 0))
         rays = np.stack(
@@ -202,8 +204,6 @@ def complete_depth(
         out[i, y[good], x[good]] = z[good]
         confidence[i, y[good], x[good]] = 1
 
-    each(n, complete, "completing planes", progress)
-    filled, trust = out.copy(), confidence.copy()
     fine = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
     def confirm(i: int) -> None:
@@ -215,5 +215,11 @@ def complete_depth(
         out[i][drop] = 0
         confidence[i][drop] = 0
 
-    each(n, confirm, "confirming planes", progress)
+    for limit in _LIMITS:
+        if limit < _LIMITS[0]:  # what was filled and confirmed speaks to the views that could not decide
+            for i in range(n):
+                maps[i] = cv2.resize(out[i], size, interpolation=cv2.INTER_NEAREST)
+        each(n, complete, "completing planes", progress)
+        filled, trust = out.copy(), confidence.copy()
+        each(n, confirm, "confirming planes", progress)
     return out, confidence

@@ -1,6 +1,7 @@
 """Settings of the depth stage. Nothing here is metric: the scale of the poses is arbitrary."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,12 @@ class DepthConfig:
 
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""
+
+    monocular: Literal["none", "transformers"] = "none"
+    """Learned depth from single images for what nothing else reaches; needs `pip install 'simrecon[depth-models]'`."""
+
+    monocular_model: str = "depth-anything/Depth-Anything-V2-Small-hf"
+    """Its model, relative or metric, as on the Hugging Face hub, or a local folder."""
 
     edge_rounds: int = 2
     """Rounds in which pixels beside a depth jump choose anew the surface that they lie on."""

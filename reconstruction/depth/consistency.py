@@ -88,7 +88,9 @@ def check_view(
 
 
 @numba.njit(cache=True, nogil=True)
-def count_witnesses(i, neighbors, depth, mask, relative, k, agree, through):  # pragma: no cover - compiled
+def count_witnesses(
+    i, neighbors, depth, mask, relative, k, beyond, same, agree, through
+):  # pragma: no cover - compiled
     """Count per masked pixel of view i the neighbors that see the same point, and those that look through it.
 
     Args:
@@ -98,6 +100,8 @@ def count_witnesses(i, neighbors, depth, mask, relative, k, agree, through):  # 
         mask: bool (h, w) pixels to ask about.
         relative: (k, 4, 4) neighbour_from_view.
         k: fx, fy, cx, cy.
+        beyond: Ratio of depths from which on a neighbor looks through the point.
+        same: Relative difference up to which it sees the same.
         agree: (h, w) uint8, written.
         through: (h, w) uint8, written.
     """
@@ -122,9 +126,9 @@ def count_witnesses(i, neighbors, depth, mask, relative, k, agree, through):  # 
                 if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
                     continue
                 d = depth[j, int(v), int(u)]
-                if d > 1.025 * qz:
+                if d > beyond * qz:
                     through[y, x] += 1
-                elif abs(d - qz) < 0.015 * qz:
+                elif abs(d - qz) < same * qz:
                     agree[y, x] += 1
 
 

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from reconstruction.depth.config import DepthConfig
+from reconstruction.depth.monocular import MonocularBackend, fill_from_predictions, load_monocular
 from reconstruction.depth.views import ViewPlan, plan_views
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import Camera, DepthMaps, PosedFrames
@@ -207,7 +208,7 @@ def _resolve(
         rows = plan.neighbors[i]
         relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
         agree, through = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-        count_witnesses(i, rows, moved, doubts[i], relative, k, agree, through)
+        count_witnesses(i, rows, moved, doubts[i], relative, k, 1.025, 0.015, agree, through)
         drop = doubts[i] & (through >= 3) & (through > agree + 1)
         # Single pixels that chose otherwise than all around them become flakes in the air.
         drop |= doubts[i] & (moved[i] > 0) & ~remove_speckles(moved[i], config.min_speckle_px // 4, 0.02)
@@ -218,14 +219,24 @@ def _resolve(
     return out, trust
 
 
-def estimate_depth(posed: PosedFrames, config: DepthConfig, *, progress: Progress = NO_PROGRESS) -> DepthMaps:
+def estimate_depth(
+    posed: PosedFrames,
+    config: DepthConfig,
+    *,
+    backend: MonocularBackend | None = None,
+    progress: Progress = NO_PROGRESS,
+) -> DepthMaps:
     """Estimate one depth map for every posed keyframe, in the units of the poses.
 
     Args:
         posed: Frames with cameras and sparse points, in any space and scale.
         config: Settings.
+        backend: Learned depth for what is left unknown; None: the one that `config.monocular` names, if any.
         progress: Where steps and decisions are reported.
     """
+    backend = backend or load_monocular(
+        config
+    )  # a model that is not there is told before the work, not after
     camera = sized_camera(posed.camera, config.depth_side_px)
     plan = plan_views(posed, config)
     workers = _Workers(config.threads)
@@ -245,6 +256,10 @@ def estimate_depth(posed: PosedFrames, config: DepthConfig, *, progress: Progres
         depth, confidence = complete_depth(posed, camera, plan, depth, raw, config, workers.each, progress)
     if config.edge_rounds > 0:
         depth, confidence = _resolve(posed, camera, plan, depth, confidence, score, config, workers, progress)
+    if backend is not None:
+        depth, confidence = fill_from_predictions(
+            posed, camera, plan, depth, confidence, backend, config, workers.each, progress
+        )
     progress.note(
         f"depth: {100 * share:.0f} % of the pixels measured, {100 * float((confidence == 1).mean()):.0f} % completed"
     )

@@ -168,7 +168,7 @@ def label_costs(
 
 
 @numba.njit(cache=True, nogil=True)
-def choose_labels(total, cost, depth, label):  # pragma: no cover - compiled
+def choose_labels(total, cost, depth, limit, label):  # pragma: no cover - compiled
     """Write the cheapest label, or -1 where it is "none" or where another view objects to it."""
     h, w, n = total.shape
     for y in range(h):
@@ -178,7 +178,7 @@ def choose_labels(total, cost, depth, label):  # pragma: no cover - compiled
                 if total[y, x, c] < best:
                     best, at = np.int64(total[y, x, c]), c
             label[y, x] = at
-            if at == n - 1 or cost[y, x, at] > (30 if depth[y, x] > 0.0 else 66):
+            if at == n - 1 or cost[y, x, at] > (30 if depth[y, x] > 0.0 else limit):
                 label[y, x] = -1
 
 

@@ -25,7 +25,7 @@ class WorldConfig:
     )
     """The marker families looked for (names of cv2.aruco)."""
     metric_depth: Literal["none", "transformers"] = "none"
-    """Learned metric depth as a source of metres; needs `pip install 'simrecon[metric-depth]'`."""
+    """Learned metric depth as a source of metres; needs `pip install 'simrecon[depth-models]'`."""
     metric_depth_model: str = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
     """Model of the metric depth backend, as on the Hugging Face hub, or a local folder."""
     camera_height_prior_m: float = 1.4

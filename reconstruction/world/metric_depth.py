@@ -5,10 +5,11 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from reconstruction.depth_model import DepthModel
 from reconstruction.types import Camera, DepthMaps, PosedFrames
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.samples import choose_frames
-from registry.errors import EnvironmentMissing, InputError
+from registry.errors import InputError, UsageError
 
 _FRAMES = 8
 _MODEL_SIGMA = 0.08  # relative: what such models are off by as a whole on indoor benchmarks
@@ -30,27 +31,17 @@ class TransformersBackend:
     name = "transformers"
 
     def __init__(self, model: str) -> None:
-        try:
-            from transformers import pipeline
-        except ImportError as error:
-            raise EnvironmentMissing(
-                f"world: metric depth needs {error.name}; `pip install 'simrecon[metric-depth]'`, "
-                "or leave out --set world.metric_depth=transformers"
-            ) from error
-        try:
-            self._pipeline = pipeline("depth-estimation", model=model)
-        except (ImportError, OSError, ValueError, RuntimeError) as error:
-            raise EnvironmentMissing(
-                f"world: the metric depth model {model!r} cannot be loaded ({error}); download it first, "
-                "or name its folder with --set world.metric_depth_model=DIR"
-            ) from error
+        """Load the model."""
+        self._model = DepthModel(model, asked_by="world.metric_depth")
+        if not self._model.predicts_metres:
+            raise UsageError(
+                f"world.metric_depth: the model {model!r} predicts depth without a scale; name a metric one with "
+                "--set world.metric_depth_model=NAME"
+            )
 
     def predict(self, image: np.ndarray, camera: Camera) -> np.ndarray:
         """See `MetricDepthBackend.predict`."""
-        from PIL import Image
-
-        predicted = self._pipeline(Image.fromarray(image))["predicted_depth"]
-        depth = np.asarray(predicted.squeeze().float().cpu(), np.float32)
+        (depth,) = self._model.predict([image])
         return cv2.resize(depth, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
 
 
