@@ -104,7 +104,7 @@ class GaussiansConfig:
     confirmed_depth: float = 0.02
     """Where it shows several: relative difference to one of the two up to which the measured depth is kept."""
 
-    sigma_cutoff: float = 3.0
+    sigma_cutoff: float = 2.6
     """Standard deviations at which a splat ends."""
 
     transmittance_stop: float = 1e-3

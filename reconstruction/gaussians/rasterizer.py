@@ -14,7 +14,7 @@ from registry.geometry import invert_rigid
 class RasterSettings:
     """Where blending is cut off. Active viewpoint optimization relaxes both cut-offs for unbiased pose gradients."""
 
-    sigma_cutoff: float = 3.0
+    sigma_cutoff: float = 2.6
     """A splat ends at this many standard deviations."""
 
     alpha_min: float = 1.0 / 255.0
