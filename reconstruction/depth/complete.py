@@ -115,6 +115,7 @@ def complete_depth(
     """Return completed depth and confidence (n, h, w): 2 measured, 1 completed, 0 unknown."""
     import cv2
 
+    from reconstruction.depth.blank_walls import fill_walls
     from reconstruction.depth.fill_kernels import (
         choose_labels,
         confirm_fill,
@@ -216,10 +217,17 @@ def complete_depth(
         confidence[i][drop] = 0
 
     for limit in _LIMITS:
-        if limit < _LIMITS[0]:  # what was filled and confirmed speaks to the views that could not decide
+        each(n, complete, "completing planes", progress)
+        if limit == _LIMITS[0]:
             for i in range(n):
                 maps[i] = cv2.resize(out[i], size, interpolation=cv2.INTER_NEAREST)
-        each(n, complete, "completing planes", progress)
+            walls, extents = fill_walls(posed, small, maps, tones, planes, plan, out, confidence)
+            planes, bounds = np.concatenate([planes, walls]), np.concatenate([bounds, extents])
+            doubt = np.concatenate([doubt, np.zeros(len(walls))])
+            progress.note(f"depth: {len(walls)} blank planes stand on lines in measured ones")
         filled, trust = out.copy(), confidence.copy()
         each(n, confirm, "confirming planes", progress)
+        # What was filled and confirmed speaks to the views that could not decide.
+        for i in range(n):
+            maps[i] = cv2.resize(out[i], size, interpolation=cv2.INTER_NEAREST)
     return out, confidence
