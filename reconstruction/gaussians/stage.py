@@ -54,5 +54,5 @@ def make_gaussians(
     settings = settings_of(config, median_depth_of(depth))
     backend = load_backend(config.backend)
     return GaussianScene(
-        gaussians, rendered_depth_maps(gaussians, depth, config, settings, backend, progress)
+        gaussians, rendered_depth_maps(gaussians, posed, depth, config, settings, backend, progress)
     )
