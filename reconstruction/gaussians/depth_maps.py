@@ -19,6 +19,7 @@ _SAME, _BEYOND = (
     1.025,
 )  # relative depth up to which, ratio from which another view sees the same, looks through
 _OWN_WITNESSES, _FAR_OFF = 2, 0.1
+_BADLY_EXPLAINED = 0.05  # share of a frame's known pixels
 
 
 def rendered_depth_maps(
@@ -36,8 +37,10 @@ def rendered_depth_maps(
     and its own depth is about the same. Where its own depth is another, the depth maps of neighboring frames vote: it
     takes the expected depth if more of them measured that, keeps its own if Gaussians stand alone far off from a
     surface that others measured (floaters of a weak capture), and becomes unknown otherwise. At outlines, where the
-    expected depth lies between two surfaces, it keeps its own depth if either of the two confirms it. Pixels that were
-    unknown stay so: what Gaussians show there was never measured in this view. Confidence is that of the input.
+    expected depth lies between two surfaces, it keeps its own depth if either of the two confirms it. A frame in which
+    much would become unknown is one that the Gaussians explain badly: there, what two neighbors measured stays. Pixels
+    that were unknown stay so: what Gaussians show there was never measured in this view. Confidence is that of the
+    input.
 
     Args:
         gaussians: of `fit_gaussians` on these depth maps; their cameras are used.
@@ -58,14 +61,17 @@ def rendered_depth_maps(
         own = measured[row].copy()
         has = (own > 0) & (np.asarray(depth.confidence[row]) > 0)
         render = backend.render(parameters, depth.camera, pose, settings)
-        kept, asked = _choose(own, render, config)
+        kept, asked, clear = _choose(own, render, config)
         if asked.any():
             relative = invert_rigid(poses[np.maximum(neighbors[row], 0)]) @ pose
             support = [
                 _witnesses(row, candidate, asked, measured, neighbors[row], relative, depth)
                 for candidate in (own, np.asarray(render.depth, np.float32))
             ]
-            kept = np.where(asked, _vote(own, render.depth, *support), kept)
+            decided = _vote(own, render.depth, clear, *support)
+            if ((decided == 0) & asked & has).sum() > _BADLY_EXPLAINED * max(int(has.sum()), 1):
+                decided = np.where((decided == 0) & (support[0] >= _OWN_WITNESSES), own, decided)
+            kept = np.where(asked, decided, kept)
         refined[row] = np.where(has, kept, 0)
         known += int(has.sum())
         moved += int((has & (kept > 0) & (np.abs(kept - own) > config.clear_depth * own)).sum())
@@ -79,14 +85,16 @@ def rendered_depth_maps(
     return DepthMaps(depth.camera, refined, confidence)
 
 
-def _choose(own: np.ndarray, render: Render, config: GaussiansConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depth (h, w) that needs no vote, 0 = none, and the pixels (h, w) that need one."""
+def _choose(
+    own: np.ndarray, render: Render, config: GaussiansConfig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the depth (h, w) that needs no vote, 0 = none; the pixels that need one; those that show one surface."""
     expected, median, solid = render.depth, render.median_depth, render.opacity > _SOLID
     clear = solid & (np.abs(expected - median) < config.clear_depth * expected)
     near = np.abs(expected - own) < config.confirmed_depth * own
     confirmed = near | (np.abs(median - own) < config.confirmed_depth * own) | ~solid
     kept = np.where(clear & near, expected, np.where(~clear & confirmed, own, 0))
-    return kept.astype(np.float32), clear & ~near & (own > 0)
+    return kept.astype(np.float32), (kept == 0) & (own > 0), clear
 
 
 def _witnesses(
@@ -111,8 +119,12 @@ def _witnesses(
     return agree.astype(np.int32)
 
 
-def _vote(own: np.ndarray, expected: np.ndarray, for_own: np.ndarray, for_expected: np.ndarray) -> np.ndarray:
+def _vote(
+    own: np.ndarray, expected: np.ndarray, clear: np.ndarray, for_own: np.ndarray, for_expected: np.ndarray
+) -> np.ndarray:
     """Return what the neighbors decide (h, w), 0 where they do not."""
     far_off = np.abs(expected - own) > _FAR_OFF * own
     alone = (for_expected == 0) & (for_own >= _OWN_WITNESSES) & far_off
-    return np.where(for_expected > for_own, expected, np.where(alone, own, 0)).astype(np.float32)
+    return np.where(clear & (for_expected > for_own), expected, np.where(clear & alone, own, 0)).astype(
+        np.float32
+    )
