@@ -172,13 +172,14 @@ def gathered(reconstructed):
 
 
 def test_depth_errors_are_those_of_the_depth(reconstructed):
-    """The room's depth is true; where it is made 2 % too deep, the map says 2 % of the distance."""
+    """The room's depth is nearly true; where it is made 2 % too deep, the map says 2 % of the distance."""
     g = gathered(reconstructed)
     _, errors = pictures.depth_rows(g, 3)
-    assert max(errors) < 0.004
+    assert max(errors) < 0.006
     stages = g.stages
-    wrong = replace(stages.get("depth"), depth=stages.get("depth").depth * np.float32(1.02))
-    stages._loaded["depth"] = wrong
+    scene = stages.get("gaussians")
+    wrong = replace(scene.depth, depth=scene.depth.depth * np.float32(1.02))
+    stages._loaded["gaussians"] = replace(scene, depth=wrong)
     _, errors = pictures.depth_rows(gather(g.bundle, stages, g.truth), 3)
     typical = [float(np.median(d[d > 0])) for d in np.asarray(g.depth.depth)]
     assert min(errors) > 0.015 * min(typical)
