@@ -66,12 +66,12 @@ def fingerprint(stage: str, module_name: str, config: Any, upstream: tuple[str, 
 
 
 def digest_input(path: Path) -> str:
-    """SHA-256 of a video file, or of the names and bytes of the files in a folder of images."""
+    """SHA-256 of a video file, or of the names and bytes of all files in a folder."""
     digest = hashlib.sha256()
-    files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.is_file())
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     for file in files:
         if not path.is_file():
-            digest.update(file.name.encode() + b"\0")
+            digest.update(file.relative_to(path).as_posix().encode() + b"\0")
         with file.open("rb") as stream:
             for block in iter(lambda: stream.read(1 << 20), b""):
                 digest.update(block)

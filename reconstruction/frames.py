@@ -5,7 +5,8 @@ the second decodes the chosen ones at working resolution. What cannot become a s
 one clear sentence: no video, blank, still, too short. Lack of parallax shows only once poses are estimated.
 """
 
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,8 @@ from reconstruction.keyframes import (
     choose_keyframes,
     repeats_of,
 )
+from reconstruction.poses.importers.exports import Export, find_export
+from reconstruction.poses.importers.polycam import polycam_turns
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import FrameSet, VideoSource
 from registry.errors import InputError, UsageError
@@ -69,7 +72,7 @@ def load_frames(video: Path, config: FramesConfig, *, progress: Progress = NO_PR
     """Choose and load keyframes from a video file or a folder of jpg and png images.
 
     Args:
-        video: File that ffmpeg decodes, or folder of images in name order.
+        video: File that ffmpeg decodes, folder of images in name order, or an export of Record3D or Polycam.
         config: See `FramesConfig`.
         progress: Receives the steps and every decision worth telling.
 
@@ -83,6 +86,9 @@ def load_frames(video: Path, config: FramesConfig, *, progress: Progress = NO_PR
     video = Path(video)
     if not video.exists():
         raise UsageError(f"frames: there is no file or folder {video}. Check the path.")
+    export = find_export(video)
+    if export is not None:
+        return _from_export(export, config, progress)
     return _from_folder(video, config, progress) if video.is_dir() else _from_video(video, config, progress)
 
 
@@ -285,6 +291,27 @@ def _from_folder(path: Path, config: FramesConfig, progress: Progress) -> FrameS
         held_out_times_s=np.array(held, np.float64),
         focal_prior_px=folder.focal_prior_px(config.max_side_px),
         ordered=ordered,
+    )
+
+
+def _from_export(export: Export, config: FramesConfig, progress: Progress) -> FrameSet:
+    """Read the images of a phone app's export, turned upright as its poses say; its poses are for stage 2."""
+    turns = polycam_turns(export) if export.kind == "polycam" else 0
+    app = {"polycam": "Polycam", "record3d": "Record3D"}[export.kind]
+    progress.note(f"an export of {app}: its {len(export.images)} images are the input, its poses are used")
+    if turns:
+        progress.note(f"images turned by {360 - 90 * turns} degrees clockwise, as their poses say")
+    with tempfile.TemporaryDirectory() as scratch:
+        frames = _from_folder(export.unpack_images(Path(scratch)), config, progress)
+    source = replace(frames.source, file=str(export.path))
+    if turns % 2:
+        source = replace(source, width=source.height, height=source.width)
+
+    def upright(images: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(images, turns, axes=(1, 2)))
+
+    return replace(
+        frames, source=source, images=upright(frames.images), held_out_images=upright(frames.held_out_images)
     )
 
 

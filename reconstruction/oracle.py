@@ -101,7 +101,7 @@ class Oracle:
             ],
         }
         path.write_text(json.dumps(data))
-        config = replace(config, import_path=str(path))
+        config = replace(config, import_path=str(path), refine_imported="never")
         return estimate_poses(frames, config, work_dir=work_dir, progress=progress)
 
     def depth(self, posed: PosedFrames, camera: Camera) -> DepthMaps:

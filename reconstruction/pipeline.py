@@ -109,6 +109,8 @@ class Run:
         config = getattr(self.config, stage.name)
         upstream = tuple(self.keys[name] for name in stage.needs) or (self.input_digest,)
         options = (config, self.overrides.of_stage(stage.name))
+        if stage.name == "poses" and config.import_path and Path(config.import_path).exists():
+            options += (digest_input(Path(config.import_path)),)
         if self.oracle is not None and self.oracle.of_stage(stage.name):
             options += (self.oracle.of_stage(stage.name),)
         key = fingerprint(stage.name, stage.module, options, upstream)

@@ -22,6 +22,7 @@ metric scale, best first:
 examples:
   simrecon reconstruct room.mp4
   simrecon reconstruct room.mp4 --scene kitchen --preset quality
+  simrecon reconstruct my_scan.r3d            # Record3D or Polycam raw data: images, poses and metres from there
   simrecon reconstruct photos/ --scene dorm --set depth.depth_side_px=640
 """
 
@@ -38,7 +39,11 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "video", metavar="VIDEO", type=Path, nargs="?", help="a video file or a folder of images"
+        "video",
+        metavar="VIDEO",
+        type=Path,
+        nargs="?",
+        help="a video file, a folder of images, or an export of Record3D or Polycam with its poses",
     )
     parser.add_argument(
         "--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)"
@@ -63,7 +68,11 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         "--marker-size", type=float, metavar="METRES", help="side of a printed marker in view"
     )
     parser.add_argument(
-        "--poses", type=Path, metavar="PATH", help="a COLMAP model or transforms.json to use as poses"
+        "--poses",
+        type=Path,
+        metavar="PATH",
+        help="poses that you have: a COLMAP model folder, nerfstudio's transforms.json, a Record3D recording "
+        "(.r3d or unzipped) or Polycam's raw data; see docs/poses.md",
     )
     parser.add_argument(
         "--overrides", type=Path, metavar="FILE", help="your corrections (YAML); see docs/overrides.md"

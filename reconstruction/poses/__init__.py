@@ -3,6 +3,6 @@
 from reconstruction.poses.config import POSES_PRESETS, PosesConfig
 from reconstruction.poses.estimate import estimate_poses
 
-VERSION = 1
+VERSION = 2
 
 __all__ = ["POSES_PRESETS", "VERSION", "PosesConfig", "estimate_poses"]

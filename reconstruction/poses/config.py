@@ -9,7 +9,12 @@ class PosesConfig:
     """How cameras are recovered from the keyframes."""
 
     import_path: str = ""
-    """Poses that you have: a COLMAP model folder or a nerfstudio `transforms.json`. Empty: estimate them."""
+    """Poses that you have: a COLMAP model folder, a nerfstudio `transforms.json`, a Record3D recording or
+    Polycam's raw data. Empty: those of the input, if it is such an export; else they are estimated."""
+
+    refine_imported: Literal["auto", "always", "never"] = "auto"
+    """Adjust imported poses to the pictures, keeping their scale and place. `auto`: those of phone apps, which
+    drift; not those of COLMAP and nerfstudio, which were adjusted already."""
 
     max_features: int = 2048
     """SIFT features kept in each frame, the strongest first."""

@@ -5,6 +5,7 @@ import numpy as np
 
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
+from reconstruction.types import FrameSet
 from registry.errors import InputError
 
 MIN_FRAMES = 8
@@ -88,6 +89,42 @@ def check_model(model: object | None, chosen: int, indices: np.ndarray, min_shar
             f"poses: the camera hardly moved: points are seen under {angle:.1f} degrees of parallax, "
             f"{_MIN_TRIANGULATION_DEG:.0f} are needed. {_HOW_TO_FILM}"
         )
+
+
+def missing_notes(frames: FrameSet, registered: list[int], parts: np.ndarray) -> list[str]:
+    """Say which keyframes are dropped, why, and what to do: one note for each reason.
+
+    Args:
+        frames: all keyframes.
+        registered: rows of those that have a camera.
+        parts: (n,) which keyframes share pictures with each other, from `label_parts`.
+    """
+    missing = np.setdiff1d(np.arange(len(frames.indices)), registered)
+    main = np.bincount(parts[registered]).argmax()
+    apart, weak = missing[parts[missing] != main], missing[parts[missing] == main]
+    notes = []
+    for rows, reason in (
+        (
+            apart,
+            "they share no picture with the rest (a cut, another room, a blocked view). To have all in one "
+            "scene, film the way between them too; or give each part as a video of its own",
+        ),
+        (weak, "they are blurred, show little texture, or too little of what the others show"),
+    ):
+        if len(rows):
+            when = f" ({_times(frames.times_s, rows)})" if frames.ordered else ""
+            notes.append(
+                f"poses: {len(rows)} of {len(frames.indices)} keyframes were not registered and are dropped: frames "
+                f"{_ranges(frames.indices[rows])}{when}: {reason}"
+            )
+    return notes
+
+
+def _times(times_s: np.ndarray, rows: np.ndarray, most: int = 6) -> str:
+    """Write the time ranges of runs of rows."""
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 2) + 1)
+    text = ", ".join(f"{times_s[run[0]]:.1f}-{times_s[run[-1]]:.1f} s" for run in runs[:most])
+    return text + (f" and {len(runs) - most} more" if len(runs) > most else "")
 
 
 def _pair_motion(features: list[Features], pair: VerifiedPair) -> tuple[float, float, float]:

@@ -4,16 +4,18 @@ SIFT, matching of likely pairs, COLMAP's incremental mapper (the global one as t
 bundle adjustment. Held-out frames are located against the finished model and never enter it.
 """
 
-import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from reconstruction.poses import diagnose, importers, mapping
+from reconstruction.poses.components import label_parts
 from reconstruction.poses.config import PosesConfig
-from reconstruction.poses.features import Features, extract_features, match, overlap_scores
+from reconstruction.poses.features import Features, extract_features, match
 from reconstruction.poses.held_out import candidates_in_time, locate_frames
-from reconstruction.poses.pairs import choose_pairs, verify_pairs
+from reconstruction.poses.imported import use_imported
+from reconstruction.poses.matching import matched_database
 from reconstruction.poses.refine import refine_model
 from reconstruction.poses.undistort import undistort
 from reconstruction.progress import NO_PROGRESS, Progress
@@ -46,16 +48,21 @@ def estimate_poses(
         features = extract_features(frames.images, config.max_features, config.contrast_threshold, progress)
         diagnose.check_features(features, frames.indices)
         known: dict[int, np.ndarray] = {}
-        if config.import_path:
-            imported = importers.read_poses(Path(config.import_path), frames)
-            known = imported.world_from_camera
-            model = _triangulate(imported, frames, features, config, work_dir, progress)
+        metric = False
+        poses_from = config.import_path or (
+            importers.find_export(Path(frames.source.file)) and frames.source.file
+        )
+        if poses_from:
+            imported = importers.read_poses(Path(poses_from), frames)
+            for note in imported.notes:
+                progress.note(note)
+            metric = imported.metric
+            model, known = use_imported(imported, frames, features, config, work_dir, progress)
         else:
             model = _reconstruct(frames, features, config, work_dir, progress)
         registered = sorted(i - 1 for i in model.reg_image_ids())
-        _note_missing(frames, registered, progress)
         held_out = _locate_held_out(frames, features, model, registered, known, config, progress)
-    return _package(frames, model, registered, held_out)
+    return replace(_package(frames, model, registered, held_out), metric=metric)
 
 
 def initial_camera(frames: FrameSet, config: PosesConfig) -> object:
@@ -70,38 +77,20 @@ def initial_camera(frames: FrameSet, config: PosesConfig) -> object:
     return camera
 
 
-def _matched_database(
-    frames: FrameSet,
-    features: list[Features],
-    camera: object,
-    config: PosesConfig,
-    path: Path,
-    progress: Progress,
-) -> list:
-    """Match likely pairs and write the database; return the verified pairs."""
-    progress.start(len(features) - 1, "overlap")
-    scores = overlap_scores(features, progress)
-    pairs = choose_pairs(scores, frames.ordered, config)
-    progress.start(len(pairs), "matching")
-    verified = verify_pairs(pairs, features, camera, config, progress)
-    path.unlink(missing_ok=True)
-    mapping.write_database(path, camera, features, verified)
-    return verified
-
-
 def _reconstruct(
     frames: FrameSet, features: list[Features], config: PosesConfig, work_dir: Path, progress: Progress
 ) -> object:
     """Run structure from motion; return the refined model of the largest consistent component."""
     camera = initial_camera(frames, config)
     database = work_dir / "database.db"
-    pairs = _matched_database(frames, features, camera, config, database, progress)
+    pairs = matched_database(frames, features, camera, config, database, progress)
     diagnose.check_motion(features, pairs, (camera.width, camera.height))
     chosen = len(frames.images)
     progress.start(chosen, "mapping")
     models = mapping.incremental_models(database, work_dir, config, chosen, progress)
     first = models[0].num_reg_images() if models else 0
-    if first < config.second_try_below_share * chosen:
+    parts = label_parts(chosen, pairs)
+    if first < config.second_try_below_share * int((parts == 0).sum()):
         other = mapping.global_models(database, work_dir, config)
         second = other[0].num_reg_images() if other else 0
         progress.note(
@@ -112,43 +101,9 @@ def _reconstruct(
     if models:
         refine_model(models[0], config)
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
+    for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
+        progress.note(note)
     return models[0]
-
-
-def _triangulate(
-    imported: "importers.ImportedPoses",
-    frames: FrameSet,
-    features: list[Features],
-    config: PosesConfig,
-    work_dir: Path,
-    progress: Progress,
-) -> object:
-    """Return a model with the imported cameras, fixed, and points triangulated from our own matches."""
-    import pycolmap
-
-    database = work_dir / "database.db"
-    _matched_database(frames, features, imported.camera, config, database, progress)
-    model = importers.model_from_poses(imported, frames, features, database)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = mapping.MAPPER_THREADS
-    options.random_seed = config.seed
-    options.extract_colors = False
-    options.min_num_matches = config.min_inliers
-    output = work_dir / "triangulated"
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir()
-    model = pycolmap.triangulate_points(model, database, work_dir, output, True, options)
-    importers.check_consistency(model, config)
-    return model
-
-
-def _note_missing(frames: FrameSet, registered: list[int], progress: Progress) -> None:
-    missing = np.delete(frames.indices, registered)
-    if len(missing):
-        progress.note(
-            f"poses: {len(missing)} of {len(frames.indices)} keyframes were not registered and are dropped: "
-            f"frames {diagnose.describe_frames(missing)}"
-        )
 
 
 def _locate_held_out(

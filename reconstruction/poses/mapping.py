@@ -67,6 +67,7 @@ def write_database(path: Path, camera: object, features: list[Features], pairs: 
         for pair in pairs:
             i, j = pair.rows
             database.write_matches(i + 1, j + 1, pair.matches)
+            pair.geometry.inlier_matches = pair.matches
             database.write_two_view_geometry(i + 1, j + 1, pair.geometry)
 
 

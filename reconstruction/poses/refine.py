@@ -24,7 +24,7 @@ def refine_model(model: object, config: PosesConfig) -> object:
     return model
 
 
-def bundle_adjust(model: object) -> None:
+def bundle_adjust(model: object, loss_scale_px: float = _LOSS_SCALE_PX) -> None:
     """Adjust cameras, points and intrinsics under a Cauchy loss."""
     import pycolmap
 
@@ -32,7 +32,7 @@ def bundle_adjust(model: object) -> None:
     options.print_summary = False
     options.refine_principal_point = False  # weakly observed in a room; measured to turn the cameras
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = _LOSS_SCALE_PX
+    options.ceres.loss_function_scale = loss_scale_px
     options.ceres.solver_options.max_num_iterations = 40
     options.ceres.solver_options.function_tolerance = 1e-6
     options.ceres.solver_options.num_threads = MAPPER_THREADS

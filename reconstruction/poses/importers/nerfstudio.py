@@ -1,0 +1,46 @@
+"""A nerfstudio `transforms.json`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.poses.importers.shared import OPENGL_FROM_OPENCV, NamedPoses
+from registry.errors import UsageError
+
+
+def read_transforms(path: Path) -> NamedPoses:
+    """Read the lens and one camera for each frame."""
+    import pycolmap
+
+    try:
+        data = json.loads(path.read_text())
+        listed = data["frames"]
+        lens = {**(listed[0] if listed else {}), **data}
+        width, height = int(lens["w"]), int(lens["h"])
+        fx = float(lens["fl_x"]) if "fl_x" in lens else width / 2 / np.tan(float(lens["camera_angle_x"]) / 2)
+        params = [
+            fx,
+            float(lens.get("fl_y", fx)),
+            float(lens.get("cx", width / 2)),
+            float(lens.get("cy", height / 2)),
+            *(float(lens.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2")),
+        ]
+        named = []
+        for frame in sorted(listed, key=lambda f: f["file_path"]):
+            if abs(float(frame.get("fl_x", fx)) - fx) > 0.01 * fx:
+                raise UsageError(f"poses: {path} has frames with different focal lengths; one lens is needed")
+            world_from_opengl = np.array(frame["transform_matrix"], np.float64).reshape(4, 4)
+            named.append((frame["file_path"], world_from_opengl @ OPENGL_FROM_OPENCV))
+    except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
+        if isinstance(error, UsageError):
+            raise
+        raise UsageError(
+            f"poses: {path} is not a usable transforms.json: {type(error).__name__} {error}"
+        ) from error
+    if any(abs(float(lens.get(k, 0.0))) > 1e-9 for k in ("k3", "k4")):
+        raise UsageError(f"poses: {path} has k3 or k4 distortion; only k1, k2, p1 and p2 are supported")
+    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", params[0], width, height)
+    camera.params = params
+    camera.has_prior_focal_length = True
+    return NamedPoses(camera, named)

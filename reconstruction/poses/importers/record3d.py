@@ -1,0 +1,48 @@
+"""Record3D: `metadata` (JSON) beside `rgb/` or `rgbd/`, in a folder or an `.r3d` file."""
+
+import numpy as np
+
+from reconstruction.poses.importers.exports import Export
+from reconstruction.poses.importers.shared import OPENGL_FROM_OPENCV, NamedPoses, pinhole
+from registry.errors import InputError
+
+
+def read_record3d(export: Export) -> NamedPoses:
+    """Read the poses of a recording with the rear (LiDAR) camera.
+
+    They are in metres, relative to the first frame, so they say nothing of gravity. Versions of the app differ in
+    which way round a camera held upright is meant, so its roll is left to the pictures (`roll_unknown`).
+    """
+    from scipy.spatial.transform import Rotation
+
+    data = export.read_json(export.cameras)
+    try:
+        rows = np.array(data["poses"], np.float64).reshape(-1, 7)
+        lens = _lens(data)
+        width, height = int(data["w"]), int(data["h"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"poses: {export.cameras} in {export.path} is no Record3D metadata ({type(error).__name__} {error})"
+        ) from error
+    if len(rows) < 2 or np.abs(rows - rows[0]).max() < 1e-9:
+        raise InputError(
+            f"poses: {export.path} has no camera motion: Record3D tracks only the rear (LiDAR) camera. Give the "
+            "video alone, then the poses are estimated"
+        )
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, :4]).as_matrix()  # x, y, z, w
+    poses[:, :3, 3] = rows[:, 4:]
+    named = [
+        (name, poses[number] @ OPENGL_FROM_OPENCV)
+        for number, name in ((int(n.rsplit("/", 1)[-1].split(".")[0]), n) for n in export.images)
+        if number < len(poses)
+    ]
+    return NamedPoses(pinhole(*lens, width, height), named, metric=True, roll_unknown=True)
+
+
+def _lens(data: dict) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy: the median over frames where each has its own (the focus moves), else K."""
+    if data.get("perFrameIntrinsicCoeffs"):
+        return tuple(np.median(np.array(data["perFrameIntrinsicCoeffs"], np.float64)[:, :4], axis=0).tolist())
+    k = np.array(data["K"], np.float64).reshape(3, 3).T  # column after column
+    return float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])

@@ -1,0 +1,46 @@
+"""From features to a database of pairs that agree with each other."""
+
+from pathlib import Path
+
+from reconstruction.poses import mapping
+from reconstruction.poses.components import label_parts, propose_bridges
+from reconstruction.poses.config import PosesConfig
+from reconstruction.poses.consistency import reject_look_alikes
+from reconstruction.poses.features import Features, overlap_scores
+from reconstruction.poses.pairs import VerifiedPair, choose_pairs, verify_pairs
+from reconstruction.progress import Progress
+from reconstruction.types import FrameSet
+
+_NOTED_SHARE = 0.02  # of the pairs; fewer look-alikes are everywhere
+
+
+def matched_database(
+    frames: FrameSet,
+    features: list[Features],
+    camera: object,
+    config: PosesConfig,
+    path: Path,
+    progress: Progress,
+) -> list[VerifiedPair]:
+    """Match likely pairs and write the database; return the verified pairs that agree with each other."""
+    progress.start(len(features) - 1, "overlap")
+    scores = overlap_scores(features, progress)
+    pairs = choose_pairs(scores, frames.ordered, config)
+    progress.start(len(pairs), "matching")
+    verified = verify_pairs(pairs, features, camera, config, progress)
+    parts = label_parts(len(features), verified)
+    bridges = propose_bridges(parts, scores, pairs)
+    if bridges:
+        progress.start(len(bridges), "joining parts")
+        verified += verify_pairs(bridges, features, camera, config, progress)
+    near = max(1, config.sequential_overlap // 2) if frames.ordered else 0
+    size = (camera.width, camera.height)
+    consistent = reject_look_alikes(verified, features, near, config.min_inliers, size)
+    if consistent.rejected > _NOTED_SHARE * len(verified):
+        progress.note(
+            f"poses: {consistent.rejected} of {len(verified)} pairs of frames show things that look alike at "
+            "different places (tiles, posters, chairs); they are not used"
+        )
+    path.unlink(missing_ok=True)
+    mapping.write_database(path, camera, features, consistent.pairs)
+    return consistent.pairs
