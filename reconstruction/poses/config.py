@@ -12,6 +12,10 @@ class PosesConfig:
     """Poses that you have: a COLMAP model folder, a nerfstudio `transforms.json`, a Record3D recording or
     Polycam's raw data. Empty: those of the input, if it is such an export; else they are estimated."""
 
+    backend: Literal["colmap", "vggt"] = "colmap"
+    """Where first cameras come from: `colmap` from matches; `vggt` from the learned model of that name, if it is
+    installed. Its prediction is then adjusted to our own matches."""
+
     refine_imported: Literal["auto", "always", "never"] = "auto"
     """Adjust imported poses to the pictures, keeping their scale and place. `auto`: those of phone apps, which
     drift; not those of COLMAP and nerfstudio, which were adjusted already."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.poses import diagnose, importers, mapping
+from reconstruction.poses.backends import PoseBackend, load_pose_backend
 from reconstruction.poses.components import label_parts
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, extract_features, match
@@ -25,7 +26,12 @@ _DEFAULT_FOCAL_SHARE = 1.0  # of the longer side, where the metadata says nothin
 
 
 def estimate_poses(
-    frames: FrameSet, config: PosesConfig, *, work_dir: Path, progress: Progress = NO_PROGRESS
+    frames: FrameSet,
+    config: PosesConfig,
+    *,
+    work_dir: Path,
+    backend: PoseBackend | None = None,
+    progress: Progress = NO_PROGRESS,
 ) -> PosedFrames:
     """Estimate one camera per frame.
 
@@ -33,6 +39,7 @@ def estimate_poses(
         frames: keyframes and held-out frames.
         config: settings; equal settings and frames give equal bits on one machine.
         work_dir: folder for COLMAP's database, models and logs; created, may be deleted afterwards.
+        backend: predicts first cameras; None: the one that `config.backend` names.
         progress: told about features, matching, mapping and held-out frames.
 
     Returns:
@@ -58,11 +65,27 @@ def estimate_poses(
                 progress.note(note)
             metric = imported.metric
             model, known = use_imported(imported, frames, features, config, work_dir, progress)
+        elif (backend := backend or load_pose_backend(config.backend)) is not None:
+            predicted = _predict(backend, frames, progress)
+            always = replace(config, refine_imported="always")
+            model, known = use_imported(predicted, frames, features, always, work_dir, progress)
         else:
             model = _reconstruct(frames, features, config, work_dir, progress)
         registered = sorted(i - 1 for i in model.reg_image_ids())
         held_out = _locate_held_out(frames, features, model, registered, known, config, progress)
     return replace(_package(frames, model, registered, held_out), metric=metric)
+
+
+def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> importers.ImportedPoses:
+    """Return the backend's cameras in the form of imported ones, with a lens that may still bend."""
+    import pycolmap
+
+    progress.note(f"poses: first cameras are predicted by {backend.name}, then adjusted to our own matches")
+    predicted = backend.predict(frames.images)
+    height, width = frames.images.shape[1:3]
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", predicted.focal_px, width, height)
+    poses = {int(index): pose for index, pose in zip(frames.indices, predicted.world_from_camera)}
+    return importers.ImportedPoses(camera, poses)
 
 
 def initial_camera(frames: FrameSet, config: PosesConfig) -> object:
