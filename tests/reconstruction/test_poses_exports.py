@@ -147,3 +147,15 @@ def test_a_changed_camera_file_changes_the_digest(small_capture, tmp_path):
     before = digest_input(tmp_path)
     (tmp_path / "keyframes" / "cameras" / "1000.json").write_text("{}")
     assert digest_input(tmp_path) != before
+
+
+def test_a_zip_with_a_folder_around_everything_is_found(small_capture, tmp_path):
+    truth = small_capture.posed
+    write_polycam(tmp_path / "scan", truth, tracked(truth, 0, 0), sideways=True)
+    with zipfile.ZipFile(tmp_path / "scan.zip", "w") as archive:
+        for file in sorted((tmp_path / "scan").rglob("*.*")):
+            archive.write(file, f"my scan/{file.relative_to(tmp_path / 'scan')}")
+    zipped = load_frames(tmp_path / "scan.zip", FramesConfig())
+    folder = load_frames(tmp_path / "scan", FramesConfig())
+    assert np.array_equal(zipped.images, folder.images)
+    assert zipped.images.shape[1:3] == (240, 320)
