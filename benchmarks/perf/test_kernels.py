@@ -53,7 +53,7 @@ def test_sgm(measure):
 
 def test_tsdf_integrate(measure):
     from reconstruction.surface.pixels import prepare_views
-    from reconstruction.surface.tsdf import BLOCK, integrate, surface_blocks
+    from reconstruction.surface.tsdf import BLOCK, integrate, surface_blocks, tile_reach
 
     depth, poses, images = inputs.depth_of_a_ball(8, inputs.camera(160, 120))
     views = prepare_views(depth, poses, images, reference_depth=1.5, max_depth=6.0, completed_weight=0.1)
@@ -61,7 +61,8 @@ def test_tsdf_integrate(measure):
     shape = tuple(int(np.ceil(side / (BLOCK * voxel))) for side in (3.2, 3.2, 0.9))
     blocks = surface_blocks(views, poses, origin, shape, voxel, 4 * voxel)
     assert len(blocks) > 100
-    volume = measure(lambda: integrate(views, blocks, shape, origin, voxel, 4 * voxel))
+    reach = tile_reach(views, 4 * voxel)
+    volume = measure(lambda: integrate(views, reach, blocks, origin, voxel, 4 * voxel, 0.0025))
     seen = volume.weight > 0
     assert 0.1 < seen.mean() < 1.0
     assert (volume.distance[seen] < 0).any()

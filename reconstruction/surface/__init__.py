@@ -2,16 +2,7 @@
 
 from reconstruction.surface.config import SURFACE_PRESETS, SurfaceConfig
 from reconstruction.surface.fuse import fuse_surface
-from reconstruction.surface.local import LocalVolume, fuse_box, prepare_fusion
 
-VERSION = 1
+VERSION = 2
 
-__all__ = [
-    "SURFACE_PRESETS",
-    "VERSION",
-    "LocalVolume",
-    "SurfaceConfig",
-    "fuse_box",
-    "fuse_surface",
-    "prepare_fusion",
-]
+__all__ = ["SURFACE_PRESETS", "VERSION", "SurfaceConfig", "fuse_surface"]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 class SurfaceConfig:
     """How depth maps become one surface and a map of free space."""
 
-    voxel_size_m: float = 0.008
+    voxel_size_m: float = 0.005
     """Edge of a fusion voxel. Made larger, with a note, where the scene would need more than `max_blocks`."""
 
-    truncation_voxels: float = 4.0
+    truncation_voxels: float = 6.0
     """Half width of the band around a surface in which signed distances are averaged."""
 
     max_depth_m: float = 6.0
@@ -25,10 +25,16 @@ class SurfaceConfig:
     min_views: int = 2
     """Surface that fewer views saw is dropped."""
 
-    max_blocks: int = 120_000
-    """Bound on the 8x8x8 voxel blocks in memory (about 6 kB each)."""
+    flat_error_m: float = 0.0025
+    """Blocks of 8x8x8 voxels whose surface is a plane within this are sampled at every other voxel only."""
 
-    max_vertices: int = 300_000
+    max_blocks: int = 250_000
+    """Bound on the blocks, and so on time and on the mesh before it is thinned; larger voxels, with a note, beyond."""
+
+    slab_blocks: int = 6_000
+    """How many blocks are fused at once, 10 kB each, and at least two layers of the scene; the rest waits its turn."""
+
+    max_vertices: int = 150_000
     """Bound on the mesh. Flat parts are thinned first."""
 
     min_component_m2: float = 0.002
@@ -51,7 +57,11 @@ class SurfaceConfig:
 
 
 SURFACE_PRESETS: dict[str, SurfaceConfig] = {
-    "fast": SurfaceConfig(voxel_size_m=0.012, max_vertices=200_000, space_voxel_m=0.025),
+    "fast": SurfaceConfig(
+        voxel_size_m=0.008, truncation_voxels=4.0, max_vertices=120_000, space_voxel_m=0.025
+    ),
     "default": SurfaceConfig(),
-    "quality": SurfaceConfig(voxel_size_m=0.006, max_blocks=240_000, max_vertices=400_000),
+    "quality": SurfaceConfig(
+        voxel_size_m=0.004, truncation_voxels=7.0, max_blocks=400_000, max_vertices=300_000
+    ),
 }

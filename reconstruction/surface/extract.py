@@ -3,6 +3,9 @@
 Surface nets need no case table, share vertices across blocks by construction and give evenly spaced vertices with
 half the triangles of marching cubes. A cell counts only if all its eight corners were observed, so the mesh ends
 where knowledge ends instead of closing over it.
+
+A volume may be one slab of a larger one. Its last layer of blocks (the halo) is then the first layer of the next slab:
+the cells that touch the slab make vertices in both, and every face belongs to one slab only.
 """
 
 from dataclasses import dataclass
@@ -10,7 +13,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from reconstruction.surface.tsdf import BLOCK, BlockVolume
+from reconstruction.surface.pixels import FusionViews
+from reconstruction.surface.tsdf import BLOCK, BlockVolume, block_visible
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,7 @@ class RawMesh:
     colors: np.ndarray  # uint8 (v, 3)
     weights: np.ndarray  # float32 (v,) views
     cells: np.ndarray  # int32 (v, 3) cell of the vertex, in voxels
+    pixels: np.ndarray  # float32 (v,) size there of a pixel of the nearest view that sees it, in voxels
 
     def subset(self, keep_vertex: np.ndarray, faces: np.ndarray) -> "RawMesh":
         """Return the mesh with only the marked vertices and the given faces (of old indices) among them."""
@@ -31,7 +36,7 @@ class RawMesh:
         pick = np.flatnonzero(keep_vertex)
         return RawMesh(
             self.vertices[pick], new[faces[inside]].astype(np.int32), self.normals[pick], self.colors[pick],
-            self.weights[pick], self.cells[pick],
+            self.weights[pick], self.cells[pick], self.pixels[pick],
         )  # fmt: skip
 
 
@@ -55,13 +60,16 @@ def _corner(blocks, index, b, i, j, l):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, parallel=True)
 def _cells(
-    blocks, index, distance, weight, views, min_weight, min_views, out_code
+    blocks, index, distance, weight, views, min_weight, min_views, own, axis, out_code
 ):  # pragma: no cover - compiled
     """Per cell: the sign bits of its corners if it is crossed and observed all around, else 0."""
     for b in numba.prange(blocks.shape[0]):
         for i in range(BLOCK):
             for j in range(BLOCK):
                 for l in range(BLOCK):
+                    # Of the halo only the cells that touch the slab are known whole.
+                    if b >= own and (i if axis == 0 else (j if axis == 1 else l)) > 0:
+                        continue
                     code, valid, support = 0, True, 0
                     for c in range(8):
                         bb, x, y, z = _corner(
@@ -79,9 +87,9 @@ def _cells(
 
 @numba.njit(cache=True, parallel=True)
 def _vertices(
-    blocks, index, distance, views, color, code, first, origin, voxel, out_v, out_n, out_c, out_w, out_cell
+    blocks, index, distance, views, code, first, origin, shift, voxel, out_v, out_n, out_w, out_cell
 ):  # pragma: no cover - compiled
-    """Fill in one vertex per crossed cell: the mean of its edge crossings, the gradient there, colour and views."""
+    """Fill in one vertex per crossed cell: the mean of its edge crossings, the gradient there, and views."""
     for b in numba.prange(blocks.shape[0]):
         row = first[b]
         d = np.empty(8)
@@ -90,18 +98,13 @@ def _vertices(
                 for l in range(BLOCK):
                     if code[b, i, j, l] == 0:
                         continue
-                    support, tone, amount = 0, np.zeros(3), 0.0
+                    support = 0
                     for c in range(8):
                         bb, x, y, z = _corner(
                             blocks, index, b, i + (c & 1), j + (c >> 1 & 1), l + (c >> 2 & 1)
                         )
                         d[c] = distance[bb, x, y, z]
                         support = max(support, views[bb, x, y, z])
-                        if views[bb, x, y, z] > 0:
-                            q = 1.0 / (abs(d[c]) + 0.05)
-                            amount += q
-                            for a in range(3):
-                                tone[a] += q * color[bb, x, y, z, a]
                     px, py, pz, count = 0.0, 0.0, 0.0, 0
                     for c in range(8):
                         for a in range(3):
@@ -124,23 +127,80 @@ def _vertices(
                         gy += (wx * wz if c >> 1 & 1 else -wx * wz) * d[c]
                         gz += (wx * wy if c >> 2 & 1 else -wx * wy) * d[c]
                     length = np.sqrt(gx * gx + gy * gy + gz * gz) + 1e-12
-                    ci, cj, cl = blocks[b, 0] * BLOCK + i, blocks[b, 1] * BLOCK + j, blocks[b, 2] * BLOCK + l
+                    ci = (blocks[b, 0] + shift[0]) * BLOCK + i
+                    cj = (blocks[b, 1] + shift[1]) * BLOCK + j
+                    cl = (blocks[b, 2] + shift[2]) * BLOCK + l
                     out_v[row, 0] = origin[0] + (ci + 0.5 + px) * voxel
                     out_v[row, 1] = origin[1] + (cj + 0.5 + py) * voxel
                     out_v[row, 2] = origin[2] + (cl + 0.5 + pz) * voxel
                     out_n[row, 0], out_n[row, 1], out_n[row, 2] = gx / length, gy / length, gz / length
-                    for a in range(3):
-                        out_c[row, a] = np.uint8(tone[a] / max(amount, 1e-9) + 0.5)
                     out_w[row] = support
                     out_cell[row, 0], out_cell[row, 1], out_cell[row, 2] = ci, cj, cl
                     row += 1
 
 
-@numba.njit(cache=True)
-def _quads(blocks, index, code, vertex_row, out_faces):  # pragma: no cover - compiled
-    """Join the four cells around every crossed edge by two triangles; return how many triangles were written."""
-    count = 0
-    for b in range(blocks.shape[0]):
+@numba.njit(cache=True, parallel=True)
+def _paint(
+    first, voxel, trunc, poses, k, depth, weight, slope, reach, color, vertices, normals, out, out_pixels
+):  # pragma: no cover - compiled
+    """Color vertices by the views that see them, best those that look at their front; and find the nearest one."""
+    n, h, w = depth.shape
+    fx, fy, cx, cy = k
+    for b in numba.prange(len(first) - 1):
+        r0, r1 = first[b], first[b + 1]
+        if r0 == r1:
+            continue
+        center = np.zeros(3)
+        for r in range(r0, r1):
+            for a in range(3):
+                center[a] += vertices[r, a] / (r1 - r0)
+        radius = 0.0
+        for r in range(r0, r1):
+            for a in range(3):
+                radius = max(radius, 1.8 * abs(vertices[r, a] - center[a]))
+        total, nearest = np.zeros((r1 - r0, 4)), np.full(r1 - r0, np.inf)
+        for v in range(n):
+            m = poses[v]
+            if not block_visible(center, radius, m, k, (h, w), reach[v]):
+                continue
+            z_of, weight_of, slope_of, color_of = depth[v], weight[v], slope[v], color[v]
+            for r in range(r0, r1):
+                p = vertices[r]
+                x = m[0, 0] * p[0] + m[0, 1] * p[1] + m[0, 2] * p[2] + m[0, 3]
+                y = m[1, 0] * p[0] + m[1, 1] * p[1] + m[1, 2] * p[2] + m[1, 3]
+                z = m[2, 0] * p[0] + m[2, 1] * p[1] + m[2, 2] * p[2] + m[2, 3]
+                if z <= trunc:
+                    continue
+                pu, pv = fx * x / z + cx, fy * y / z + cy
+                if pu < 0.0 or pv < 0.0 or pu >= w or pv >= h:
+                    continue
+                ix, iy = int(pu), int(pv)
+                q = weight_of[iy, ix]
+                s = abs(z_of[iy, ix] - z) * slope_of[iy, ix] / 255.0
+                if q <= 0.0 or s >= trunc:
+                    continue
+                nearest[r - r0] = min(nearest[r - r0], z)
+                facing = 0.0
+                for a in range(3):
+                    facing -= normals[r, a] * (m[0, a] * x + m[1, a] * y + m[2, a] * z)
+                q = q * (1.0 - s / trunc) * (1.0 if facing > 0.0 else 0.01) + 1e-6
+                total[r - r0, 3] += q
+                for a in range(3):
+                    total[r - r0, a] += q * color_of[iy, ix, a]
+        for r in range(r0, r1):
+            out_pixels[r] = nearest[r - r0] / (fx * voxel)
+            for a in range(3):
+                out[r, a] = np.uint8(total[r - r0, a] / max(total[r - r0, 3], 1e-9) + 0.5)
+
+
+@numba.njit(cache=True, parallel=True)
+def _quads(
+    blocks, index, code, vertex_row, own, first, fill, out_count, out_faces
+):  # pragma: no cover - compiled
+    """Join the four cells around every crossed edge by two triangles; count them, or write them from `first` on."""
+    for b in numba.prange(own):
+        count = first[b] if fill else 0
+        ring = np.empty(4, np.int64)
         for i in range(BLOCK):
             for j in range(BLOCK):
                 for l in range(BLOCK):
@@ -153,50 +213,80 @@ def _quads(blocks, index, code, vertex_row, out_faces):  # pragma: no cover - co
                         other = (bits >> (7 ^ (1 << axis)) & 1) == 1
                         if inside == other:
                             continue
-                        ring = np.empty(4, np.int64)
                         complete = True
+                        a, c = (axis + 1) % 3, (axis + 2) % 3
                         for q in range(4):
-                            a, c = (axis + 1) % 3, (axis + 2) % 3
-                            step = [0, 0, 0]
-                            if q == 1 or q == 2:
-                                step[a] = 1
-                            if q >= 2:
-                                step[c] = 1
-                            bb, x, y, z = _corner(blocks, index, b, i + step[0], j + step[1], l + step[2])
+                            fa, fc = (1 if q == 1 or q == 2 else 0), (1 if q >= 2 else 0)
+                            di = (fa if a == 0 else 0) + (fc if c == 0 else 0)
+                            dj = (fa if a == 1 else 0) + (fc if c == 1 else 0)
+                            dl = (fa if a == 2 else 0) + (fc if c == 2 else 0)
+                            bb, x, y, z = _corner(blocks, index, b, i + di, j + dj, l + dl)
                             if bb < 0 or code[bb, x, y, z] == 0:
                                 complete = False
                                 break
                             ring[q] = vertex_row[bb, x, y, z]
                         if not complete:
                             continue
-                        if not other:  # inside lies ahead on the axis: free space is behind
-                            ring[1], ring[3] = ring[3], ring[1]
-                        for a, c in ((1, 2), (2, 3)):
-                            out_faces[count, 0] = ring[0]
-                            out_faces[count, 1] = ring[a]
-                            out_faces[count, 2] = ring[c]
-                            count += 1
-    return count
+                        if fill:
+                            # Inside ahead on the axis: free space is behind.
+                            second, fourth = (ring[1], ring[3]) if other else (ring[3], ring[1])
+                            out_faces[count, 0], out_faces[count, 1], out_faces[count, 2] = (
+                                ring[0],
+                                second,
+                                ring[2],
+                            )
+                            out_faces[count + 1, 0], out_faces[count + 1, 1] = ring[0], ring[2]
+                            out_faces[count + 1, 2] = fourth
+                        count += 2
+        out_count[b] = count - (first[b] if fill else 0)
 
 
-def extract_mesh(volume: BlockVolume, *, min_views: int, min_weight: float) -> RawMesh:
-    """Return the zero level where every corner of a cell has more than `min_weight` and one `min_views` views."""
+def extract_mesh(
+    volume: BlockVolume, views: FusionViews, reach: np.ndarray, *, own: int, axis: int, min_views: int,
+    min_weight: float,
+) -> tuple[RawMesh, int]:  # fmt: skip
+    """Return the zero level where every corner of a cell has more than `min_weight` and one `min_views` views.
+
+    Args:
+        volume: the blocks, the first `own` of them the slab's own, the others its halo.
+        views: what the vertices are colored from.
+        reach: what `tile_reach` gave for the views.
+        own: how many blocks are the slab's own.
+        axis: along which the slabs follow each other.
+        min_views: fewer views make no surface.
+        min_weight: nor does less weight.
+
+    Returns:
+        The mesh, and how many of its vertices (the first ones) are the slab's own; those of the halo follow.
+    """
+    low = volume.blocks.min(0)
+    blocks = (volume.blocks - low).astype(np.int32)
+    index = np.full(blocks.max(0) + 1, -1, np.int32)
+    index[tuple(blocks.T)] = np.arange(len(blocks), dtype=np.int32)
     code = np.zeros(volume.distance.shape, np.uint8)
     _cells(
-        volume.blocks, volume.index, volume.distance, volume.weight, volume.views, min_weight, min_views, code
+        blocks, index, volume.distance, volume.weight, volume.views, min_weight, min_views, own, axis, code
     )
-    per_block = np.count_nonzero(code.reshape(len(code), -1), axis=1)
-    first = np.concatenate([[0], np.cumsum(per_block)]).astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(np.count_nonzero(code.reshape(len(code), -1), axis=1))]).astype(
+        np.int64
+    )
     total = int(first[-1])
     vertices, normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
-    colors, weights = np.empty((total, 3), np.uint8), np.empty(total, np.float32)
-    cells = np.empty((total, 3), np.int32)
+    weights, cells = np.empty(total, np.float32), np.empty((total, 3), np.int32)
     _vertices(
-        volume.blocks, volume.index, volume.distance, volume.views, volume.color, code, first, volume.origin,
-        volume.voxel_size, vertices, normals, colors, weights, cells,
+        blocks, index, volume.distance, volume.views, code, first, volume.origin, low.astype(np.int32),
+        volume.voxel_size, vertices, normals, weights, cells,
+    )  # fmt: skip
+    colors, pixels = np.zeros((total, 3), np.uint8), np.zeros(total, np.float32)
+    _paint(
+        first, volume.voxel_size, volume.truncation, views.camera_from_world, views.intrinsics, views.depth,
+        views.weight, views.slope, reach, views.color, vertices, normals, colors, pixels,
     )  # fmt: skip
     # Rows were numbered block by block in memory order, which is what a running count over `code` gives.
-    vertex_row = (np.cumsum(code.reshape(-1) != 0) - 1).astype(np.int32).reshape(code.shape)
-    faces = np.empty((6 * total, 3), np.int32)
-    faces = faces[: _quads(volume.blocks, volume.index, code, vertex_row, faces)]
-    return RawMesh(vertices, np.ascontiguousarray(faces), normals, colors, weights, cells)
+    vertex_row = (np.cumsum(code.reshape(-1) != 0, dtype=np.int32) - 1).reshape(code.shape)
+    counts, none = np.zeros(own, np.int64), np.empty((0, 3), np.int32)
+    _quads(blocks, index, code, vertex_row, own, counts, False, counts, none)
+    face_first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    faces = np.empty((int(face_first[-1]), 3), np.int32)
+    _quads(blocks, index, code, vertex_row, own, face_first, True, counts, faces)
+    return RawMesh(vertices, faces, normals, colors, weights, cells, pixels), int(first[own])

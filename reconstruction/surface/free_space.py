@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from reconstruction.surface.pixels import FusionViews
-from reconstruction.surface.tsdf import _block_visible
+from reconstruction.surface.tsdf import block_visible
 from reconstruction.types import SpaceGrid
 
 _CHUNK = 8
@@ -37,7 +37,7 @@ def _free(
         for o in range(n):
             v = order[o]
             m = poses[v]
-            if not _block_visible(center, radius, m, k, (h, w), tiles[v], 0.0):
+            if not block_visible(center, radius, m, k, (h, w), tiles[v]):
                 continue
             for i in range(x0, x1):
                 px = origin[0] + (i + 0.5) * voxel
@@ -85,8 +85,19 @@ def carve_space(
     return SpaceGrid(np.asarray(origin, np.float64), float(voxel_size), state)
 
 
-def mark_surface(space: SpaceGrid, vertices: np.ndarray) -> None:
-    """Enter the voxels of mesh vertices (v, 3) as surface, in place."""
-    cell = np.floor((vertices - space.origin) / space.voxel_size_m).astype(np.int64)
-    cell = cell[np.all((cell >= 0) & (cell < space.state.shape), axis=1)]
-    space.state[tuple(cell.T)] = SURFACE
+def mark_surface(space: SpaceGrid, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Enter the voxels that a mesh crosses as surface, in place: at its vertices, and between them on wide faces."""
+    corners = vertices[faces]
+    span = np.sqrt(((corners - np.roll(corners, 1, axis=1)) ** 2).sum(-1).max(1))
+    points = [vertices]
+    parts = 2 ** np.ceil(np.log2(np.maximum(span / (0.75 * space.voxel_size_m), 1.0))).astype(int)
+    for count in np.unique(parts[parts > 1]):
+        wide = corners[parts == count]
+        for i in range(count + 1):
+            for j in range(count + 1 - i):
+                share = np.array([i, j, count - i - j], np.float32) / np.float32(count)
+                points.append(np.einsum("k,nkd->nd", share, wide))
+    for part in points:
+        cell = np.floor((part - space.origin) / space.voxel_size_m).astype(np.int64)
+        cell = cell[np.all((cell >= 0) & (cell < space.state.shape), axis=1)]
+        space.state[tuple(cell.T)] = SURFACE

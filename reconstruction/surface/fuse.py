@@ -1,11 +1,17 @@
 """Stage 5: depth maps -> surface mesh and free space."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.surface.config import SurfaceConfig
 from reconstruction.types import Camera, DepthMaps, PosedFrames, SpaceGrid, Surface
 from registry.errors import InputError
+
+if TYPE_CHECKING:
+    from reconstruction.surface.extract import RawMesh
+    from reconstruction.surface.pixels import FusionViews
 
 _BOX_MARGIN_M = 0.05
 
@@ -42,16 +48,24 @@ def _observed_box(
     return low, high
 
 
-def _fuse_blocks(posed, views, low, high, config: SurfaceConfig, progress: Progress):
-    """Allocate and fill the blocks; coarsen until they fit."""
-    from reconstruction.surface.tsdf import BLOCK, integrate, surface_blocks
+def _fuse_blocks(
+    posed: PosedFrames,
+    views: "FusionViews",
+    low: np.ndarray,
+    high: np.ndarray,
+    config: SurfaceConfig,
+    progress: Progress,
+) -> tuple["RawMesh", float]:
+    """Allocate the blocks, coarser until they are few enough, and fuse; return the mesh and the voxel's edge."""
+    from reconstruction.surface.slabs import fuse_slabs
+    from reconstruction.surface.tsdf import BLOCK, surface_blocks
 
     voxel = config.voxel_size_m
     while True:
-        truncation = config.truncation_voxels * voxel
         shape = tuple(int(s) for s in np.ceil((high - low) / (BLOCK * voxel)).astype(int) + 1)
-        # Marks of sixteen views are held at once, one byte a block: the dense grid itself must stay small.
+        # One byte a block of the dense grid: it must stay small, too.
         if np.prod(shape, dtype=np.int64) <= 40 * config.max_blocks:
+            truncation = config.truncation_voxels * voxel
             blocks = surface_blocks(views, posed.world_from_camera, low, shape, voxel, truncation)
             if len(blocks) <= config.max_blocks:
                 break
@@ -61,10 +75,17 @@ def _fuse_blocks(posed, views, low, high, config: SurfaceConfig, progress: Progr
             f"surface: voxels of {voxel * 1000:.1f} mm instead of {config.voxel_size_m * 1000:.1f} mm, "
             f"since the scene is large ({', '.join(f'{s:.1f}' for s in high - low)} m)"
         )
-    return integrate(views, blocks, shape, low, voxel, truncation)
+    return fuse_slabs(views, blocks, low, voxel, config, progress), voxel
 
 
-def _space(views, low, high, vertices: np.ndarray, config: SurfaceConfig, progress: Progress) -> SpaceGrid:
+def _space(
+    views: "FusionViews",
+    low: np.ndarray,
+    high: np.ndarray,
+    mesh: "RawMesh",
+    config: SurfaceConfig,
+    progress: Progress,
+) -> SpaceGrid:
     from reconstruction.surface.free_space import carve_space, mark_surface
 
     voxel = config.space_voxel_m
@@ -77,7 +98,7 @@ def _space(views, low, high, vertices: np.ndarray, config: SurfaceConfig, progre
         views, low, shape, voxel, margin=config.free_margin_m, completed_margin=config.completed_margin_m,
         min_rays=config.free_min_rays,
     )  # fmt: skip
-    mark_surface(space, vertices)
+    mark_surface(space, mesh.vertices, mesh.faces)
     return space
 
 
@@ -92,26 +113,21 @@ def fuse_surface(
         config: Settings.
         progress: Where steps and decisions are reported.
     """
-    from reconstruction.surface.extract import extract_mesh
     from reconstruction.surface.pixels import prepare_views
     from reconstruction.surface.thinning import drop_small_components, thin
 
-    progress.start(3, "fusing depth")
     low, high = _observed_box(posed, depth, config)
     views = prepare_views(
         depth, posed.world_from_camera, posed.images, reference_depth=config.reference_depth_m,
         max_depth=config.max_depth_m, completed_weight=config.completed_weight,
     )  # fmt: skip
-    volume = _fuse_blocks(posed, views, low, high, config, progress)
-    progress.advance()
-    # A vertex that only completed pixels made needs the same number of views, at their lower weight.
-    mesh = extract_mesh(volume, min_views=config.min_views, min_weight=0.02 * config.completed_weight)
+    mesh, voxel_size = _fuse_blocks(posed, views, low, high, config, progress)
     mesh, dropped = drop_small_components(mesh, config.min_component_m2)
     if dropped:
         progress.note(
             f"surface: {dropped} scattered pieces below {config.min_component_m2 * 1e4:.0f} cm2 dropped"
         )
-    fine_vertices = mesh.vertices
+    space = _space(views, low, high, mesh, config, progress)
     mesh = thin(mesh, config.max_vertices)
     if len(mesh.faces) == 0:
         raise InputError(
@@ -122,9 +138,6 @@ def fuse_surface(
         progress.note(
             f"surface: {len(mesh.vertices)} vertices, more than the {config.max_vertices} asked for"
         )
-    progress.advance()
-    space = _space(views, low, high, fine_vertices, config, progress)
-    progress.advance()
     return Surface(
-        mesh.vertices, mesh.faces, mesh.normals, mesh.colors, mesh.weights, float(volume.voxel_size), space
+        mesh.vertices, mesh.faces, mesh.normals, mesh.colors, mesh.weights, float(voxel_size), space
     )

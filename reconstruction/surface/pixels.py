@@ -26,13 +26,6 @@ class FusionViews:
     tile_max: np.ndarray  # float32 (n, th, tw) largest depth in each tile of TILE_PX pixels
     color: np.ndarray  # uint8 (n, h, w, 3)
 
-    def subset(self, rows: np.ndarray) -> "FusionViews":
-        """Return only the given views."""
-        return FusionViews(
-            self.camera, self.camera_from_world[rows], self.depth[rows], self.weight[rows], self.slope[rows],
-            self.carve[rows], self.tile_max[rows], self.color[rows],
-        )  # fmt: skip
-
     @property
     def intrinsics(self) -> np.ndarray:
         """Return fx, fy, cx, cy."""

@@ -14,6 +14,9 @@ import numpy as np
 from reconstruction.surface.pixels import TILE_PX, FusionViews
 
 BLOCK = 8
+_ONE_SURFACE = 0.02  # neighbouring pixels whose depths differ by less (relative) lie on one surface
+_IN_BAND = 0.5  # of the truncation: nearer than that a sample tells where the surface is
+_RAY_WEIGHT = 0.05  # least weight of a ray that crossed a voxel
 
 
 @dataclass(frozen=True)
@@ -24,22 +27,33 @@ class BlockVolume:
     voxel_size: float
     truncation: float
     blocks: np.ndarray  # int32 (m, 3)
-    index: np.ndarray  # int32 (bx, by, bz) row of `blocks`, -1 = none
     distance: np.ndarray  # float32 (m, 8, 8, 8) in [-1, 1], in units of the truncation
     weight: np.ndarray  # float32 (m, 8, 8, 8)
     views: np.ndarray  # uint8 (m, 8, 8, 8) how many views saw the surface near the voxel
-    free_views: np.ndarray  # uint8 (m, 8, 8, 8) how many views measured something behind the voxel
-    color: np.ndarray  # uint8 (m, 8, 8, 8, 3)
+
+    def rows(self, keep: np.ndarray) -> "BlockVolume":
+        """Return only the blocks that `keep` (a mask or slice) picks."""
+        return BlockVolume(
+            self.origin, self.voxel_size, self.truncation, self.blocks[keep], self.distance[keep],
+            self.weight[keep], self.views[keep],
+        )  # fmt: skip
+
+    def joined(self, other: "BlockVolume") -> "BlockVolume":
+        """Return this volume with the blocks of another one behind its own."""
+        pairs = ((getattr(self, n), getattr(other, n)) for n in ("blocks", "distance", "weight", "views"))
+        return BlockVolume(
+            self.origin, self.voxel_size, self.truncation, *(np.concatenate(pair) for pair in pairs)
+        )
 
 
 @numba.njit(cache=True, parallel=True)
 def _mark(
     depth, weight, world_from_camera, k, origin, block_size, truncation, stride, marks
 ):  # pragma: no cover
-    """Set marks[view, bx, by, bz] for every block that a view's surface band touches."""
+    """Set marks[bx, by, bz] for every block that a view's surface band touches; all threads write the same value."""
     n, h, w = depth.shape
     fx, fy, cx, cy = k
-    nx, ny, nz = marks.shape[1:]
+    nx, ny, nz = marks.shape
     for v in numba.prange(n):
         m = world_from_camera[v]
         for y in range(0, h, stride):
@@ -57,27 +71,28 @@ def _mark(
                     by = int(math.floor((py - origin[1]) / block_size))
                     bz = int(math.floor((pz - origin[2]) / block_size))
                     if 0 <= bx < nx and 0 <= by < ny and 0 <= bz < nz:
-                        marks[v, bx, by, bz] = True
+                        marks[bx, by, bz] = True
 
 
-@numba.njit(cache=True)
-def _nearest_or_bilinear(depth, u, v, tolerance):  # pragma: no cover - compiled
-    """Sample depth at pixel coordinates: bilinear where the four neighbours are one surface."""
+@numba.njit(cache=True, inline="always")
+def _bilinear(depth, here, pu, pv):  # pragma: no cover - compiled
+    """Sample depth at pixel coordinates: bilinear where the four neighbours are one surface, else `here`."""
     h, w = depth.shape
-    x, y = u - 0.5, v - 0.5
+    x, y = pu - 0.5, pv - 0.5
     x0, y0 = int(math.floor(x)), int(math.floor(y))
-    if 0 <= x0 < w - 1 and 0 <= y0 < h - 1:
-        a, b, c, d = depth[y0, x0], depth[y0, x0 + 1], depth[y0 + 1, x0], depth[y0 + 1, x0 + 1]
-        low = min(min(a, b), min(c, d))
-        if low > 0.0 and max(max(a, b), max(c, d)) - low < tolerance * low:
-            fx, fy = x - x0, y - y0
-            return (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
-    return depth[int(v), int(u)]
+    if x0 < 0 or y0 < 0 or x0 + 1 >= w or y0 + 1 >= h:
+        return here
+    a, b, c, d = depth[y0, x0], depth[y0, x0 + 1], depth[y0 + 1, x0], depth[y0 + 1, x0 + 1]
+    low = min(min(a, b), min(c, d))
+    if low <= 0.0 or max(max(a, b), max(c, d)) - low >= _ONE_SURFACE * low:
+        return here
+    tx, ty = x - x0, y - y0
+    return (a * (1.0 - tx) + b * tx) * (1.0 - ty) + (c * (1.0 - tx) + d * tx) * ty
 
 
 @numba.njit(cache=True)
-def _block_visible(center, radius, m, k, shape, tiles, slack):  # pragma: no cover - compiled
-    """Tell whether a view may see a ball: in the frustum, and not wholly behind all depth there."""
+def block_visible(center, radius, m, k, shape, reach):  # pragma: no cover - compiled
+    """Tell whether a view may see a ball: in the frustum, and not wholly behind what it reaches there."""
     h, w = shape
     fx, fy, cx, cy = k
     z = m[2, 0] * center[0] + m[2, 1] * center[1] + m[2, 2] * center[2] + m[2, 3]
@@ -88,93 +103,240 @@ def _block_visible(center, radius, m, k, shape, tiles, slack):  # pragma: no cov
     u, v, r = fx * x / z + cx, fy * y / z + cy, max(fx, fy) * radius / (z - radius)
     if u + r < 0 or u - r >= w or v + r < 0 or v - r >= h:
         return False
-    x0, x1 = max(0, int(u - r) // TILE_PX), min(tiles.shape[1] - 1, int(u + r) // TILE_PX)
-    y0, y1 = max(0, int(v - r) // TILE_PX), min(tiles.shape[0] - 1, int(v + r) // TILE_PX)
+    x0, x1 = max(0, int(u - r) // TILE_PX), min(reach.shape[1] - 1, int(u + r) // TILE_PX)
+    y0, y1 = max(0, int(v - r) // TILE_PX), min(reach.shape[0] - 1, int(v + r) // TILE_PX)
     for ty in range(y0, y1 + 1):
         for tx in range(x0, x1 + 1):
-            if tiles[ty, tx] + slack > z - radius:
+            if reach[ty, tx] > z - radius:
                 return True
     return False
 
 
 @numba.njit(cache=True, parallel=True)
 def _integrate(
-    blocks, origin, voxel, trunc, poses, k, depth, weight, slope, carve, tiles, color, mask, use_mask,
-    out_distance, out_weight, out_views, out_free, out_color,
-):  # pragma: no cover - compiled  # fmt: skip
+    blocks,
+    origin,
+    edge,
+    trunc,
+    poses,
+    k,
+    depth,
+    weight,
+    slope,
+    carve,
+    reach,
+    out_distance,
+    out_weight,
+    out_views,
+):  # pragma: no cover - compiled
     n, h, w = depth.shape
+    side = out_distance.shape[1]
+    voxel = edge / side
     fx, fy, cx, cy = k
-    radius = 0.5 * math.sqrt(3.0) * BLOCK * voxel
+    radius = 0.5 * math.sqrt(3.0) * edge
+    share = 1.0 / trunc
     for b in numba.prange(blocks.shape[0]):
-        corner = origin + blocks[b] * (BLOCK * voxel) + 0.5 * voxel
-        center = corner + 0.5 * (BLOCK - 1) * voxel
-        total = np.zeros((BLOCK, BLOCK, BLOCK, 6), np.float32)  # sum of w*d, w, wc, wc*r, wc*g, wc*b
+        corner = origin + blocks[b] * edge + 0.5 * voxel
+        center = origin + (blocks[b] + 0.5) * edge
+        # Sums of weight * distance and of weight, first in place.
+        total, amount, seen = out_distance[b], out_weight[b], out_views[b]
         for v in range(n):
             m = poses[v]
-            if not _block_visible(center, radius, m, k, (h, w), tiles[v], 4.0 * trunc):
+            if not block_visible(center, radius, m, k, (h, w), reach[v]):
                 continue
-            for i in range(BLOCK):
+            z_of, weight_of, slope_of, carve_of = depth[v], weight[v], slope[v], carve[v]
+            # Pixel times depth, and depth, are affine along every row of voxels.
+            sz = m[2, 2] * voxel
+            su, sv = (fx * m[0, 2] + cx * m[2, 2]) * voxel, (fy * m[1, 2] + cy * m[2, 2]) * voxel
+            for i in range(side):
                 px = corner[0] + i * voxel
-                for j in range(BLOCK):
+                for j in range(side):
                     py = corner[1] + j * voxel
-                    ax = m[0, 0] * px + m[0, 1] * py + m[0, 3]
-                    ay = m[1, 0] * px + m[1, 1] * py + m[1, 3]
-                    az = m[2, 0] * px + m[2, 1] * py + m[2, 3]
-                    for l in range(BLOCK):
-                        pz = corner[2] + l * voxel
-                        z = az + m[2, 2] * pz
+                    z0 = m[2, 0] * px + m[2, 1] * py + m[2, 2] * corner[2] + m[2, 3]
+                    u0 = fx * (m[0, 0] * px + m[0, 1] * py + m[0, 2] * corner[2] + m[0, 3]) + cx * z0
+                    v0 = fy * (m[1, 0] * px + m[1, 1] * py + m[1, 2] * corner[2] + m[1, 3]) + cy * z0
+                    for l in range(side):
+                        z = z0 + l * sz
                         if z <= trunc:
                             continue
-                        pu = fx * (ax + m[0, 2] * pz) / z + cx
-                        pv = fy * (ay + m[1, 2] * pz) / z + cy
+                        inverse = 1.0 / z
+                        pu, pv = (u0 + l * su) * inverse, (v0 + l * sv) * inverse
                         if pu < 0.0 or pv < 0.0 or pu >= w or pv >= h:
                             continue
                         ix, iy = int(pu), int(pv)
-                        kind = carve[v, iy, ix]
+                        kind = carve_of[iy, ix]
                         if kind == 0:
                             continue
-                        d = _nearest_or_bilinear(depth[v], pu, pv, 0.02)
-                        s = (d - z) * slope[v, iy, ix] / 255.0
-                        if s < -trunc:
+                        d = z_of[iy, ix]
+                        cosine = slope_of[iy, ix] * (1.0 / 255.0)
+                        s = (d - z) * cosine
+                        # Interpolating moves a depth by less than the span of one surface: far off nothing changes.
+                        span = _ONE_SURFACE * d * cosine
+                        if s < -trunc - span:
                             continue
-                        q = weight[v, iy, ix]
-                        own = not use_mask or mask[v, iy, ix]
-                        if s > trunc or not own:
-                            # Space that a ray crossed; pixels of other things tell only that it is free.
-                            if kind != 2 or s < (trunc if own else voxel):
+                        if s <= trunc + span:
+                            s = (_bilinear(z_of, d, pu, pv) - z) * cosine
+                            if s < -trunc:
                                 continue
-                            if out_free[b, i, j, l] < 255:
-                                out_free[b, i, j, l] += 1
-                            q = max(q, np.float32(0.05))
-                            total[i, j, l, 0] += q * min(s / trunc, 1.0)
-                            total[i, j, l, 1] += q
+                        q = weight_of[iy, ix]
+                        if s > trunc:
+                            # Space that a ray crossed: it speaks against any surface there.
+                            if kind == 2:
+                                q = max(q, np.float32(_RAY_WEIGHT))
+                                total[i, j, l] += q
+                                amount[i, j, l] += q
                             continue
                         if q <= 0.0:
                             continue
                         if s < 0.0:
                             # Behind a surface nothing is measured: trust fades, so that thin things keep two sides.
-                            q *= 1.0 + s / trunc
-                        elif kind == 2 and s > 1.5 * voxel and out_free[b, i, j, l] < 255:
-                            out_free[b, i, j, l] += 1
-                        total[i, j, l, 0] += q * s / trunc
-                        total[i, j, l, 1] += q
-                        if out_views[b, i, j, l] < 255:
-                            out_views[b, i, j, l] += 1
-                        near = q * (1.0 - min(1.0, abs(s) / trunc)) + np.float32(1e-6)
-                        total[i, j, l, 2] += near
-                        for c in range(3):
-                            total[i, j, l, 3 + c] += near * color[v, iy, ix, c]
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                for l in range(BLOCK):
-                    q = total[i, j, l, 1]
-                    out_weight[b, i, j, l] = q
-                    if q > 0.0:
-                        out_distance[b, i, j, l] = total[i, j, l, 0] / q
-                    near = total[i, j, l, 2]
-                    if near > 0.0:
-                        for c in range(3):
-                            out_color[b, i, j, l, c] = np.uint8(total[i, j, l, 3 + c] / near + 0.5)
+                            q *= 1.0 + s * share
+                        total[i, j, l] += q * s * share
+                        amount[i, j, l] += q
+                        if seen[i, j, l] < 255:
+                            seen[i, j, l] += 1
+        for i in range(side):
+            for j in range(side):
+                for l in range(side):
+                    if amount[i, j, l] > 0.0:
+                        total[i, j, l] /= amount[i, j, l]
+
+
+@numba.njit(cache=True, parallel=True)
+def _tile_reach(depth, weight, slope, trunc, reach):  # pragma: no cover - compiled
+    """Per tile, the depth behind which no pixel says anything: its surface and the band behind it."""
+    n, h, w = depth.shape
+    for v in numba.prange(n):
+        for y in range(h):
+            for x in range(w):
+                if depth[v, y, x] > 0.0 and slope[v, y, x] > 0:
+                    far = depth[v, y, x] + trunc * 255.0 / slope[v, y, x]
+                    if far > reach[v, y // TILE_PX, x // TILE_PX]:
+                        reach[v, y // TILE_PX, x // TILE_PX] = far
+
+
+@numba.njit(cache=True)
+def _solve(a, r):  # pragma: no cover - compiled
+    """Solve a symmetric positive 4x4 system in place; a call of LAPACK would take seconds to compile."""
+    for p in range(4):
+        for q in range(p + 1, 4):
+            f = a[q, p] / a[p, p]
+            for c in range(p, 4):
+                a[q, c] -= f * a[p, c]
+            r[q] -= f * r[p]
+    for p in range(3, -1, -1):
+        for c in range(p + 1, 4):
+            r[p] -= a[p, c] * r[c]
+        r[p] /= a[p, p]
+
+
+@numba.njit(cache=True, parallel=True)
+def _fit_blocks(distance, weight, out_fit, out_error):  # pragma: no cover - compiled
+    """Fit distance = g . x + c to the samples of each block that lie in the band; x in samples from the block's centre.
+
+    out_error is the largest deviation; blocks with too few samples in the band to fit get -1.
+    """
+    side = distance.shape[1]
+    half = 0.5 * (side - 1)
+    for b in numba.prange(distance.shape[0]):
+        a, r, x = np.zeros((4, 4)), np.zeros(4), np.ones(4)
+        count = 0
+        for i in range(side):
+            for j in range(side):
+                for l in range(side):
+                    d = distance[b, i, j, l]
+                    if weight[b, i, j, l] <= 0.0 or abs(d) > _IN_BAND:
+                        continue
+                    count += 1
+                    x[0], x[1], x[2] = i - half, j - half, l - half
+                    for p in range(4):
+                        r[p] += x[p] * d
+                        for q in range(4):
+                            a[p, q] += x[p] * x[q]
+        out_error[b] = -1.0
+        if count < side * side // 2:
+            continue
+        for p in range(4):
+            a[p, p] += 1e-3
+        _solve(a, r)
+        fit = r
+        worst = 0.0
+        for i in range(side):
+            for j in range(side):
+                for l in range(side):
+                    d = distance[b, i, j, l]
+                    if weight[b, i, j, l] <= 0.0:
+                        continue
+                    e = fit[0] * (i - half) + fit[1] * (j - half) + fit[2] * (l - half) + fit[3]
+                    # Only which side it is on counts for a sample away from the surface.
+                    worst = max(
+                        worst, abs(min(_IN_BAND, max(-_IN_BAND, e)) - min(_IN_BAND, max(-_IN_BAND, d)))
+                    )
+        out_error[b] = worst
+        for p in range(4):
+            out_fit[b, p] = fit[p]
+
+
+@numba.njit(cache=True, parallel=True)
+def _pixel_sizes(blocks, origin, edge, poses, k, shape, reach, out):  # pragma: no cover - compiled
+    """Per block the least size of a pixel on it, among the views that may see it; infinite where none does."""
+    radius = 0.5 * math.sqrt(3.0) * edge
+    for b in numba.prange(blocks.shape[0]):
+        center = origin + (blocks[b] + 0.5) * edge
+        nearest = np.inf
+        for v in range(poses.shape[0]):
+            m = poses[v]
+            z = m[2, 0] * center[0] + m[2, 1] * center[1] + m[2, 2] * center[2] + m[2, 3]
+            if 0.0 < z < nearest and block_visible(center, radius, m, k, shape, reach[v]):
+                nearest = z
+        out[b] = nearest / k[0]
+
+
+@numba.njit(cache=True, inline="always")
+def _trilinear(d, w, x, y, z):  # pragma: no cover - compiled
+    """Interpolate samples (s, s, s) at sample coordinates, a little beyond too; the nearest where one is missing."""
+    top = d.shape[0] - 2
+    i, j, l = min(max(int(x), 0), top), min(max(int(y), 0), top), min(max(int(z), 0), top)
+    u, v, t = x - i, y - j, z - l
+    total = 0.0
+    for c in range(8):
+        a, b, e = c & 1, c >> 1 & 1, c >> 2 & 1
+        if w[i + a, j + b, l + e] <= 0.0:
+            return np.float64(d[int(x + 0.5), int(y + 0.5), int(z + 0.5)])
+        total += (
+            (u if a else 1.0 - u) * (v if b else 1.0 - v) * (t if e else 1.0 - t) * d[i + a, j + b, l + e]
+        )
+    return total
+
+
+@numba.njit(cache=True, parallel=True)
+def _spread(
+    rows, flat, fit, distance, weight, views, out_distance, out_weight, out_views
+):  # pragma: no cover - compiled
+    """Fill the voxels of blocks from their fitted plane where they are flat, else from the samples around."""
+    side, coarse = out_distance.shape[1], weight.shape[1]
+    ratio = side // coarse
+    half = 0.5 * (coarse - 1)
+    for n in numba.prange(len(rows)):
+        b = rows[n]
+        for i in range(side):
+            x = (i + 0.5) / ratio - 0.5
+            for j in range(side):
+                y = (j + 0.5) / ratio - 0.5
+                for l in range(side):
+                    z = (l + 0.5) / ratio - 0.5
+                    if flat[b]:
+                        d = (
+                            fit[b, 0] * (x - half)
+                            + fit[b, 1] * (y - half)
+                            + fit[b, 2] * (z - half)
+                            + fit[b, 3]
+                        )
+                    else:
+                        d = _trilinear(distance[b], weight[b], x, y, z)
+                    out_distance[b, i, j, l] = min(1.0, max(-1.0, d))
+                    out_weight[b, i, j, l] = weight[b, i // ratio, j // ratio, l // ratio]
+                    out_views[b, i, j, l] = views[b, i // ratio, j // ratio, l // ratio]
 
 
 def surface_blocks(
@@ -182,46 +344,63 @@ def surface_blocks(
     voxel_size: float, truncation: float,
 ) -> np.ndarray:  # fmt: skip
     """Return the blocks (m, 3) that the surface bands of at least one view touch, in a grid of `shape` blocks."""
-    counts = np.zeros(shape, bool)
-    # A few views at a time bound the memory; every second pixel is enough for blocks of eight voxels.
-    for start in range(0, len(views.depth), 16):
-        part = slice(start, start + 16)
-        marks = np.zeros((len(views.depth[part]), *shape), bool)
-        _mark(
-            views.depth[part], views.weight[part], np.ascontiguousarray(world_from_camera[part]), views.intrinsics,
-            origin, BLOCK * voxel_size, truncation, 2, marks,
-        )  # fmt: skip
-        counts |= marks.any(0)
-    return np.argwhere(counts).astype(np.int32)
+    marks = np.zeros(shape, bool)
+    # Every second pixel is enough for blocks of eight voxels.
+    _mark(
+        views.depth, views.weight, np.ascontiguousarray(world_from_camera), views.intrinsics, origin,
+        BLOCK * voxel_size, truncation, 2, marks,
+    )  # fmt: skip
+    return np.argwhere(marks).astype(np.int32)
+
+
+def tile_reach(views: FusionViews, truncation: float) -> np.ndarray:
+    """Return per view and tile of pixels the depth (n, th, tw) behind which nothing is said of space."""
+    reach = np.zeros(views.tile_max.shape, np.float32)
+    _tile_reach(views.depth, views.weight, views.slope, truncation, reach)
+    return reach
+
+
+def _sampled(
+    views: FusionViews, reach: np.ndarray, blocks: np.ndarray, origin: np.ndarray, edge: float, truncation: float,
+    side: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    cells = (len(blocks), side, side, side)
+    distance, weight, seen = (
+        np.zeros(cells, np.float32),
+        np.zeros(cells, np.float32),
+        np.zeros(cells, np.uint8),
+    )
+    _integrate(
+        blocks, origin, edge, truncation, views.camera_from_world, views.intrinsics, views.depth, views.weight,
+        views.slope, views.carve, reach, distance, weight, seen,
+    )  # fmt: skip
+    return distance, weight, seen
 
 
 def integrate(
-    views: FusionViews, blocks: np.ndarray, shape: tuple[int, int, int], origin: np.ndarray, voxel_size: float,
-    truncation: float, mask: np.ndarray | None = None,
+    views: FusionViews, reach: np.ndarray, blocks: np.ndarray, origin: np.ndarray, voxel_size: float,
+    truncation: float, flat_error: float,
 ) -> BlockVolume:  # fmt: skip
-    """Fuse all views into the given blocks. `mask` (n, h, w) restricts which pixels may make surface."""
-    m = len(blocks)
-    cells = (m, BLOCK, BLOCK, BLOCK)
-    distance, weight = np.zeros(cells, np.float32), np.zeros(cells, np.float32)
-    seen, free = np.zeros(cells, np.uint8), np.zeros(cells, np.uint8)
-    color = np.zeros((*cells, 3), np.uint8)
-    used = np.zeros((1, 1, 1), bool) if mask is None else np.ascontiguousarray(mask, bool)
-    _integrate(
-        blocks, np.asarray(origin, np.float64), voxel_size, truncation, views.camera_from_world, views.intrinsics,
-        views.depth, views.weight, views.slope, views.carve, views.tile_max, views.color, used, mask is not None,
-        distance, weight, seen, free, color,
-    )  # fmt: skip
-    index = np.full(shape, -1, np.int32)
-    index[tuple(blocks.T)] = np.arange(m, dtype=np.int32)
-    return BlockVolume(
-        np.asarray(origin, np.float64),
-        voxel_size,
-        truncation,
-        blocks,
-        index,
-        distance,
-        weight,
-        seen,
-        free,
-        color,
-    )
+    """Fuse all views into the given blocks (m, 3).
+
+    Every block is first sampled at every other voxel. That is enough where the samples lie on one plane within
+    `flat_error` metres, where no surface is near, and where no view is so close that its pixels are as small as a
+    voxel; only the rest is sampled at every voxel. On rooms that is a third.
+    """
+    origin, edge = np.asarray(origin, np.float64), BLOCK * voxel_size
+    coarse, weight, seen = _sampled(views, reach, blocks, origin, edge, truncation, BLOCK // 2)
+    fit, error, pixel = np.zeros((len(blocks), 4)), np.zeros(len(blocks)), np.zeros(len(blocks))
+    _fit_blocks(coarse, weight, fit, error)
+    shape = views.depth.shape[1:]
+    _pixel_sizes(blocks, origin, edge, views.camera_from_world, views.intrinsics, shape, reach, pixel)
+    flat = (error >= 0) & (error * truncation <= flat_error)
+    # A voxel of an edge that the surface crosses is at most one voxel from it: farther off only the sign counts.
+    away = ~((weight > 0) & (np.abs(coarse) < 1.4 * voxel_size / truncation)).any(axis=(1, 2, 3))
+    simple = flat | away | (pixel > voxel_size)
+    cells = (len(blocks), BLOCK, BLOCK, BLOCK)
+    out = np.zeros(cells, np.float32), np.zeros(cells, np.float32), np.zeros(cells, np.uint8)
+    _spread(np.flatnonzero(simple), flat, fit, coarse, weight, seen, *out)
+    rough = np.flatnonzero(~simple)
+    for into, fine in zip(out, _sampled(views, reach, blocks[rough], origin, edge, truncation, BLOCK)):
+        into[rough] = fine
+    return BlockVolume(origin, voxel_size, truncation, blocks, *out)
