@@ -19,7 +19,7 @@ from reconstruction.types import AssembledScene, AssetSet, PlacedObject, SceneGr
 from registry.errors import SimReconError
 from registry.simulation import TIMESTEP_S, BodySpec, build_physics, physics_report, pose_change
 
-VERSION = 2
+VERSION = 3
 
 
 def assemble(
@@ -88,9 +88,10 @@ def _settle_together(
     report = best[2]
     unstable = [entry["id"] for entry in report["objects"] if not entry["stable"]]
     if unstable and config.freeze_unstable:
+        for placement in list(placer.placed.values()):
+            placer.commit(placement)  # the workbench may hold what a worse round came to
         for i in unstable:
-            note = "made immovable: it does not stay where it was seen"
-            placer.placed[i] = placer.placed[i].noted(note, dynamic=False)
+            placer.hold(i, "made immovable: it does not stay where it was seen")
         report = physics_report(scene_specs(list(placer.placed.values()), base))
     done = "it was made immovable" if config.freeze_unstable else "it was left as it is"
     for i in unstable:

@@ -151,6 +151,14 @@ class Placer:
         self.commit(placement)
         return placement
 
+    def hold(self, asset_id: int, note: str) -> Placement:
+        """Make a placed thing immovable; where it reaches into its neighbors it is shifted or cut first."""
+        old = self.placed[asset_id].noted(note, dynamic=False)
+        # Whether it stands by itself is another question, answered before.
+        held = replace(self._keep_clear(old, lift=self.config.max_shift_m), stands=old.stands)
+        self.commit(held)
+        return held
+
     # Furniture and hanging things: moved as little as possible, never let go.
 
     def _stand_furniture(self, item: Placement) -> Placement:

@@ -201,3 +201,17 @@ def test_furniture_deep_inside_other_furniture_is_cut_not_left_overlapping():
     cut_off = [item for item in scene.placed if "inside a neighbor" in item.repair]
     assert len(cut_off) == 1
     assert cut_off[0].moved_m < 0.05
+
+
+def test_a_small_thing_frozen_inside_furniture_is_cut_clear_of_it():
+    """A box sticks 9 cm out of a cabinet's side in mid-air: it can neither be shifted out nor stay by itself."""
+    cabinet = box(3, (0.8, 0.5, 0.9), (0.0, 0.0, 0.0), label="cabinet", mass=40.0)
+    stuck = box(4, (0.2, 0.1, 0.1), (0.39, 0.0, 0.45))
+    graph = SceneGraph((Edge(3, "supported_by", 1, 1.0, ""), Edge(4, "supported_by", 3, 1.0, "")))
+    scene = assemble(room(cabinet, stuck), graph, AssemblyConfig())
+    held = next(item for item in scene.placed if item.id == 4)
+    assert not held.dynamic
+    assert not held.stable
+    assert held.moved_m < 0.1
+    assert "inside a neighbor" in held.repair
+    assert scene.physics_report["spawn_penetration_mm"] < 1.0
