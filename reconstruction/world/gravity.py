@@ -18,6 +18,7 @@ from reconstruction.world.samples import SurfaceSamples
 _ROLL_SIGMA_DEG = 4.0
 _PITCH_SIGMA_DEG = 28.0
 _SEARCH_DEG = 60.0
+_MAX_ROLL_COST = 1.8  # six times the surface outweighs any roll
 _VOTE_WIDTH_DEG = 5.0
 _WALL_SHARE = 0.35  # a wall's vote leaves one direction free, and furniture has many upright faces
 _PLANE_SIGMA_DEG = 0.6  # how far a fitted plane may be from level or plumb and still count in full
@@ -89,8 +90,8 @@ def _best_vote(
     plumb = np.exp(-0.5 * (np.arcsin(np.clip(cosine, -1, 1)) / width) ** 2)
     votes = (level + _WALL_SHARE * plumb) @ mass
     roll = np.arcsin(np.clip(candidates @ right.T, -1, 1)) / np.radians(_ROLL_SIGMA_DEG)
-    # A Cauchy-like penalty: a few turned frames must not veto, and neither may the mean of many.
-    roll_cost = np.log1p(0.5 * roll**2).mean(axis=1)
+    # A Cauchy-like penalty: a few turned frames must not veto. A whole film held askew is rarer than a level room.
+    roll_cost = np.minimum(np.log1p(0.5 * roll**2).mean(axis=1), _MAX_ROLL_COST)
     pitch = np.arccos(np.clip(candidates @ _unit(rough_up.mean(axis=0)), -1, 1)) / np.radians(
         _PITCH_SIGMA_DEG
     )

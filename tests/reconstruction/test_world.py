@@ -208,6 +208,29 @@ def test_steep_looks_do_not_turn_the_room(room):
     assert abs(errors(world, true)["floor_m"]) < 0.02
 
 
+def rolled(poses: np.ndarray, roll_deg: float, seed: int) -> np.ndarray:
+    """Return cameras all held askew, about their own axis."""
+    out, rng = poses.copy(), np.random.default_rng(seed)
+    for pose in out:
+        half = np.radians(roll_deg + rng.normal(0, 3)) / 2
+        pose[:3, :3] = pose[:3, :3] @ matrix_from_quat([np.cos(half), 0, 0, np.sin(half)])
+    return out
+
+
+@pytest.mark.parametrize("roll_deg", [-22.0, 10.0])
+def test_a_camera_held_askew_all_the_time_does_not_tilt_the_room(roll_deg):
+    posed, depth, true = disturb(*film(ROOM, rolled(walk(2), roll_deg, 2)), 2)
+    assert errors(find_world(posed, depth, WorldConfig()), true)["gravity_deg"] < 0.5
+
+
+def test_a_slanted_roof_does_not_tilt_the_world():
+    roof = box((-2.4, -1.5, 2.0), (2.4, 1.9, 2.1), tilt_deg=25)
+    posed, depth, true = disturb(*film([*ROOM, roof], walk(3, height=1.2, target=(0, 0.5, 1.3))), 3)
+    world = find_world(posed, depth, WorldConfig())
+    assert errors(world, true)["gravity_deg"] < 0.5
+    assert abs(errors(world, true)["floor_m"]) < 0.01
+
+
 def test_slanted_things_do_not_tilt_the_world():
     slanted = [
         box((0.6, -1.2, 0.1), (1.6, -0.2, 0.15), tilt_deg=12),
