@@ -7,10 +7,10 @@ from dataclasses import dataclass
 class SurfaceConfig:
     """How depth maps become one surface and a map of free space."""
 
-    voxel_size_m: float = 0.005
+    voxel_size_m: float = 0.008
     """Edge of a fusion voxel. Made larger, with a note, where the scene would need more than `max_blocks`."""
 
-    truncation_voxels: float = 6.0
+    truncation_voxels: float = 4.0
     """Half width of the band around a surface in which signed distances are averaged."""
 
     max_depth_m: float = 6.0
@@ -57,11 +57,7 @@ class SurfaceConfig:
 
 
 SURFACE_PRESETS: dict[str, SurfaceConfig] = {
-    "fast": SurfaceConfig(
-        voxel_size_m=0.008, truncation_voxels=4.0, max_vertices=120_000, space_voxel_m=0.025
-    ),
+    "fast": SurfaceConfig(voxel_size_m=0.012, max_vertices=120_000, space_voxel_m=0.025),
     "default": SurfaceConfig(),
-    "quality": SurfaceConfig(
-        voxel_size_m=0.004, truncation_voxels=7.0, max_blocks=400_000, max_vertices=300_000
-    ),
+    "quality": SurfaceConfig(voxel_size_m=0.005, truncation_voxels=6.0, max_vertices=300_000),
 }
