@@ -22,6 +22,7 @@ from reconstruction.poses.undistort import undistort
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import FrameSet, PosedFrames
 
+_PLAUSIBLE_FOCAL = (0.35, 4.0)  # of the longer side; metadata beyond is wrong
 _DEFAULT_FOCAL_SHARE = 1.0  # of the longer side, where the metadata says nothing
 
 
@@ -93,10 +94,12 @@ def initial_camera(frames: FrameSet, config: PosesConfig) -> object:
     import pycolmap
 
     height, width = frames.images.shape[1:3]
-    focal = frames.focal_prior_px or _DEFAULT_FOCAL_SHARE * max(width, height)
+    low, high = (share * max(width, height) for share in _PLAUSIBLE_FOCAL)
+    known = low <= frames.focal_prior_px <= high
+    focal = frames.focal_prior_px if known else _DEFAULT_FOCAL_SHARE * max(width, height)
     name = "SIMPLE_RADIAL" if config.camera_model == "auto" else config.camera_model
     camera = pycolmap.Camera.create_from_model_name(1, name, focal, width, height)
-    camera.has_prior_focal_length = frames.focal_prior_px > 0
+    camera.has_prior_focal_length = known
     return camera
 
 

@@ -82,6 +82,16 @@ def test_cameras_are_where_they_were(posed, small_capture):
     assert posed.camera.fx == pytest.approx(small_capture.posed.camera.fx, rel=0.02)
 
 
+@pytest.mark.parametrize("factor", [1.6, 0.65, 40.0])
+def test_a_wrong_focal_length_in_the_metadata_does_no_harm(frames, small_capture, tmp_path, factor):
+    wrong = replace(frames, focal_prior_px=factor * small_capture.posed.camera.fx)
+    posed = estimate_poses(wrong, PosesConfig(), work_dir=tmp_path)
+    errors, _, _ = camera_errors_m(posed, small_capture.posed)
+    assert len(posed.images) == posed.chosen_frames
+    assert np.sqrt((errors**2).mean()) < 0.006
+    assert posed.camera.fx == pytest.approx(small_capture.posed.camera.fx, rel=0.03)
+
+
 def test_observations_and_points_agree_with_the_cameras(posed):
     frame, point = posed.observations.T
     assert len(posed.points) > 200
