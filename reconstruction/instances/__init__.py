@@ -4,6 +4,6 @@ from reconstruction.instances.config import INSTANCES_PRESETS, InstancesConfig
 from reconstruction.instances.find import find_instances
 from reconstruction.instances.overrides import apply_overrides
 
-VERSION = 1
+VERSION = 2
 
 __all__ = ["INSTANCES_PRESETS", "VERSION", "InstancesConfig", "apply_overrides", "find_instances"]

@@ -21,6 +21,7 @@ from reconstruction.instances.labels import ShapeFacts, coarse_label
 from reconstruction.instances.mesh_graph import MeshGraph
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.segmentation import Thing, segment
+from reconstruction.instances.stands import merge_stands
 from reconstruction.progress import Progress
 from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 
@@ -56,7 +57,7 @@ def find_instances(
     for vertices, number in crumbs:
         owner[vertices] = number
     things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
-    things = merge_feet(graph, things, progress)
+    things = merge_stands(graph, merge_feet(graph, things, progress), progress)
     things = _without_fragments(graph, things, base[0].observed, config, progress)
     for thing in things:
         if thing.attached:
