@@ -1,7 +1,7 @@
 """Furniture that was cut at its own top: what carries a wide top from below within its outline belongs to it.
 
-Legs and trestles end at the level of the top that they carry, so cutting there parts a table in two where its sides were
-not seen well. Two signs tell that from a thing put onto another:
+Legs and trestles end at the level of the top that they carry, so cutting there parts a table in two where its sides
+were not seen well. Two signs tell that from a thing put onto another:
 
 - the upper one reaches down beside the lower one, which nothing does that stands on it;
 - the upper one is a wide slab that hides all of the lower one from above: a board on legs.
