@@ -20,10 +20,12 @@ from reconstruction.poses import PosesConfig, estimate_poses
 from reconstruction.progress import Progress
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import (
+    BaseEntity,
     Camera,
     DepthMaps,
     FrameSet,
     InstanceSet,
+    Plane,
     PosedFrames,
     ScaleEstimate,
     Surface,
@@ -132,7 +134,7 @@ class Oracle:
     def instances(self, posed: PosedFrames, depth: DepthMaps, surface: Surface) -> InstanceSet:
         """Return the true things: each surface vertex belongs to the nearest true surface within 5 cm."""
         from reconstruction.instances.find import describe
-        from reconstruction.instances.mesh_graph import MeshGraph
+        from reconstruction.surface.mesh_graph import MeshGraph
 
         alignment = self._align(posed)
         entities = [e for e in self.truth.entities if e.visible_pixels > 0]
@@ -197,7 +199,8 @@ def _owners(surface: Surface, entities: list[TrueEntity], alignment: Alignment) 
 
 def _base(entities, owner: np.ndarray, graph, posed: PosedFrames):
     """Fit a plane to the seen part of each true floor and wall; floors come first, as the stages expect."""
-    from reconstruction.instances.base_planes import FittedPlane, assumed_floor, base_entity
+    from reconstruction.instances.base import assumed_floor
+    from reconstruction.surface.base_planes import base_outline
 
     entities.sort(key=lambda e: (not e.base, e.label != "floor", e.id))
     eye = posed.world_from_camera[:, :3, 3].mean(axis=0)
@@ -212,7 +215,8 @@ def _base(entities, owner: np.ndarray, graph, posed: PosedFrames):
         normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
         normal *= np.sign((eye - center) @ normal) or 1.0
         plane = np.array([*normal, -normal @ center])
-        out.append(base_entity(len(out) + 1, FittedPlane(entity.label, plane, _NEAR_TRUTH_M, members), graph))
+        outline = base_outline(points, plane)
+        out.append(BaseEntity(len(out) + 1, entity.label, Plane(plane, outline), True))
     return tuple(out)
 
 

@@ -171,6 +171,25 @@ class SpaceGrid:
 
 
 @dataclass(frozen=True)
+class Plane:
+    """A bounded plane: n . x + d = 0, n towards free space."""
+
+    plane: np.ndarray  # float64 (4,) nx, ny, nz, d
+    polygon: np.ndarray  # float64 (k, 3) outline in world space, k >= 3
+
+
+@dataclass(frozen=True)
+class SurfacePlane:
+    """A plane of the room of which some was seen: what bounds it, or something level that can carry things."""
+
+    label: str  # "floor" | "wall" | "ceiling" | "support"
+    surface: Plane  # outline of what was seen: a convex one, of a support one that follows its bays
+    area_m2: float  # of the seen surface on it
+    band_m: float  # surface within this distance belongs to it
+    vertices: np.ndarray  # int32 (k,) vertices of the surface on it, ascending; no vertex is on two planes
+
+
+@dataclass(frozen=True)
 class Surface:
     """Stage 5: the fused visible surface in world space, as one triangle mesh, and the state of space."""
 
@@ -181,14 +200,7 @@ class Surface:
     weights: np.ndarray  # float32 (v,) how many views support the vertex
     voxel_size_m: float
     space: SpaceGrid
-
-
-@dataclass(frozen=True)
-class Plane:
-    """A bounded plane: n . x + d = 0, n towards free space."""
-
-    plane: np.ndarray  # float64 (4,) nx, ny, nz, d
-    polygon: np.ndarray  # float64 (k, 3) convex outline in world space, k >= 3
+    planes: tuple[SurfacePlane, ...] = ()  # floor, walls, ceiling, then supports from the lowest up
 
 
 @dataclass(frozen=True)

@@ -335,6 +335,7 @@ def _graph(
 
 def _stage_figures(truth: GroundTruth, stages: StageResults, alignment: Alignment, out: Evaluation) -> None:
     from reconstruction.evaluation import stages as figures
+    from reconstruction.evaluation.planes import planes_figures
 
     posed, depth = stages.in_world()
     surface, instances = stages.get("surface"), stages.get("instances")
@@ -348,6 +349,9 @@ def _stage_figures(truth: GroundTruth, stages: StageResults, alignment: Alignmen
         out.stages.setdefault("surface", {}).update(
             {f"depth_{key}": value for key, value in (shown or {}).items()}
         )
+        found = planes_figures(surface, alignment, truth)
+        if found is not None:
+            out.stages["surface"]["planes"] = found
     if surface is not None and instances is not None:
         if truth.entities:
             on_surface = figures.instance_figures_3d(surface, instances, alignment, truth)

@@ -52,6 +52,9 @@ _STAGE_ROWS: tuple[tuple[str, str, str, str], ...] = (
     ("surface", "nc", "{:.1f} %", "normal consistency"),
     ("surface", "depth_median_rel", "{:.2%}", "median relative depth error on kept-out frames"),
     ("surface", "depth_share_over_5_percent", "{:.1%}", "pixels off by more than 5 %"),
+    ("surface", "planes.found_share", "{:.0%}", "true floor, walls and support tops found"),
+    ("surface", "planes.angle_median_deg", "{:.2f} deg", "... their angle error, median"),
+    ("surface", "planes.offset_median_mm", "{:.1f} mm", "... their offset error, median"),
     ("assembly", "median_moved_cm", "{:.2f} cm", "objects moved by, median"),
     ("assembly", "max_moved_cm", "{:.2f} cm", "objects moved by, at most"),
 )

@@ -4,7 +4,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph, pieces
 from reconstruction.instances.supports import (
     SupportRegion,
     contact_height,
@@ -12,6 +11,7 @@ from reconstruction.instances.supports import (
     span_ratio,
     stands_on,
 )
+from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 
 def candidates_on(

@@ -31,15 +31,6 @@ class InstancesConfig:
     min_support_area_m2: float = 0.004
     """Smaller up-facing patches carry nothing."""
 
-    min_wall_area_m2: float = 0.4
-    """Smaller vertical planes are not walls."""
-
-    min_wall_width_m: float = 0.7
-    """Narrower vertical planes are not walls."""
-
-    min_floor_area_m2: float = 0.1
-    """With less up-facing surface near z = 0 the floor counts as not observed."""
-
     min_picture_m: float = 0.10
     """The shorter side of the smallest picture that is looked for on a wall."""
 

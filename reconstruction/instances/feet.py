@@ -7,9 +7,9 @@ really carries a thing alone (a plate, a book, a coaster) reaches beyond it.
 import cv2
 import numpy as np
 
-from reconstruction.instances.mesh_graph import MeshGraph
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
+from reconstruction.surface.mesh_graph import MeshGraph
 
 _MAX_HEIGHT_M = 0.04
 _MAX_HEIGHT_SHARE = 0.5  # of the thing above

@@ -5,24 +5,18 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from reconstruction.instances.base_planes import (
-    FittedPlane,
-    assumed_floor,
-    base_entity,
-    fit_ceiling,
-    fit_floor,
-    fit_walls,
-)
+from reconstruction.instances.base import base_entities, base_planes
 from reconstruction.instances.boxes import UprightBox, upright_box, with_bottom
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.feet import merge_feet
 from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.labels import ShapeFacts, coarse_label
-from reconstruction.instances.mesh_graph import MeshGraph
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.stands import merge_stands
 from reconstruction.progress import Progress
+from reconstruction.surface.base_planes import FittedPlane, base_owner, behind_base
+from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 
 
@@ -43,14 +37,15 @@ def find_instances(
     """
     progress.start(4, "base planes and things")
     graph = MeshGraph.from_surface(surface)
-    planes, owner = _fit_base(graph, config)
+    planes = base_planes(surface)
+    owner = base_owner(planes, len(graph.points))
     progress.advance()
-    base = _base_entities(graph, planes, progress)
+    base = base_entities(surface, progress)
     things = _pictures(graph, planes, owner, posed, depth, config)
     hung = np.zeros(len(graph.points), bool)
     for thing in things:
         hung[thing.vertices] = True
-    behind = _behind_base(graph, planes)
+    behind = behind_base(graph, planes)
     rest = np.flatnonzero((owner == 0) & ~hung & ~behind)
     progress.advance()
     segmented, crumbs = _without_base_crumbs(graph, segment(graph, rest, config), planes)
@@ -99,35 +94,6 @@ def _without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progr
     )
 
 
-def _fit_base(graph: MeshGraph, config: InstancesConfig) -> tuple[list[FittedPlane], np.ndarray]:
-    """Return the fitted planes (a floor first, if seen) and the id of the plane that owns each vertex (0 = none)."""
-    owner = np.zeros(len(graph.points), np.int32)
-    planes: list[FittedPlane] = []
-    floor = fit_floor(graph, config)
-    first = 1
-    if floor is not None:
-        planes.append(floor)
-        owner[floor.members] = 1
-    for wall in fit_walls(graph, owner > 0, config):
-        planes.append(wall)
-        owner[wall.members & (owner == 0)] = first + len([p for p in planes if p.label != "floor"])
-    ceiling = fit_ceiling(graph, owner > 0, config)
-    if ceiling is not None:
-        planes.append(ceiling)
-        owner[ceiling.members & (owner == 0)] = first + len([p for p in planes if p.label != "floor"])
-    return planes, owner
-
-
-def _base_entities(graph: MeshGraph, planes: list[FittedPlane], progress: Progress) -> tuple[BaseEntity, ...]:
-    base: list[BaseEntity] = []
-    if not planes or planes[0].label != "floor":
-        progress.note("No floor was seen near z = 0: one is assumed under everything.")
-        base.append(assumed_floor(1, graph.points))
-    for plane in planes:
-        base.append(base_entity(len(base) + 1, plane, graph))
-    return tuple(base)
-
-
 def _pictures(
     graph: MeshGraph,
     planes: list[FittedPlane],
@@ -146,21 +112,6 @@ def _pictures(
             used[vertices] = True
             found.append(Thing(vertices, attached=True))
     return found
-
-
-def _behind_base(graph: MeshGraph, planes: list[FittedPlane]) -> np.ndarray:
-    """Mark vertices below the floor or behind a wall: reflections, what a window shows, and noise."""
-    out = np.zeros(len(graph.points), bool)
-    for plane in planes:
-        distance = plane.distance(graph.points)
-        beyond = distance < -plane.band_m
-        if plane.label == "wall":
-            axis = np.array([-plane.plane[1], plane.plane[0]])
-            along = graph.points[:, :2] @ axis
-            low, high = np.percentile(along[plane.members], [0.5, 99.5])
-            beyond &= (along > low - 0.05) & (along < high + 0.05)
-        out |= beyond
-    return out
 
 
 def _without_fragments(

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import lab_from_rgb
 from reconstruction.progress import Progress
+from reconstruction.surface.mesh_graph import lab_from_rgb
 from reconstruction.types import DepthMaps, PosedFrames, Surface
 
 

@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph, pieces
 from reconstruction.instances.supports import SupportRegion, contact_height
+from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 
 def neighbors_of(

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruction.instances.base_planes import base_outline
+from reconstruction.instances.base import BASE_LABELS
 from reconstruction.instances.boxes import upright_box
+from reconstruction.surface.base_planes import base_outline
 from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, Plane, PosedFrames, Surface
 from registry.errors import UsageError
 
 _ANCHOR_M = 0.3
-_BASE_LABELS = ("floor", "wall", "ceiling")
 
 
 def apply_overrides(
@@ -191,8 +191,8 @@ def _split_maps(
 
 def _make_base(found: InstanceSet, surface: Surface, item: Instance, label: object) -> InstanceSet:
     """Turn a thing into a base entity: the plane through its vertices, its normal towards free space."""
-    if label not in _BASE_LABELS:
-        raise UsageError(f"overrides: make_base of object {item.id} must be one of {', '.join(_BASE_LABELS)}")
+    if label not in BASE_LABELS:
+        raise UsageError(f"overrides: make_base of object {item.id} must be one of {', '.join(BASE_LABELS)}")
     chosen = found.vertex_instance == item.id
     points = np.asarray(surface.vertices, np.float64)[chosen]
     center = np.median(points, axis=0)

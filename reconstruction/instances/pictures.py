@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reconstruction.instances.base_planes import FittedPlane, plane_axes
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph, lab_from_rgb
+from reconstruction.surface.base_planes import FittedPlane, plane_axes
+from reconstruction.surface.mesh_graph import MeshGraph, lab_from_rgb
 from reconstruction.types import DepthMaps, PosedFrames
 from registry.geometry import invert_rigid
 

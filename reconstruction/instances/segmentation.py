@@ -7,10 +7,10 @@ from scipy.spatial import cKDTree
 
 from reconstruction.instances.candidates import candidates_on
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph, pieces
 from reconstruction.instances.neighbors import neighbors_of
 from reconstruction.instances.splitting import split_touching
 from reconstruction.instances.supports import SupportRegion, find_supports
+from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 _MAX_DEPTH = 4
 

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph
+from reconstruction.surface.mesh_graph import MeshGraph
 
 _MAX_VERTICES = 40_000
 # Shading changes lightness within one thing; two things mostly differ in hue or strongly in lightness.

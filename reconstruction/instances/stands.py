@@ -10,9 +10,9 @@ were not seen well. Two signs tell that from a thing put onto another:
 import cv2
 import numpy as np
 
-from reconstruction.instances.mesh_graph import MeshGraph
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
+from reconstruction.surface.mesh_graph import MeshGraph
 
 _MIN_AREA_M2 = 0.15  # of a piece of furniture from above
 _REACHES_DOWN = 0.5  # share of the lower one's height that the upper one covers, too

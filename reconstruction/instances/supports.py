@@ -8,7 +8,8 @@ from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph, pieces
+from reconstruction.surface.levels import horizontal_levels, joined_levels
+from reconstruction.surface.mesh_graph import MeshGraph
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,7 @@ class SupportRegion:
 
 def find_supports(graph: MeshGraph, chosen: np.ndarray, config: InstancesConfig) -> list[SupportRegion]:
     """Find the horizontal up-facing regions among vertices `chosen`, lowest first."""
-    flat = chosen[graph.normals[chosen, 2] > 0.85]
-    levels: list[np.ndarray] = []
-    for piece in pieces(graph, flat):
-        if graph.areas[piece].sum() >= 0.1 * config.min_support_area_m2:
-            levels.extend(_split_by_height(graph, piece))
-    levels = [piece for piece in levels if graph.areas[piece].sum() >= 0.1 * config.min_support_area_m2]
-    merged = _merge_levels(graph, levels)
+    merged = _merge_levels(graph, horizontal_levels(graph, chosen, 0.1 * config.min_support_area_m2))
     regions = []
     for piece in merged:
         if graph.areas[piece].sum() < config.min_support_area_m2:
@@ -95,56 +90,20 @@ def find_supports(graph: MeshGraph, chosen: np.ndarray, config: InstancesConfig)
     return sorted(regions, key=lambda region: (region.height_m, int(region.vertices[0])))
 
 
-def _split_by_height(graph: MeshGraph, piece: np.ndarray) -> list[np.ndarray]:
-    """Cut a connected up-facing piece where its heights form separate levels."""
-    z = graph.points[piece, 2]
-    if np.percentile(z, 98) - np.percentile(z, 2) < 0.02:
-        return [piece]
-    step = 0.004
-    bounds = np.arange(z.min() - 2 * step, z.max() + 3 * step, step)
-    histogram = np.histogram(z, bounds, weights=graph.areas[piece])[0]
-    smooth = np.convolve(histogram, [0.25, 0.5, 0.25], "same")
-    peaks = [
-        i
-        for i in range(1, len(smooth) - 1)
-        if smooth[i] >= smooth[i - 1] and smooth[i] > smooth[i + 1] and smooth[i] * 3 > 0.002
-    ]
-    peaks.sort(key=lambda i: -smooth[i])
-    kept: list[int] = []
-    for peak in peaks:
-        if all(abs(peak - other) * step > 0.015 for other in kept):
-            kept.append(peak)
-    out = []
-    for peak in kept:
-        near = piece[np.abs(z - (bounds[peak] + 0.5 * step)) < 0.008]
-        out.extend(pieces(graph, near))
-    return out
-
-
 def _merge_levels(graph: MeshGraph, levels: list[np.ndarray]) -> list[np.ndarray]:
     """Join regions of the same height whose outlines are near: things standing between them hide the rest."""
     boxes = [
         (graph.points[p].min(axis=0)[:2], graph.points[p].max(axis=0)[:2], np.median(graph.points[p, 2]))
         for p in levels
     ]
-    parent = list(range(len(levels)))
 
-    def root(i: int) -> int:
-        while parent[i] != i:
-            i = parent[i]
-        return i
+    def of_one(i: int, j: int) -> bool:
+        apart = np.maximum(boxes[i][0] - boxes[j][1], boxes[j][0] - boxes[i][1]).max()
+        alike = np.abs(np.median(graph.lab[levels[i]], 0) - np.median(graph.lab[levels[j]], 0)).max() < 25
+        rise = abs(boxes[i][2] - boxes[j][2])
+        return bool(alike and ((rise < 0.012 and apart < 0.06) or (rise < 0.008 and apart < 0.25)))
 
-    for i in range(len(levels)):
-        for j in range(i + 1, len(levels)):
-            apart = np.maximum(boxes[i][0] - boxes[j][1], boxes[j][0] - boxes[i][1]).max()
-            alike = np.abs(np.median(graph.lab[levels[i]], 0) - np.median(graph.lab[levels[j]], 0)).max() < 25
-            rise = abs(boxes[i][2] - boxes[j][2])
-            if alike and ((rise < 0.012 and apart < 0.06) or (rise < 0.008 and apart < 0.25)):
-                parent[max(root(i), root(j))] = min(root(i), root(j))
-    groups: dict[int, list[np.ndarray]] = {}
-    for i, piece in enumerate(levels):
-        groups.setdefault(root(i), []).append(piece)
-    return [np.sort(np.concatenate(group)) for group in groups.values()]
+    return joined_levels(levels, of_one)
 
 
 def stands_on(

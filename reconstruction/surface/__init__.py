@@ -1,8 +1,8 @@
-"""Stage 5: depth maps -> one fused surface, and what is known of free space."""
+"""Stage 5: depth maps -> one fused surface, its planes, and what is known of free space."""
 
 from reconstruction.surface.config import SURFACE_PRESETS, SurfaceConfig
 from reconstruction.surface.fuse import fuse_surface
 
-VERSION = 2
+VERSION = 3
 
 __all__ = ["SURFACE_PRESETS", "VERSION", "SurfaceConfig", "fuse_surface"]

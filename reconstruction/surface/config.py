@@ -55,6 +55,18 @@ class SurfaceConfig:
     max_space_cells: int = 40_000_000
     """Bound on the free-space grid; its voxels grow, with a note, beyond it."""
 
+    min_wall_area_m2: float = 0.4
+    """Smaller vertical planes are not walls."""
+
+    min_wall_width_m: float = 0.7
+    """Narrower vertical planes are not walls."""
+
+    min_floor_area_m2: float = 0.1
+    """With less up-facing surface near z = 0 the floor counts as not observed."""
+
+    min_support_area_m2: float = 0.02
+    """Level surface smaller than this is not handed on as a support."""
+
 
 SURFACE_PRESETS: dict[str, SurfaceConfig] = {
     "fast": SurfaceConfig(voxel_size_m=0.012, max_vertices=120_000, space_voxel_m=0.025),

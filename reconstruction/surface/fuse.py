@@ -1,5 +1,6 @@
 """Stage 5: depth maps -> surface mesh and free space."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -105,7 +106,7 @@ def _space(
 def fuse_surface(
     posed: PosedFrames, depth: DepthMaps, config: SurfaceConfig, *, progress: Progress = NO_PROGRESS
 ) -> Surface:
-    """Fuse depth maps into the visible surface and the state of space.
+    """Fuse depth maps into the visible surface, its planes and the state of space.
 
     Args:
         posed: Frames in world space, in metres.
@@ -114,6 +115,7 @@ def fuse_surface(
         progress: Where steps and decisions are reported.
     """
     from reconstruction.surface.pixels import prepare_views
+    from reconstruction.surface.planes import find_planes
     from reconstruction.surface.thinning import drop_small_components, thin
 
     low, high = _observed_box(posed, depth, config)
@@ -138,6 +140,7 @@ def fuse_surface(
         progress.note(
             f"surface: {len(mesh.vertices)} vertices, more than the {config.max_vertices} asked for"
         )
-    return Surface(
+    surface = Surface(
         mesh.vertices, mesh.faces, mesh.normals, mesh.colors, mesh.weights, float(voxel_size), space
     )
+    return replace(surface, planes=find_planes(surface, config))

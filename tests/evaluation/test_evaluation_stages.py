@@ -8,12 +8,13 @@ import pytest
 from reconstruction.evaluation import GroundTruth
 from reconstruction.evaluation import stages as figures
 from reconstruction.evaluation.alignment import align
+from reconstruction.evaluation.planes import planes_figures
 from reconstruction.evaluation.surfaces import sample_seen
 from reconstruction.oracle import Oracle
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.synthetic.capture import SyntheticCapture, make_test_capture, write_ground_truth
 from reconstruction.synthetic.film import prepare
-from reconstruction.types import DepthMaps
+from reconstruction.types import DepthMaps, Plane
 from registry.errors import UsageError
 from registry.geometry import rigid, split_similarity
 
@@ -110,6 +111,28 @@ def test_surface_of_true_depth_is_good_and_a_shifted_one_is_not(capture, truth, 
     depth = figures.surface_depth_figures(capture.posed, surface, alignment, truth)
     assert depth["median_rel"] < 0.01
     assert depth["frames"] == len(capture.posed.held_out_indices)
+
+
+def test_planes_are_found_where_they_are_and_missed_where_they_are_not(capture, truth, surface):
+    alignment = aligned(capture.posed, truth)
+    good = planes_figures(surface, alignment, truth)
+    assert good["floor_found_share"] == good["wall_found_share"] == 1
+    assert good["found_share"] > 0.7
+    assert good["angle_median_deg"] < 1
+    assert good["offset_median_mm"] < 5
+    raised = tuple(
+        replace(
+            p,
+            surface=Plane(p.surface.plane - [0, 0, 0, 0.05], p.surface.polygon + p.surface.plane[:3] * 0.05),
+        )
+        for p in surface.planes
+    )
+    bad = planes_figures(replace(surface, planes=raised), alignment, truth)
+    assert bad["found_share"] == 0
+    assert "angle_median_deg" not in bad
+    half = tuple(p for p in surface.planes if p.label != "support")
+    assert planes_figures(replace(surface, planes=half), alignment, truth)["support_found_share"] == 0
+    assert planes_figures(surface, alignment, replace(truth, entities=())) is None
 
 
 def oracle(truth, *stages) -> Oracle:

@@ -1,10 +1,12 @@
 """Surfaces built by hand from sheets, with cameras that look at them: inputs of the instance tests."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reconstruction.rasterize import rasterize_mesh
+from reconstruction.surface import SurfaceConfig
+from reconstruction.surface.planes import find_planes
 from reconstruction.types import Camera, DepthMaps, PosedFrames, SpaceGrid, Surface, VideoSource
 
 STEP_M = 0.01
@@ -67,9 +69,9 @@ def merged(*parts: Patchwork) -> Patchwork:
 
 
 def surface_from(patchwork: Patchwork) -> Surface:
-    """Return the mesh as the surface stage would."""
+    """Return the mesh as the surface stage would, with its planes; nothing is known of space."""
     space = SpaceGrid(np.zeros(3), 0.02, np.zeros((1, 1, 1), np.uint8))
-    return Surface(
+    surface = Surface(
         patchwork.vertices.astype(np.float32),
         patchwork.faces.astype(np.int32),
         patchwork.normals.astype(np.float32),
@@ -78,6 +80,12 @@ def surface_from(patchwork: Patchwork) -> Surface:
         STEP_M,
         space,
     )
+    return with_planes(surface)
+
+
+def with_planes(surface: Surface) -> Surface:
+    """Return a surface with the planes that the surface stage finds on it."""
+    return replace(surface, planes=find_planes(surface, SurfaceConfig()))
 
 
 def looking_at(position, target) -> np.ndarray:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
+from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from, with_planes
 
 from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig, find_instances
 from reconstruction.progress import NO_PROGRESS
@@ -113,7 +113,7 @@ def test_noise_does_not_make_objects():
         )
     )
     jitter = np.random.default_rng(0).normal(0, 0.002, surface.vertices.shape).astype(np.float32)
-    noisy = replace(surface, vertices=surface.vertices + jitter)
+    noisy = with_planes(replace(surface, vertices=surface.vertices + jitter))
     found = run(noisy)
     assert len(found.objects) == 2
     small = by_id(found, object_at(found, surface, (0.06, 0.05, 0.65)))
@@ -155,7 +155,7 @@ def test_empty_surface():
         weights=np.zeros(0, np.float32),
     )
     posed, depth = frames_of(nothing)
-    found = find_instances(posed, depth, empty, InstancesConfig(), progress=NO_PROGRESS)
+    found = find_instances(posed, depth, with_planes(empty), InstancesConfig(), progress=NO_PROGRESS)
     assert found.objects == ()
     assert not found.base[0].observed
 

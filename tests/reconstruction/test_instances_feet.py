@@ -5,9 +5,9 @@ import pytest
 from surfaces import floor_sheet, merged, solid_box, surface_from
 
 from reconstruction.instances.feet import merge_feet
-from reconstruction.instances.mesh_graph import MeshGraph
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import NO_PROGRESS
+from reconstruction.surface.mesh_graph import MeshGraph
 
 
 def pile(lower_size, upper_size):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from surfaces import floor_sheet, merged, solid_box, surface_from
 
-from reconstruction.instances.mesh_graph import MeshGraph
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.stands import merge_stands
 from reconstruction.progress import NO_PROGRESS
+from reconstruction.surface.mesh_graph import MeshGraph
 
 WOOD = (150, 110, 70)
 LEGS = [(-0.55, -0.3), (-0.55, 0.25), (0.5, -0.3), (0.5, 0.25)]

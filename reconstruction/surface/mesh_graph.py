@@ -47,6 +47,12 @@ class MeshGraph:
         spacing = float(np.median(lengths)) if len(lengths) else float(surface.voxel_size_m)
         return cls(points, normals, lab, areas, edges, max(spacing, 1e-3))
 
+    def edges_within(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the edges (k, 2) between vertices `chosen`, in their order."""
+        inside = np.zeros(len(self.points), bool)
+        inside[chosen] = True
+        return self.edges[inside[self.edges[:, 0]] & inside[self.edges[:, 1]]]
+
 
 def lab_from_rgb(colors: np.ndarray) -> np.ndarray:
     """Convert uint8 sRGB (..., 3) to float32 CIELAB (..., 3)."""
@@ -75,8 +81,7 @@ def pieces(graph: MeshGraph, chosen: np.ndarray, bridge_m: float = 0.0) -> list[
         return []
     local = np.full(len(graph.points), -1, np.int64)
     local[chosen] = np.arange(len(chosen))
-    links = local[graph.edges]
-    links = links[(links >= 0).all(axis=1)]
+    links = local[graph.edges_within(chosen)]
     if bridge_m > 0:
         near = cKDTree(graph.points[chosen]).query_pairs(bridge_m, output_type="ndarray")
         links = np.concatenate([links, near])

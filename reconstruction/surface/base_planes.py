@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.mesh_graph import MeshGraph
-from reconstruction.types import BaseEntity, Plane
+from reconstruction.surface.config import SurfaceConfig
+from reconstruction.surface.mesh_graph import MeshGraph
 
 _MAX_WALLS = 8
 
@@ -31,7 +30,7 @@ def _band(residuals: np.ndarray, low: float, high: float) -> float:
     return float(np.clip(3.0 * sigma, low, high))
 
 
-def fit_floor(graph: MeshGraph, config: InstancesConfig) -> FittedPlane | None:
+def fit_floor(graph: MeshGraph, config: SurfaceConfig) -> FittedPlane | None:
     """Fit the floor near z = 0; None where too little of it was seen."""
     z = graph.points[:, 2]
     flat = (graph.normals[:, 2] > 0.8) & (np.abs(z) < 0.06)
@@ -62,7 +61,7 @@ def fit_floor(graph: MeshGraph, config: InstancesConfig) -> FittedPlane | None:
     return FittedPlane("floor", plane, band, members)
 
 
-def fit_walls(graph: MeshGraph, taken: np.ndarray, config: InstancesConfig) -> list[FittedPlane]:
+def fit_walls(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> list[FittedPlane]:
     """Find the large vertical planes with nothing of the room behind them."""
     upright = (np.abs(graph.normals[:, 2]) < 0.35) & ~taken
     candidates: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -88,7 +87,7 @@ def fit_walls(graph: MeshGraph, taken: np.ndarray, config: InstancesConfig) -> l
 
 
 def _strongest_upright_plane(
-    graph: MeshGraph, free: np.ndarray, config: InstancesConfig
+    graph: MeshGraph, free: np.ndarray, config: SurfaceConfig
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return (plane, inliers, area) of the vertical plane with most free area; None when none is wall-sized."""
     index = np.flatnonzero(free)
@@ -120,7 +119,7 @@ def _strongest_upright_plane(
 
 
 def _refined(
-    graph: MeshGraph, free: np.ndarray, plane: np.ndarray, config: InstancesConfig
+    graph: MeshGraph, free: np.ndarray, plane: np.ndarray, config: SurfaceConfig
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     for width in (0.06, 0.04, 0.03):
         distance = graph.points @ plane[:3] + plane[3]
@@ -153,7 +152,7 @@ def _within_extent(graph: MeshGraph, plane: np.ndarray, inliers: np.ndarray) -> 
     return (along > low - 0.15) & (along < high + 0.15)
 
 
-def _bounds_the_room(graph, plane, inliers, area, candidates, config: InstancesConfig) -> bool:
+def _bounds_the_room(graph, plane, inliers, area, candidates, config: SurfaceConfig) -> bool:
     """Tell a wall from the side of a piece of furniture."""
     if area < config.min_wall_area_m2:
         return False
@@ -177,7 +176,7 @@ def _bounds_the_room(graph, plane, inliers, area, candidates, config: InstancesC
     return True
 
 
-def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: InstancesConfig) -> FittedPlane | None:
+def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> FittedPlane | None:
     """Find a ceiling: a large down-facing plane above 1.8 m."""
     down = (graph.normals[:, 2] < -0.85) & (graph.points[:, 2] > 1.8) & ~taken
     if graph.areas[down].sum() < config.min_wall_area_m2:
@@ -193,10 +192,38 @@ def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: InstancesConfig) ->
     return FittedPlane("ceiling", np.array([0, 0, -1.0, height]), 0.04, members)
 
 
-def base_entity(number: int, fitted: FittedPlane, graph: MeshGraph) -> BaseEntity:
-    """Return the entity of a fitted plane, its outline the convex hull of its vertices (trimmed of strays)."""
-    outline = base_outline(graph.points[fitted.members], fitted.plane)
-    return BaseEntity(number, fitted.label, Plane(fitted.plane, outline), True)
+def fit_base(graph: MeshGraph, config: SurfaceConfig) -> list[FittedPlane]:
+    """Return floor (if enough of it was seen), walls and ceiling; no vertex is on two of them."""
+    floor = fit_floor(graph, config)
+    planes = [] if floor is None else [floor]
+    planes += fit_walls(graph, base_owner(planes, len(graph.points)) > 0, config)
+    ceiling = fit_ceiling(graph, base_owner(planes, len(graph.points)) > 0, config)
+    return planes if ceiling is None else [*planes, ceiling]
+
+
+def base_owner(planes: list[FittedPlane], count: int) -> np.ndarray:
+    """Return which plane each of `count` vertices is on, int32: 0 none, 1 floor, the others from 2 in their order."""
+    owner = np.zeros(count, np.int32)
+    number = 2
+    for plane in planes:
+        owner[plane.members & (owner == 0)] = 1 if plane.label == "floor" else number
+        number += plane.label != "floor"
+    return owner
+
+
+def behind_base(graph: MeshGraph, planes: list[FittedPlane]) -> np.ndarray:
+    """Mark vertices below the floor or behind a wall: reflections, what a window shows, and noise."""
+    out = np.zeros(len(graph.points), bool)
+    for plane in planes:
+        distance = plane.distance(graph.points)
+        beyond = distance < -plane.band_m
+        if plane.label == "wall":
+            axis = np.array([-plane.plane[1], plane.plane[0]])
+            along = graph.points[:, :2] @ axis
+            low, high = np.percentile(along[plane.members], [0.5, 99.5])
+            beyond &= (along > low - 0.05) & (along < high + 0.05)
+        out |= beyond
+    return out
 
 
 def base_outline(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
@@ -205,20 +232,7 @@ def base_outline(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
     uv = np.column_stack([points @ axis_u, points @ axis_v])
     low, high = np.percentile(uv, [0.1, 99.9], axis=0)
     hull = cv2.convexHull(np.clip(uv, low, high).astype(np.float32)).reshape(-1, 2).astype(np.float64)
-    return _on_plane(hull, plane)
-
-
-def assumed_floor(number: int, points: np.ndarray) -> BaseEntity:
-    """Return a floor at z = 0 under everything, marked as not observed."""
-    if len(points):
-        low, high = np.percentile(points[:, :2], [0.5, 99.5], axis=0)
-    else:
-        low, high = np.full(2, -1.0), np.full(2, 1.0)
-    low, high = low - 0.25, high + 0.25
-    corners = np.array(
-        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
-    )
-    return BaseEntity(number, "floor", Plane(np.array([0, 0, 1.0, 0]), corners), False)
+    return on_plane(hull, plane)
 
 
 def plane_axes(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,6 +244,7 @@ def plane_axes(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return axis_u, np.cross(normal, axis_u)
 
 
-def _on_plane(uv: np.ndarray, plane: np.ndarray) -> np.ndarray:
+def on_plane(uv: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Return the world points (n, 3) at coordinates (n, 2) along the axes of a plane."""
     axis_u, axis_v = plane_axes(plane)
     return uv[:, :1] * axis_u + uv[:, 1:] * axis_v - plane[3] * plane[:3]

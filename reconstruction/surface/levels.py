@@ -1,0 +1,64 @@
+"""Horizontal up-facing pieces of a surface, cut where they form steps."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from reconstruction.surface.mesh_graph import MeshGraph, pieces
+
+
+def horizontal_levels(graph: MeshGraph, chosen: np.ndarray, min_area_m2: float) -> list[np.ndarray]:
+    """Return the level up-facing pieces among vertices `chosen` (sorted), each the indices of its vertices."""
+    flat = chosen[graph.normals[chosen, 2] > 0.85]
+    graph = replace(graph, edges=graph.edges_within(flat))  # each look at all edges costs milliseconds
+    levels: list[np.ndarray] = []
+    for piece in pieces(graph, flat):
+        if graph.areas[piece].sum() >= min_area_m2:
+            levels.extend(_split_by_height(graph, piece))
+    return [piece for piece in levels if graph.areas[piece].sum() >= min_area_m2]
+
+
+def joined_levels(levels: list[np.ndarray], of_one: Callable[[int, int], bool]) -> list[np.ndarray]:
+    """Join levels i < j wherever `of_one(i, j)`, also by way of others; return sorted vertices of each group."""
+    parent = list(range(len(levels)))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            i = parent[i]
+        return i
+
+    for i in range(len(levels)):
+        for j in range(i + 1, len(levels)):
+            if of_one(i, j):
+                parent[max(root(i), root(j))] = min(root(i), root(j))
+    groups: dict[int, list[np.ndarray]] = {}
+    for i, piece in enumerate(levels):
+        groups.setdefault(root(i), []).append(piece)
+    return [np.sort(np.concatenate(group)) for group in groups.values()]
+
+
+def _split_by_height(graph: MeshGraph, piece: np.ndarray) -> list[np.ndarray]:
+    """Cut a connected up-facing piece where its heights form separate levels."""
+    z = graph.points[piece, 2]
+    if np.percentile(z, 98) - np.percentile(z, 2) < 0.02:
+        return [piece]
+    step = 0.004
+    bounds = np.arange(z.min() - 2 * step, z.max() + 3 * step, step)
+    histogram = np.histogram(z, bounds, weights=graph.areas[piece])[0]
+    smooth = np.convolve(histogram, [0.25, 0.5, 0.25], "same")
+    peaks = [
+        i
+        for i in range(1, len(smooth) - 1)
+        if smooth[i] >= smooth[i - 1] and smooth[i] > smooth[i + 1] and smooth[i] * 3 > 0.002
+    ]
+    peaks.sort(key=lambda i: -smooth[i])
+    kept: list[int] = []
+    for peak in peaks:
+        if all(abs(peak - other) * step > 0.015 for other in kept):
+            kept.append(peak)
+    out = []
+    for peak in kept:
+        near = piece[np.abs(z - (bounds[peak] + 0.5 * step)) < 0.008]
+        out.extend(pieces(graph, near))
+    return out

@@ -1,0 +1,33 @@
+"""The planes of a surface: floor, walls and ceiling, and the level tops that can carry things."""
+
+import numpy as np
+
+from reconstruction.surface.base_planes import base_outline, base_owner, behind_base, fit_base
+from reconstruction.surface.config import SurfaceConfig
+from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.surface.support_planes import find_support_planes
+from reconstruction.types import Plane, Surface, SurfacePlane
+
+
+def find_planes(surface: Surface, config: SurfaceConfig) -> tuple[SurfacePlane, ...]:
+    """Find the floor (where enough of it was seen), walls, a ceiling, and supports from the lowest up.
+
+    Args:
+        surface: in world space, floor at z = 0; its own planes are not read.
+        config: thresholds.
+    """
+    graph = MeshGraph.from_surface(surface)
+    base = fit_base(graph, config)
+    out = [
+        SurfacePlane(
+            plane.label,
+            Plane(plane.plane, base_outline(graph.points[plane.members], plane.plane)),
+            float(graph.areas[plane.members].sum()),
+            plane.band_m,
+            np.flatnonzero(plane.members).astype(np.int32),
+        )
+        for plane in base
+    ]
+    free = np.flatnonzero((base_owner(base, len(graph.points)) == 0) & ~behind_base(graph, base))
+    floor = next((plane for plane in base if plane.label == "floor"), None)
+    return (*out, *find_support_planes(graph, free, floor, surface.space, config.min_support_area_m2))
