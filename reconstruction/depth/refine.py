@@ -11,7 +11,7 @@ _SAMPLES = len(_DX)
 _correlate = make_correlate(_SAMPLES)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
 def _gather(rho, here, jump, a, b, n, sx, sy, sr, sxx, syy, sxy, sxr, syr):  # pragma: no cover - compiled
     """Add to the sums of a row of pixels their neighbors (a, b) away, where those continue the surface."""
     one, nil = np.float32(1.0), np.float32(0.0)
@@ -32,7 +32,7 @@ def _gather(rho, here, jump, a, b, n, sx, sy, sr, sxx, syy, sxy, sxr, syr):  # p
         syr[x] += b * e
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
 def _solve(here, n, sx, sy, sr, sxx, syy, sxy, sxr, syr, rho, gx, gy):  # pragma: no cover - compiled
     """Turn the sums of a row of pixels into planes: value and slopes; pixels with few neighbors stay flat."""
     one, nil, few = np.float32(1.0), np.float32(0.0), np.float32(6.0)

@@ -32,7 +32,7 @@ def _window_moments(reference, mean, inverse_deviation, zero):  # pragma: no cov
             inverse_deviation[y, x] = 1.0 / math.sqrt(max(q / n - (s / n) ** 2, 0.0) + zero)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
 def _warp_row(source, height, width, h_inf, shift, rho, y, out, inside):  # pragma: no cover - compiled
     """Resample a source for row y of the reference at inverse depth rho (bilinear, border repeated).
 
@@ -67,7 +67,7 @@ def _warp_row(source, height, width, h_inf, shift, rho, y, out, inside):  # prag
         store_apart(inside, x, one if seen else nil)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
 def _move_down(new, old, reference_new, reference_old, s, q, p):  # pragma: no cover - compiled
     """Take a row into the column sums of gray, its square and its product with the reference, and one row out."""
     for x in range(len(new)):
@@ -77,7 +77,7 @@ def _move_down(new, old, reference_new, reference_old, s, q, p):  # pragma: no c
         p[x] += a * reference_new[x] - c * reference_old[x]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
 def _score_row(
     s, q, p, share, row_share, mean, inverse_deviation, zero, inside, first, second
 ):  # pragma: no cover - compiled
@@ -94,7 +94,7 @@ def _score_row(
         first[x] = max(first[x], score)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
 def _write_row(first, second, out):  # pragma: no cover - compiled
     """Write the cost of a row of pixels from its two best correlations."""
     nil, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)

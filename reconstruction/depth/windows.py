@@ -40,7 +40,9 @@ def project(h_inf, y, x, maps):  # pragma: no cover - compiled
 def make_correlate(samples: int):
     """Compile the correlation for windows of so many samples: a loop of known length runs on vector units."""
 
-    @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+    # Inlined for good: a copy of its own and one inside the caller would be optimized, and round, differently, and
+    # which of them runs would depend on whether this process compiled them or found them compiled.
+    @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
     def correlate(
         weight, centered, variance, source, height, width, m, rho, gx, gy, zero, dx, dy
     ):  # pragma: no cover - compiled

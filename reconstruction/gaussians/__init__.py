@@ -12,7 +12,7 @@ from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.rendering import Render, render_gaussians
 from reconstruction.gaussians.stage import GaussianScene, make_gaussians
 
-VERSION = 3
+VERSION = 4
 
 __all__ = [
     "GAUSSIANS_PRESETS",

@@ -108,7 +108,7 @@ def blend(
         )
 
 
-@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy", forceinline=True)
 def _blend_tile(
     tile, splats, boxes, tile_start, entries, tiles_x, scalars, weights, features, contributions
 ):  # pragma: no cover - compiled
@@ -232,7 +232,7 @@ def blend_backward(
         )
 
 
-@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy", forceinline=True)
 def _blend_tile_backward(
     tile,
     splats,
