@@ -22,6 +22,7 @@ _GAP = 4
 def main() -> None:
     """Load, draw, write."""
     from reconstruction.evaluation.stage_results import StageResults
+    from reconstruction.report.pictures import draw_gaussians
     from registry import SceneRegistry
 
     parser = argparse.ArgumentParser(
@@ -52,7 +53,7 @@ def main() -> None:
     rows = []
     for k in range(count):
         row = int((k + 0.5) * len(frames) / count)
-        items = draw(gaussians, camera, poses[row])
+        *items, _ = draw_gaussians(gaussians, camera, poses[row])
         if not arguments.no_frames:
             size = (camera.width, camera.height)
             items.insert(0, cv2.resize(np.asarray(frames[row]), size, interpolation=cv2.INTER_AREA))
@@ -63,23 +64,6 @@ def main() -> None:
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(arguments.out), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
     print(arguments.out)
-
-
-def draw(gaussians: object, camera: object, pose: np.ndarray) -> list[np.ndarray]:
-    """Return color, depth and normals (world axes) as images."""
-    from reconstruction.gaussians import render_gaussians
-    from reconstruction.report import drawing
-
-    render = render_gaussians(gaussians, camera, pose)
-    solid = render.opacity > 0.5
-    near, far = np.percentile(render.depth[solid], [2, 98])
-    normals = render.normal / np.maximum(np.linalg.norm(render.normal, axis=2, keepdims=True), 1e-6)
-    normals = np.where(solid[..., None], normals @ pose[:3, :3].T.astype(np.float32), 0)
-    return [
-        render.uint8(),
-        drawing.colorize(render.depth, near, far, "turbo_r", solid),
-        drawing.normal_colors(normals),
-    ]
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from reconstruction.gaussians import render_gaussians
+from reconstruction.gaussians import Gaussians, render_gaussians
 from reconstruction.preview import best_view, render_textured
 from reconstruction.report import drawing, plots
 from reconstruction.report.blocks import Picture
@@ -221,6 +221,19 @@ def renderers(g: Gathered) -> dict[str, Renderer]:
     return {"scene": scene} if g.gaussians is None else {"Gaussians": gaussians, "scene": scene}
 
 
+def draw_gaussians(
+    gaussians: Gaussians, camera: Camera, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[float, float]]:
+    """Return color, depth and normals (world axes) as images, and the depths (near, far) of the colors' ends."""
+    render = render_gaussians(gaussians, camera, pose)
+    solid = render.opacity > 0.5
+    near, far = np.percentile(render.depth[solid], [2, 98]) if solid.any() else (0.0, 1.0)
+    normals = render.normal / np.maximum(np.linalg.norm(render.normal, axis=2, keepdims=True), 1e-6)
+    normals = np.where(solid[..., None], normals @ pose[:3, :3].T.astype(np.float32), 0)
+    depth = drawing.colorize(render.depth, near, far, "turbo_r", solid)
+    return render.uint8(), depth, drawing.normal_colors(normals), (float(near), float(far))
+
+
 def gaussian_rows(g: Gathered, count: int = 3) -> list[Picture]:
     """Kept-out frames; color, depth and normals of the Gaussians at their cameras."""
     posed, out = g.posed, []
@@ -228,17 +241,12 @@ def gaussian_rows(g: Gathered, count: int = 3) -> list[Picture]:
     camera = posed.camera.resized(FRAME_PX, round(FRAME_PX * posed.camera.height / posed.camera.width))
     for row in (int((k + 0.5) * total / min(count, total)) for k in range(min(count, total))):
         index, pose = int(posed.held_out_indices[row]), posed.held_out_world_from_camera[row]
-        render = render_gaussians(g.gaussians, camera, pose)
-        solid = render.opacity > 0.5
-        near, far = np.percentile(render.depth[solid], [2, 98]) if solid.any() else (0.0, 1.0)
-        normals = render.normal / np.maximum(np.linalg.norm(render.normal, axis=2, keepdims=True), 1e-6)
-        normals = np.where(solid[..., None], normals @ pose[:3, :3].T.astype(np.float32), 0)
-        depth = drawing.colorize(render.depth, near, far, "turbo_r", solid)
+        color, depth, normals, (near, far) = draw_gaussians(g.gaussians, camera, pose)
         out += [
             _frame(np.asarray(posed.held_out_images[row]), f"kept-out frame {index}", f"frame {index}"),
-            picture(render.uint8(), f"color of the Gaussians, frame {index}"),
+            picture(color, f"color of the Gaussians, frame {index}"),
             picture(depth, f"depth of the Gaussians, frame {index}", f"{near:.1f} to {far:.1f} m"),
-            picture(drawing.normal_colors(normals), f"normals of the Gaussians, frame {index}"),
+            picture(normals, f"normals of the Gaussians, frame {index}"),
         ]
     return out
 

@@ -29,7 +29,7 @@ from registry import SceneBundle, SceneRegistry
 
 SCENE = "small_room"
 THINGS = ("table", "mug", "box", "picture")
-FEW_GAUSSIANS = GaussiansConfig(iterations=60, side_px=192, coarse_side_px=128, max_gaussians=6000)
+FEW_GAUSSIANS = GaussiansConfig(iterations=120, side_px=256, coarse_side_px=192, max_gaussians=12_000)
 SFM_SCALE = 0.5  # sfm units per metre: what is shown must be in metres all the same
 
 
