@@ -1,11 +1,36 @@
 """Settings of the instances stage."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
 class InstancesConfig:
     """How the surface is cut into things."""
+
+    masks: Literal["embedded", "folder", "sam2", "sam3", "mask2former"] = "embedded"
+    """Where the cut comes from: `embedded` (geometry and color, nothing to install), `folder` (id images that any other
+    tool made), `sam2`, `sam3` or `mask2former` (through transformers)."""
+
+    masks_path: str = ""
+    """For `folder`: the folder with one id image (PNG, 8 or 16 bit, 0 = in no mask) a frame, named by video frame
+    number (`00040.png`) or like the image that it belongs to."""
+
+    masks_model: str = ""
+    """For the learned ones: the model's name on the Hugging Face hub, or its folder; empty is the backend's choice."""
+
+    labels: Literal["embedded", "clip", "vlm"] = "embedded"
+    """Who names things: `embedded` (coarse classes from shape and place), `clip` (any words, through transformers) or
+    `vlm` (an OpenAI-compatible endpoint, see `SIMRECON_VLM_URL`)."""
+
+    labels_model: str = ""
+    """For `clip`: the model's name on the Hugging Face hub, or its folder."""
+
+    labels_vocabulary: str = ""
+    """For `clip`: comma-separated words to choose from; empty is a list of household things."""
+
+    learned_device: str = "auto"
+    """Where learned models run: `cpu`, `cuda`, ...; `auto` is cuda where there is one."""
 
     min_object_m: float = 0.03
     """Things whose second-largest extent is below this are not objects."""
