@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from reconstruction.instances.base import base_entities, base_planes
@@ -10,7 +9,7 @@ from reconstruction.instances.boxes import UprightBox, upright_box, with_bottom
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.feet import merge_feet
 from reconstruction.instances.id_maps import render_id_maps
-from reconstruction.instances.labels import ShapeFacts, coarse_label
+from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.stands import merge_stands
@@ -279,39 +278,3 @@ def _box_to_wall(graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[Ba
     center = turned.center.copy()
     center[:2] = (turned.center[:2] @ along) * along + (0.5 * front - wall.surface.plane[3]) * normal[:2]
     return UprightBox(center, yaw, np.array([front, turned.extents_m[1], turned.extents_m[2]]))
-
-
-def shape_facts(
-    graph: MeshGraph, vertices: np.ndarray, box: UprightBox, on_floor: bool, attached: bool, carries: int
-) -> ShapeFacts:
-    """Measure what labels are guessed from."""
-    points, normals, areas = graph.points[vertices], graph.normals[vertices], graph.areas[vertices]
-    plan = float(np.prod(box.extents_m[:2]))
-    top = box.center[2] + 0.5 * box.extents_m[2]
-    up = normals[:, 2] > 0.8
-    near_top = up & (points[:, 2] > top - max(0.03, 0.12 * box.extents_m[2]))
-    heights = points[up, 2]
-    step = 0.04
-    levels = (
-        np.histogram(heights, np.arange(0, top + 2 * step, step), weights=areas[up])[0]
-        if up.any()
-        else np.zeros(1)
-    )
-    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
-    local = np.abs((points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]])) / (0.5 * box.extents_m[:2])
-    middle = (local.max(axis=1) < 0.45) & up
-    hollow = bool(middle.any() and np.median(points[middle, 2]) < top - max(0.015, 0.3 * box.extents_m[2]))
-    hull = cv2.contourArea(cv2.convexHull(points[:, :2].astype(np.float32))) / max(plan, 1e-9)
-    lab = graph.lab[vertices]
-    green = (lab[:, 1] < -8) & (lab[:, 2] > 5)
-    return ShapeFacts(
-        box.extents_m,
-        on_floor,
-        attached,
-        carries,
-        float(areas[near_top].sum()) / max(plan, 1e-9),
-        int((levels > 0.25 * plan).sum()),
-        hollow,
-        0.65 < hull < 0.87 and 0.8 < box.extents_m[0] / box.extents_m[1] < 1.25,
-        float(green.mean()),
-    )

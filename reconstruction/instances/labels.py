@@ -2,7 +2,11 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+
+from reconstruction.instances.boxes import UprightBox
+from reconstruction.surface.mesh_graph import MeshGraph
 
 
 @dataclass(frozen=True)
@@ -18,6 +22,42 @@ class ShapeFacts:
     hollow: bool  # seen from above its middle is lower than its rim
     round_plan: bool  # ground plan closer to a disc than to a rectangle
     greenness: float  # share of green vertices
+
+
+def shape_facts(
+    graph: MeshGraph, vertices: np.ndarray, box: UprightBox, on_floor: bool, attached: bool, carries: int
+) -> ShapeFacts:
+    """Measure what labels are guessed from."""
+    points, normals, areas = graph.points[vertices], graph.normals[vertices], graph.areas[vertices]
+    plan = float(np.prod(box.extents_m[:2]))
+    top = box.center[2] + 0.5 * box.extents_m[2]
+    up = normals[:, 2] > 0.8
+    near_top = up & (points[:, 2] > top - max(0.03, 0.12 * box.extents_m[2]))
+    heights = points[up, 2]
+    step = 0.04
+    levels = (
+        np.histogram(heights, np.arange(0, top + 2 * step, step), weights=areas[up])[0]
+        if up.any()
+        else np.zeros(1)
+    )
+    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+    local = np.abs((points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]])) / (0.5 * box.extents_m[:2])
+    middle = (local.max(axis=1) < 0.45) & up
+    hollow = bool(middle.any() and np.median(points[middle, 2]) < top - max(0.015, 0.3 * box.extents_m[2]))
+    hull = cv2.contourArea(cv2.convexHull(points[:, :2].astype(np.float32))) / max(plan, 1e-9)
+    lab = graph.lab[vertices]
+    green = (lab[:, 1] < -8) & (lab[:, 2] > 5)
+    return ShapeFacts(
+        box.extents_m,
+        on_floor,
+        attached,
+        carries,
+        float(areas[near_top].sum()) / max(plan, 1e-9),
+        int((levels > 0.25 * plan).sum()),
+        hollow,
+        0.65 < hull < 0.87 and 0.8 < box.extents_m[0] / box.extents_m[1] < 1.25,
+        float(green.mean()),
+    )
 
 
 def coarse_label(facts: ShapeFacts) -> tuple[str, float]:
