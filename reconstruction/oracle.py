@@ -133,7 +133,7 @@ class Oracle:
 
     def instances(self, posed: PosedFrames, depth: DepthMaps, surface: Surface) -> InstanceSet:
         """Return the true things: each surface vertex belongs to the nearest true surface within 5 cm."""
-        from reconstruction.instances.find import describe
+        from reconstruction.instances.describe import describe
         from reconstruction.surface.mesh_graph import MeshGraph
 
         alignment = self._align(posed)

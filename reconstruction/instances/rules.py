@@ -1,0 +1,108 @@
+"""The embedded cut: rules of shape, contact and color, without any masks."""
+
+import numpy as np
+
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.cut import Cut, Shell
+from reconstruction.instances.feet import merge_feet
+from reconstruction.instances.pictures import find_pictures
+from reconstruction.instances.segmentation import Thing, segment
+from reconstruction.instances.stands import merge_stands
+from reconstruction.progress import Progress
+from reconstruction.surface.base_planes import FittedPlane
+from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.types import DepthMaps, PosedFrames
+
+
+def cut_by_rules(
+    shell: Shell, posed: PosedFrames, depth: DepthMaps, config: InstancesConfig, progress: Progress
+) -> Cut:
+    """Cut what stands above the base by connectivity, supports, creases and color; find pictures on the walls."""
+    graph, planes, owner = shell.graph, shell.planes, shell.owner.copy()
+    things = _pictures(graph, planes, owner, posed, depth, config)
+    hung = np.zeros(len(graph.points), bool)
+    for thing in things:
+        hung[thing.vertices] = True
+    rest = np.flatnonzero((owner == 0) & ~hung & ~shell.behind)
+    segmented, crumbs = _without_base_crumbs(graph, segment(graph, rest, config), planes)
+    for vertices, number in crumbs:
+        owner[vertices] = number
+    owner[hung] = 0
+    things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
+    return Cut(merge_stands(graph, merge_feet(graph, things, progress), progress), owner)
+
+
+def _pictures(
+    graph: MeshGraph,
+    planes: list[FittedPlane],
+    owner: np.ndarray,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: InstancesConfig,
+) -> list[Thing]:
+    found: list[Thing] = []
+    used = np.zeros(len(owner), bool)
+    for plane in planes:
+        if plane.label != "wall":
+            continue
+        taken = (owner > 0) & ~plane.members
+        for vertices in find_pictures(graph, plane, taken | used, owner == 0, posed, depth, config):
+            used[vertices] = True
+            found.append(Thing(vertices, attached=True))
+    return found
+
+
+def _without_base_crumbs(
+    graph: MeshGraph, things: list[Thing], planes: list[FittedPlane]
+) -> tuple[list[Thing], list[tuple[np.ndarray, int]]]:
+    """Give bumps of the floor and the walls back to them: small, thin, hugging the base all over."""
+    first = 1 if planes and planes[0].label == "floor" else 2
+    kept: list[Thing] = []
+    crumbs = []
+    carriers: set[int] = set()
+    for thing in reversed(things):  # what rests on a thing comes after it
+        points = graph.points[thing.vertices]
+        if not planes or id(thing) in carriers:
+            kept.append(thing)
+            carriers.add(id(thing.rests_on))
+            continue
+        distances = np.stack([np.abs(plane.distance(points)) for plane in planes])
+        nearest = distances.min(axis=0)
+        spread = np.sort(np.ptp(points, axis=0))
+        thin = np.percentile(nearest, 90) < 0.035 or (spread[2] < 0.12 and np.median(nearest) < 0.025)
+        if (thin and spread[2] < 0.6) or (nearest < 0.05).mean() > 0.8:
+            crumbs.append((thing.vertices, first + int(np.argmin(np.median(distances, axis=1)))))
+        else:
+            kept.append(thing)
+            carriers.add(id(thing.rests_on))
+    return kept[::-1], crumbs
+
+
+def _mark_attached(graph: MeshGraph, things: list[Thing], planes: list[FittedPlane]) -> list[Thing]:
+    """Mark things that touch a wall and have nothing below them."""
+    for thing in things:
+        points = graph.points[thing.vertices]
+        if thing.rests_on is not None or points[:, 2].min() < 0.15:
+            continue
+        for plane in planes:
+            if plane.label == "wall" and np.percentile(plane.distance(points), 5) < 0.06:
+                thing.attached = True
+    return things
+
+
+def _merge_attached(graph: MeshGraph, things: list[Thing]) -> list[Thing]:
+    """Join hanging things whose boxes overlap: a picture's frame, its inside, its sides."""
+    hanging = sorted((t for t in things if t.attached), key=lambda t: -float(graph.areas[t.vertices].sum()))
+    out = [t for t in things if not t.attached]
+    kept: list[Thing] = []
+    for thing in hanging:
+        points = graph.points[thing.vertices]
+        for other in kept:
+            around = graph.points[other.vertices]
+            low, high = around.min(axis=0) - 0.03, around.max(axis=0) + 0.03
+            if ((points > low) & (points < high)).all(axis=1).mean() > 0.5:
+                other.vertices = np.union1d(other.vertices, thing.vertices)
+                break
+        else:
+            kept.append(thing)
+    return kept + out
