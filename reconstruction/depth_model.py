@@ -1,16 +1,14 @@
 """Learned depth from single images: the models of `transformers`, for the depth stage and for the scale ladder.
 
 Any model that `AutoModelForDepthEstimation` opens will do: Depth Anything, DPT and MiDaS predict inverse depth up to
-scale and shift; their metric variants, ZoeDepth and Depth Pro predict metres. Weights are read from a folder or from
-the local cache of the Hugging Face hub, which downloads them where it may.
+scale and shift; their metric variants, ZoeDepth and Depth Pro predict metres.
 """
 
 import cv2
 import numpy as np
 
-from registry.errors import EnvironmentMissing
+from reconstruction.learned import ModelRequest, load_model, load_part
 
-EXTRA = "depth-models"
 _METRIC_FAMILIES = ("zoedepth", "depth_pro")
 
 
@@ -28,25 +26,10 @@ class DepthModel:
         Raises:
             EnvironmentMissing: transformers or the model is not there, or cannot be loaded.
         """
-        try:
-            import torch
-            from transformers import AutoImageProcessor, AutoModelForDepthEstimation
-        except ImportError as error:
-            raise EnvironmentMissing(
-                f"{asked_by} needs {error.name}; `pip install 'simrecon[{EXTRA}]'`, or leave that option out"
-            ) from error
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        try:
-            self._processor = AutoImageProcessor.from_pretrained(model)
-            self._model = AutoModelForDepthEstimation.from_pretrained(model).to(device).eval()
-        except (ImportError, OSError, ValueError, RuntimeError) as error:
-            raise EnvironmentMissing(
-                f"{asked_by}: the depth model {model!r} cannot be loaded ({error}); download it first, "
-                f"or name its folder with --set {asked_by}_model=DIR"
-            ) from error
+        request = ModelRequest(model, asked_by, f"{asked_by}_model", device)
+        self._processor = load_part(request, "AutoImageProcessor")
+        self._model = load_model(request, "AutoModelForDepthEstimation")
         self.name = model
-        self.device = device
         config = self._model.config
         self.predicts_metres = (
             getattr(config, "depth_estimation_type", "relative") == "metric"
@@ -60,7 +43,7 @@ class DepthModel:
         """
         import torch
 
-        inputs = self._processor(images=images, return_tensors="pt").to(self.device)
+        inputs = self._processor(images=images, return_tensors="pt").to(self._model.device)
         with torch.inference_mode():
             predicted = self._model(**inputs).predicted_depth
         maps = predicted.reshape(len(images), *predicted.shape[-2:]).float().cpu().numpy()

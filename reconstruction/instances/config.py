@@ -19,6 +19,9 @@ class InstancesConfig:
     masks_model: str = ""
     """For the learned ones: the model's name on the Hugging Face hub, or its folder; empty is the backend's choice."""
 
+    masks_concepts: str = ""
+    """For `sam3`: comma-separated things to look for ("chair, cup"); empty is everything, from a grid of points."""
+
     labels: Literal["embedded", "clip", "vlm"] = "embedded"
     """Who names things: `embedded` (coarse classes from shape and place), `clip` (any words, through transformers) or
     `vlm` (an OpenAI-compatible endpoint, see `SIMRECON_VLM_URL`)."""

@@ -206,5 +206,5 @@ def test_a_missing_library_names_the_extra(monkeypatch):
         return real_import(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(EnvironmentMissing, match=r"simrecon\[depth-models\]"):
+    with pytest.raises(EnvironmentMissing, match=r"simrecon\[models\]"):
         load_backend(WorldConfig(metric_depth="transformers"))

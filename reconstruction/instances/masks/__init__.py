@@ -7,5 +7,14 @@ from reconstruction.instances.masks.base import (
     MaskBackend,
     flatten_masks,
 )
+from reconstruction.instances.masks.load import DEFAULT_MODELS, load_mask_backend
 
-__all__ = ["FrameMasks", "ImageSegmenter", "KeyframeMasks", "MaskBackend", "flatten_masks"]
+__all__ = [
+    "DEFAULT_MODELS",
+    "FrameMasks",
+    "ImageSegmenter",
+    "KeyframeMasks",
+    "MaskBackend",
+    "flatten_masks",
+    "load_mask_backend",
+]

@@ -60,13 +60,13 @@ class KeyframeMasks:
 
 
 def flatten_masks(masks: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return one id image, uint16 (h, w), of overlapping masks bool (k, h, w) with scores (k,).
+    """Return one id image, uint16 (h, w), of overlapping masks bool (k, h, w), k >= 0, with scores (k,).
 
     A pixel goes to the smallest mask that holds it, for a thing's mask lies within that of what it stands on; of two
     masks of nearly one extent (IoU above 0.8) the one with the higher score stays.
     """
     masks, scores = np.asarray(masks, bool), np.asarray(scores, np.float64)
-    area = masks.reshape(len(masks), -1).sum(axis=1)
+    area = masks.sum(axis=(1, 2))
     kept: list[int] = []
     for k in np.lexsort((np.arange(len(masks)), -scores)):
         doubled = area[k] == 0

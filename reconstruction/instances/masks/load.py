@@ -1,0 +1,38 @@
+"""Which backend makes the masks: what the config asks for, loaded."""
+
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.masks.base import ImageSegmenter, KeyframeMasks, MaskBackend
+from reconstruction.learned import ModelRequest
+
+# Where the option names none. Licenses: docs/masks.md.
+DEFAULT_MODELS = {
+    "sam2": "facebook/sam2.1-hiera-small",
+    "sam3": "facebook/sam3",
+    "mask2former": "facebook/mask2former-swin-large-ade-panoptic",
+}
+
+
+def load_mask_backend(config: InstancesConfig) -> MaskBackend | None:
+    """Return the backend that `config.masks` asks for; None for the embedded cut, which needs no masks.
+
+    Raises:
+        EnvironmentMissing: a learned one needs something that is not installed, or weights that are not there.
+    """
+    if config.masks in DEFAULT_MODELS:
+        return KeyframeMasks(_load_segmenter(config))
+    return None
+
+
+def _load_segmenter(config: InstancesConfig) -> ImageSegmenter:
+    model = config.masks_model or DEFAULT_MODELS[config.masks]
+    request = ModelRequest(model, "instances.masks", "instances.masks_model", config.learned_device)
+    if config.masks == "mask2former":
+        from reconstruction.instances.masks.mask2former import QueryMasks
+
+        return QueryMasks(request)
+    from reconstruction.instances.masks.sam import ConceptMasks, PointGridMasks
+
+    concepts = tuple(word.strip() for word in config.masks_concepts.split(",") if word.strip())
+    if config.masks == "sam3" and concepts:
+        return ConceptMasks(request, concepts)
+    return PointGridMasks(request, "Sam2Model" if config.masks == "sam2" else "Sam3TrackerModel")

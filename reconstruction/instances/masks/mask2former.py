@@ -1,0 +1,42 @@
+"""Masks by Mask2Former through `transformers`: instance, panoptic or semantic weights, each query's mask on its own."""
+
+import numpy as np
+
+from reconstruction.instances.masks.base import flatten_masks
+from reconstruction.learned import ModelRequest, load_model, load_part, upsample
+
+_MIN_SCORE = 0.5
+
+
+class QueryMasks:
+    """A Mask2Former model: an `ImageSegmenter`."""
+
+    def __init__(self, request: ModelRequest) -> None:
+        """Load the model and its image processor.
+
+        Raises:
+            EnvironmentMissing: transformers or the weights are missing, or do not fit.
+        """
+        self._model = load_model(request, "Mask2FormerForUniversalSegmentation")
+        self._processor = load_part(request, "AutoImageProcessor")
+        self.name = request.model
+
+    def segment(self, image: np.ndarray) -> np.ndarray:
+        """See `ImageSegmenter.segment`.
+
+        A query's score is its class probability times the mean probability inside its mask, as in the model's own
+        instance segmentation; panoptic fusion is left out, since a thing's mask may lie within another's here.
+        """
+        import torch
+
+        inputs = self._processor(images=[np.ascontiguousarray(image)], return_tensors="pt")
+        with torch.inference_mode():
+            out = self._model(pixel_values=inputs["pixel_values"].to(self._model.device))
+            classes = out.class_queries_logits[0].softmax(dim=-1)[:, :-1].max(dim=-1).values
+            logits = out.masks_queries_logits[0]
+            inside = logits > 0
+            sure = (logits.sigmoid() * inside).flatten(1).sum(1) / inside.flatten(1).sum(1).clamp(min=1)
+            score = classes * sure
+            good = score > _MIN_SCORE
+            masks = upsample(logits[good], *image.shape[:2]) > 0
+        return flatten_masks(masks, score[good].float().cpu().numpy())
