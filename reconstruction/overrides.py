@@ -1,27 +1,22 @@
 """The user's corrections (`--overrides FILE`), read once, checked at once, and applied by the stage that they concern.
 
-The file is a YAML list; each entry names an object by `id` (see `simrecon show`), optionally with an anchor
-`near: [x, y, z]` in world metres that must lie within 0.3 m of the object, so that a file made for another run is
-refused instead of applied to the wrong thing. See docs/overrides.md.
+The file is a YAML list; each entry says which thing it means, by `id`, `at` or `pixel`
+(`reconstruction.instances.addresses`), and what to do with it. See docs/overrides.md.
 """
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
+    from reconstruction.instances.anchors import Pointer
     from reconstruction.types import (
         AssetSet,
-        DepthMaps,
         InstanceSet,
         ObjectAsset,
-        PosedFrames,
         SceneGraph,
-        Surface,
     )
 
 # What an entry may do, by the stage that does it.
@@ -30,8 +25,7 @@ ACTIONS: dict[str, tuple[str, ...]] = {
     "assets": ("mass_kg", "material", "friction", "mesh"),
     "scene_graph": ("parent",),
 }
-_ADDRESS = ("id", "near", "relation")
-ANCHOR_RADIUS_M = 0.3
+_ADDRESS = ("id", "near", "at", "pixel", "relation")
 
 
 @dataclass(frozen=True)
@@ -67,37 +61,43 @@ class Overrides:
         return cls(entries, Path(path).resolve().parent)
 
     def of_stage(self, stage: str) -> list[dict]:
-        """Return the entries that change this stage's result; part of its fingerprint."""
+        """Return the entries that change this stage's result."""
         actions = ACTIONS.get(stage, ())
         return [entry for entry in self.entries if any(action in entry for action in actions)]
 
-    def apply_to_instances(
-        self, found: "InstanceSet", surface: "Surface", posed: "PosedFrames", depth: "DepthMaps"
-    ) -> "InstanceSet":
-        """Relabel, drop, merge, split, make base; the cameras tell how a split shows in the instance maps."""
-        entries = self.of_stage("instances")
-        if not entries:
-            return found
+    def fingerprint_of_stage(self, stage: str) -> list:
+        """Return what belongs into a stage's fingerprint: its entries, and the bytes of meshes that they name."""
+        from reconstruction.cache import digest_input
+
+        entries = self.of_stage(stage)
+        files = [self.folder / str(entry["mesh"]) for entry in entries if "mesh" in entry]
+        return [*entries, *(digest_input(file) for file in files if file.exists())]
+
+    def apply_to_instances(self, pointer: "Pointer") -> "InstanceSet":
+        """Relabel, drop, merge, split, make base what the pointer's cut holds."""
         from reconstruction.instances import apply_overrides
 
-        return apply_overrides(found, surface, entries, posed=posed, depth=depth)
+        return apply_overrides(pointer.found, pointer.surface, self.of_stage("instances"), pointer.footage)
 
-    def apply_to_assets(self, assets: "AssetSet") -> "AssetSet":
+    def apply_to_assets(self, assets: "AssetSet", pointer: "Pointer") -> "AssetSet":
         """Set mass, material or friction, or replace a mesh."""
         objects = {item.id: item for item in assets.objects}
         for entry in self.of_stage("assets"):
-            item = _addressed(entry, objects)
+            item = _addressed(entry, objects, pointer)
             objects[item.id] = _with_physics(self._with_mesh(item, entry), entry)
         return replace(assets, objects=tuple(objects[item.id] for item in assets.objects))
 
-    def apply_to_graph(self, graph: "SceneGraph", assets: "AssetSet") -> "SceneGraph":
+    def apply_to_graph(self, graph: "SceneGraph", assets: "AssetSet", pointer: "Pointer") -> "SceneGraph":
         """Give objects other parents; refuses a parent that does not exist or that makes a cycle."""
+        from reconstruction.instances.addresses import parse_address
+
         objects = {item.id: item for item in assets.objects}
         known = set(objects) | {item.id for item in assets.base}
         edges = {edge.child: edge for edge in graph.edges}
         for entry in self.of_stage("scene_graph"):
-            item = _addressed(entry, objects)
-            parent = entry["parent"]
+            item = _addressed(entry, objects, pointer)
+            address = parse_address(entry["parent"], "overrides: parent")
+            parent = address.id if address.kind == "id" else pointer.entity(address).id
             if parent not in known:
                 raise UsageError(
                     f"overrides: object {item.id} cannot have parent {parent}; ids are {sorted(known)}"
@@ -134,8 +134,7 @@ def _check(entry: Any, where: str) -> None:
         )
     if not set(entry) & set(allowed):
         raise UsageError(f"{where}: says nothing to do; use one of {', '.join(allowed)}")
-    if "merge" not in entry and not isinstance(entry.get("id"), int):
-        raise UsageError(f"{where}: needs `id: N`, the object's number in `simrecon show`")
+    _check_addresses(entry, where)
     for name in ("mass_kg", "friction"):
         value = entry.get(name)
         if value is not None and not (isinstance(value, int | float) and 0 < value < 1e5):
@@ -144,20 +143,30 @@ def _check(entry: Any, where: str) -> None:
         raise UsageError(f"{where}: relation must be supported_by or attached_to")
 
 
-def _addressed(entry: dict, objects: dict[int, "ObjectAsset"]) -> "ObjectAsset":
-    item = objects.get(entry["id"])
-    if item is None:
-        raise UsageError(f"overrides: no object {entry['id']}; objects are {sorted(objects)}")
-    if "near" in entry:
-        center = item.world_from_object[:3, 3]
-        if np.linalg.norm(center - np.asarray(entry["near"], float)) > ANCHOR_RADIUS_M + float(
-            np.ptp(item.visual.vertices)
-        ):
-            where = ", ".join(f"{x:.2f}" for x in center)
-            raise UsageError(
-                f"overrides: object {item.id} ({item.label}) is at [{where}], not near {entry['near']}"
-            )
-    return item
+def _check_addresses(entry: dict, where: str) -> None:
+    """Refuse an entry that does not say which thing it means."""
+    from reconstruction.instances.addresses import KINDS, parse_address, parse_addresses, parse_parts
+
+    clicked = isinstance(entry.get("split"), list)
+    if clicked:
+        parse_parts(entry["split"], f"{where}: split")
+    if "merge" in entry:
+        parse_addresses(entry["merge"], f"{where}: merge", fewest=2)
+        if set(entry) != {"merge"}:
+            raise UsageError(f"{where}: merge stands alone; say the rest in an entry after it")
+    elif not (clicked and not set(entry) & set(KINDS)):
+        parse_address(entry, where)
+    if "parent" in entry:
+        parse_address(entry["parent"], f"{where}: parent")
+
+
+def _addressed(entry: dict, objects: dict[int, "ObjectAsset"], pointer: "Pointer") -> "ObjectAsset":
+    from reconstruction.instances.addresses import parse_address
+
+    found = pointer.thing(parse_address(entry, "overrides"))
+    if found.id not in objects:
+        raise UsageError(f"overrides: {found.label} {found.id} was not built; objects are {sorted(objects)}")
+    return objects[found.id]
 
 
 def _with_physics(item: "ObjectAsset", entry: dict) -> "ObjectAsset":

@@ -12,6 +12,7 @@ in metres, +z up, floor at z = 0. `Run` remembers each stage's result under the 
 import importlib
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,8 @@ from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, finge
 from reconstruction.compiling import compilation_shown
 from reconstruction.config import PipelineConfig
 from reconstruction.gaussians import GaussianScene
+from reconstruction.instances.anchors import Footage, Pointer
+from reconstruction.instances.lens import Lens
 from reconstruction.overrides import Overrides
 from reconstruction.profiling import Usage, UsageMeter
 from reconstruction.progress import NO_PROGRESS, Progress, StageListener
@@ -108,29 +111,26 @@ class Run:
     def _execute_stage(self, number: int, stage: Stage) -> None:
         config = getattr(self.config, stage.name)
         upstream = tuple(self.keys[name] for name in stage.needs) or (self.input_digest,)
-        options = (config, self.overrides.of_stage(stage.name))
+        options = ()
         if stage.name == "poses" and config.import_path and Path(config.import_path).exists():
             options += (digest_input(Path(config.import_path)),)
         if self.oracle is not None and self.oracle.of_stage(stage.name):
             options += (self.oracle.of_stage(stage.name),)
-        key = fingerprint(stage.name, stage.module, options, upstream)
-        self.keys[stage.name] = key
+
+        def key_with(corrections: list) -> str:
+            return fingerprint(stage.name, stage.module, (config, corrections, *options), upstream)
+
+        corrections = self.overrides.fingerprint_of_stage(stage.name)
+        key = self.keys[stage.name] = key_with(corrections)
         cached = self.store.has(number, stage.name, key)
         self.listener.begin_stage(stage.name, number, len(STAGES), cached)
         if not cached:
-            notes: list[str] = []
-            with UsageMeter() as meter, compilation_shown(self.listener) as shown:
-                result = self._compute(stage, config, _NoteTaker(shown, notes))
-            record = {
-                "stage": stage.name,
-                "key": key,
-                "usage": asdict(meter.usage),
-                "notes": notes,
-                "config": config,
-            }
-            self.store.save(result, number, stage.name, key, record)
+            with compilation_shown(self.listener) as shown:
+                if corrections:
+                    self._keep_corrected(number, stage, key_with([]), key, shown)
+                else:
+                    self._keep(number, stage, key, lambda noted: self._compute(stage, config, noted), shown)
             self.computed.add(stage.name)
-            del result
         manifest = self.store.manifest(number, stage.name, key)
         # Always continue from what is on disk: a resumed run then computes with the very same values.
         self.results[stage.name] = self.store.load(stage.produces, number, stage.name, key)
@@ -140,6 +140,52 @@ class Run:
             for note in manifest["notes"]
         )
         self.listener.end_stage(stage.name, None if cached else self.usage[stage.name])
+
+    def _keep(
+        self,
+        number: int,
+        stage: Stage,
+        key: str,
+        make: Callable[[Progress], Any],
+        shown: Progress,
+        before: dict | None = None,
+    ) -> None:
+        """Make a stage's result and keep it; `before` is the manifest of the result that it was made from."""
+        notes = list(before["notes"]) if before else []
+        with UsageMeter() as meter:
+            result = make(_NoteTaker(shown, notes))
+        usage = meter.usage if before is None else Usage(**before["usage"]).followed_by(meter.usage)
+        config = getattr(self.config, stage.name)
+        record = {"stage": stage.name, "key": key, "usage": asdict(usage), "notes": notes, "config": config}
+        self.store.save(result, number, stage.name, key, record)
+
+    def _keep_corrected(self, number: int, stage: Stage, plain_key: str, key: str, shown: Progress) -> None:
+        """Correct a stage's result as the user says; the result before that is kept too, for the next correction."""
+        config = getattr(self.config, stage.name)
+        if not self.store.has(number, stage.name, plain_key):
+            self._keep(number, stage, plain_key, lambda noted: self._compute(stage, config, noted), shown)
+        plain = self.store.load(stage.produces, number, stage.name, plain_key)
+        before = self.store.manifest(number, stage.name, plain_key)
+        self._keep(number, stage, key, lambda _: self._corrected(stage, plain), shown, before)
+
+    def _corrected(self, stage: Stage, plain: Any) -> Any:
+        done = self.results
+        if stage.name == "instances":
+            return self.overrides.apply_to_instances(self._pointer(plain))
+        pointer = self._pointer(done["instances"])
+        if stage.name == "assets":
+            return self.overrides.apply_to_assets(plain, pointer)
+        return self.overrides.apply_to_graph(plain, done["assets"], pointer)
+
+    def _pointer(self, found: InstanceSet) -> Pointer:
+        """Return what addresses of the overrides are looked up in."""
+        posed, depth = self.in_world()
+        surface = self.results["surface"]
+        return Pointer(found, surface, Footage(posed, depth, surface, self.lens()))
+
+    def lens(self) -> Lens:
+        """Return the map from the film's pixels to those of its straightened frames."""
+        return Lens.measure(self.results["frames"], self.results["poses"])
 
     def _compute(self, stage: Stage, config: Any, progress: Progress) -> Any:
         module = importlib.import_module(stage.module)
@@ -163,20 +209,17 @@ class Run:
                 config = replace(config, refine_depth=False)  # the truth has nothing to gain
             return module.make_gaussians(done["poses"], done["depth"], config, progress=progress)
         if stage.name == "scene_graph":
-            graph = module.infer_scene_graph(done["assets"], config, progress=progress)
-            return self.overrides.apply_to_graph(graph, done["assets"])
+            return module.infer_scene_graph(done["assets"], config, progress=progress)
         if stage.name == "assembly":
             return module.assemble(done["assets"], done["scene_graph"], config, progress=progress)
         posed, depth = self.in_world()
         if stage.name == "surface":
             return module.fuse_surface(posed, depth, config, progress=progress)
         if stage.name == "instances":
-            found = module.find_instances(posed, depth, done["surface"], config, progress=progress)
-            return self.overrides.apply_to_instances(found, done["surface"], posed, depth)
-        assets = module.build_assets(
+            return module.find_instances(posed, depth, done["surface"], config, progress=progress)
+        return module.build_assets(
             posed, depth, done["surface"], done["instances"], config, progress=progress
         )
-        return self.overrides.apply_to_assets(assets)
 
     def _ask_oracle(self, stage: Stage, config: Any, progress: Progress) -> Any:
         progress.note(f"{stage.name}: taken from the ground truth")

@@ -23,6 +23,11 @@ class Usage:
     cpu_s: float
     peak_memory_mb: float
 
+    def followed_by(self, later: "Usage") -> "Usage":
+        """Return what both cost, one after the other."""
+        peak = max(self.peak_memory_mb, later.peak_memory_mb)
+        return Usage(self.wall_s + later.wall_s, self.cpu_s + later.cpu_s, peak)
+
 
 class UsageMeter:
     """Context manager that measures this process and everything that it starts while the body runs.

@@ -75,7 +75,10 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         "(.r3d or unzipped) or Polycam's raw data; see docs/poses.md",
     )
     parser.add_argument(
-        "--overrides", type=Path, metavar="FILE", help="your corrections (YAML); see docs/overrides.md"
+        "--overrides",
+        type=Path,
+        metavar="FILE",
+        help="your corrections (YAML): relabel, merge, split, drop what you click on; see docs/overrides.md",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default 0)")
     parser.add_argument(

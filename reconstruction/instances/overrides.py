@@ -4,78 +4,64 @@ from dataclasses import replace
 
 import numpy as np
 
+from reconstruction.instances.addresses import KINDS, parse_address, parse_addresses, parse_parts, vector
+from reconstruction.instances.anchors import Footage, Pointer
 from reconstruction.instances.base import BASE_LABELS
 from reconstruction.instances.boxes import upright_box
+from reconstruction.instances.clicked_split import grown_parts, split_maps
 from reconstruction.surface.base_planes import base_outline
-from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, Plane, PosedFrames, Surface
+from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.errors import UsageError
-
-_ANCHOR_M = 0.3
 
 
 def apply_overrides(
-    found: InstanceSet,
-    surface: Surface,
-    overrides: list[dict],
-    *,
-    posed: PosedFrames | None = None,
-    depth: DepthMaps | None = None,
+    found: InstanceSet, surface: Surface, overrides: list[dict], footage: Footage | None = None
 ) -> InstanceSet:
     """Apply entries of an overrides file (docs/overrides.md) in their order.
 
-    Ids of things that an entry does not touch stay as they are; a split's second part gets the next free id.
+    Ids of things that an entry does not touch stay as they are; the further parts of a split get the next free ids.
 
     Args:
         found: the cut to correct.
         surface: the surface that was cut.
         overrides: the entries; those of other stages are ignored.
-        posed: keyframes in world space; needed by `split`, which also cuts the id maps.
-        depth: their depth; needed by `split`.
+        footage: the film; needed by clicks and by `split`, which also cuts the id maps.
 
     Raises:
-        UsageError: an entry names an object that is not there, or says something impossible.
+        UsageError: an entry means a thing that is not there, or says something impossible.
     """
     for entry in overrides:
+        pointer = Pointer(found, surface, footage)
         if "merge" in entry:
-            found = _merge(found, surface, entry["merge"])
+            found = _merge(found, surface, _merged_things(pointer, entry["merge"]))
             continue
-        item = _find(found, entry.get("id"), entry.get("near"))
+        item = _thing(pointer, entry)
         if entry.get("drop"):
             found = _drop(found, item)
         elif "make_base" in entry:
             found = _make_base(found, surface, item, entry["make_base"])
         elif "split" in entry:
-            found = _split(found, surface, item, entry["split"], posed, depth)
+            found = _split(pointer, item, entry["split"])
         if "relabel" in entry:
-            item = _find(found, entry["id"], None)
+            item = next(o for o in found.objects if o.id == item.id)
             found = _with(found, replace(item, label=str(entry["relabel"]), label_confidence=1.0))
     return found
 
 
-def _find(found: InstanceSet, number: object, near: object) -> Instance:
-    item = next((o for o in found.objects if o.id == number), None)
-    if item is None:
-        raise UsageError(f"overrides: no object {number}; objects are {[o.id for o in found.objects]}")
-    if near is not None:
-        anchor = _vector(near, f"near of object {number}")
-        # The anchor may lie anywhere on the thing: measured to its box's center, less half its diagonal.
-        if np.linalg.norm(anchor - item.center) > _ANCHOR_M + 0.5 * np.linalg.norm(item.extents_m):
-            where = ", ".join(f"{x:.2f}" for x in item.center)
-            raise UsageError(
-                f"overrides: object {number} ({item.label}) is at [{where}], not near {list(anchor)}; "
-                "the file was made for another reconstruction, correct its ids"
-            )
-    return item
+def _thing(pointer: Pointer, entry: dict) -> Instance:
+    """Return the thing that an entry is about; a split by clicks says it by its clicks."""
+    if isinstance(entry.get("split"), list) and not set(entry) & set(KINDS):
+        return _split_thing(pointer, entry["split"])
+    return pointer.thing(parse_address(entry, "overrides"))
 
 
-def _vector(value: object, name: str) -> np.ndarray:
-    try:
-        vector = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        vector = np.zeros(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise UsageError(f"overrides: {name} must be three numbers in world metres, got {value!r}")
-    return vector
+def _merged_things(pointer: Pointer, values: object) -> list[Instance]:
+    items = [pointer.thing(a) for a in parse_addresses(values, "overrides: merge", fewest=2)]
+    if len({item.id for item in items}) < 2:
+        raise UsageError(
+            f"overrides: merge: all addresses mean the same thing, {items[0].label} {items[0].id}"
+        )
+    return list({item.id: item for item in items}.values())
 
 
 def _with(found: InstanceSet, item: Instance) -> InstanceSet:
@@ -111,10 +97,7 @@ def _drop(found: InstanceSet, item: Instance) -> InstanceSet:
     return replace(dropped, objects=tuple(objects))
 
 
-def _merge(found: InstanceSet, surface: Surface, numbers: object) -> InstanceSet:
-    if not isinstance(numbers, list) or len(set(map(repr, numbers))) < 2:
-        raise UsageError(f"overrides: merge needs a list of at least two ids, got {numbers!r}")
-    items = [_find(found, n, None) for n in numbers]
+def _merge(found: InstanceSet, surface: Surface, items: list[Instance]) -> InstanceSet:
     keep = max(items, key=lambda o: (float(np.prod(o.extents_m)), -o.id))
     for item in items:
         if item.id != keep.id:
@@ -126,67 +109,66 @@ def _merge(found: InstanceSet, surface: Surface, numbers: object) -> InstanceSet
     return _with(found, replace(_refit(kept, found, surface), support_hint=outside[0] if outside else 0))
 
 
-def _split(
-    found: InstanceSet,
-    surface: Surface,
-    item: Instance,
-    plane: object,
-    posed: PosedFrames | None,
-    depth: DepthMaps | None,
-) -> InstanceSet:
-    if not isinstance(plane, dict) or set(plane) != {"point", "normal"}:
+def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
+    found, surface = pointer.found, pointer.surface
+    if pointer.footage is None:
+        raise ValueError("a split needs the footage: it also cuts the id maps")
+    chosen = np.flatnonzero(found.vertex_instance == item.id)
+    part = _beyond_plane(pointer, item, how, chosen) if isinstance(how, dict) else None
+    if part is None:
+        seeds = [[pointer.vertex(a, item) for a in clicks] for clicks in parse_parts(how, "overrides: split")]
+        if len({v for seed in seeds for v in seed}) < sum(map(len, seeds)):
+            raise UsageError(
+                f"overrides: split of {item.label} {item.id}: two points are the same spot of it"
+            )
+        part = grown_parts(surface, chosen, seeds)
+    first = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
+    numbers = np.array([item.id, *range(first, first + int(part.max()))])
+    labels = np.array(found.vertex_instance)
+    labels[chosen] = numbers[part]
+    maps = np.array(found.id_maps)
+    footage = pointer.footage
+    split_maps(
+        maps, lambda row: footage.seen_vertices(np.asarray(footage.posed.world_from_camera[row])), labels,
+        item.id, numbers.tolist(),
+    )  # fmt: skip
+    parts = [replace(item, id=int(number)) for number in numbers]
+    others = tuple(parts[0] if o.id == item.id else o for o in found.objects)
+    out = replace(found, vertex_instance=labels, id_maps=maps, objects=(*others, *parts[1:]))
+    for each in parts:
+        out = _with(out, _refit(each, out, surface))
+    return out
+
+
+def _split_thing(pointer: Pointer, how: object) -> Instance:
+    """Return the thing that all clicks of a split lie on."""
+    clicks = [a for part in parse_parts(how, "overrides: split") for a in part]
+    hit = [(a, pointer.thing(a)) for a in clicks]
+    if len({item.id for _, item in hit}) > 1:
+        said = "; ".join(f"{a} shows {item.label} {item.id}" for a, item in hit)
+        raise UsageError(f"overrides: split: the points lie on different things already: {said}")
+    return hit[0][1]
+
+
+def _beyond_plane(pointer: Pointer, item: Instance, how: dict, chosen: np.ndarray) -> np.ndarray:
+    """Return for each vertex of a thing whether it lies beyond the plane: int (k,) 0 or 1."""
+    if set(how) != {"point", "normal"}:
         raise UsageError(
-            f"overrides: split of object {item.id} needs {{point: [x, y, z], normal: [x, y, z]}}"
+            f"overrides: split of object {item.id} needs {{point: [x, y, z], normal: [x, y, z]}}, "
+            "or a list with a click on each part"
         )
-    point, normal = _vector(plane["point"], "split point"), _vector(plane["normal"], "split normal")
+    if isinstance(how["point"], dict):
+        point = pointer.point(parse_address(how["point"], "overrides: split point"))
+    else:
+        point = np.array(vector(how["point"], "overrides: split point"))
+    normal = np.array(vector(how["normal"], "overrides: split normal"))
     if np.linalg.norm(normal) < 1e-9:
         raise UsageError(f"overrides: the split normal of object {item.id} has no direction")
-    vertices = np.asarray(surface.vertices, np.float64)
-    chosen = found.vertex_instance == item.id
-    second = chosen & ((vertices - point) @ normal > 0)
-    if not 0 < second.sum() < chosen.sum():
+    beyond = (np.asarray(pointer.surface.vertices, np.float64)[chosen] - point) @ normal > 0
+    if not 0 < beyond.sum() < len(chosen):
         where = ", ".join(f"{x:.2f}" for x in item.center)
         raise UsageError(f"overrides: the split plane misses object {item.id}, which is around [{where}]")
-    number = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
-    labels = np.array(found.vertex_instance)
-    labels[second] = number
-    maps = np.array(found.id_maps)
-    if len(maps):
-        if posed is None or depth is None:
-            raise ValueError("apply_overrides needs `posed` and `depth` to split the id maps")
-        _split_maps(maps, surface, item.id, number, (point, normal), posed, depth)
-    found = replace(found, vertex_instance=labels, id_maps=maps)
-    part = replace(item, id=number)
-    found = replace(found, objects=(*found.objects, part))
-    for old in (item, part):
-        found = _with(found, _refit(old, found, surface))
-    return found
-
-
-def _split_maps(
-    maps: np.ndarray,
-    surface: Surface,
-    old: int,
-    new: int,
-    plane: tuple[np.ndarray, np.ndarray],
-    posed: PosedFrames,
-    depth: DepthMaps,
-) -> None:
-    """Give the pixels of `old` that show the far side of the plane to `new`, in place."""
-    from reconstruction.rasterize import rasterize_mesh
-
-    camera = depth.camera
-    point, normal = plane
-    for i in np.flatnonzero((maps == old).any(axis=(1, 2))):
-        world_from_camera = np.asarray(posed.world_from_camera[i])
-        seen = rasterize_mesh(surface.vertices, surface.faces, camera, world_from_camera).depth
-        row, column = np.nonzero(maps[i] == old)
-        z = np.where(seen[row, column] > 0, seen[row, column], depth.depth[i][row, column]).astype(np.float64)
-        ray = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy], axis=1)
-        in_camera = np.column_stack([ray * z[:, None], z])
-        in_world = in_camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-        far = ((in_world - point) @ normal > 0) & (z > 0)
-        maps[i, row[far], column[far]] = new
+    return beyond.astype(np.int64)
 
 
 def _make_base(found: InstanceSet, surface: Surface, item: Instance, label: object) -> InstanceSet:

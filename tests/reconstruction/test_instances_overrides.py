@@ -5,6 +5,8 @@ import pytest
 from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
 
 from reconstruction.instances import InstancesConfig, apply_overrides, find_instances
+from reconstruction.instances.anchors import Footage
+from reconstruction.instances.lens import Lens
 from reconstruction.progress import NO_PROGRESS
 from registry.errors import UsageError
 
@@ -23,7 +25,7 @@ def scene():
     posed, depth = frames_of(surface, 320, 240)
     found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
     assert len(found.objects) == 3
-    return surface, posed, depth, found
+    return surface, posed, Footage(posed, depth, surface, Lens(320, 240)), found
 
 
 def consistent(found) -> bool:
@@ -70,10 +72,10 @@ def test_merge(scene):
 
 
 def test_split_by_plane_cuts_vertices_and_pixels(scene):
-    surface, posed, depth, found = scene
+    surface, _, footage, found = scene
     table = found.objects[0]
     entry = {"id": table.id, "split": {"point": [0.0, 0, 0], "normal": [1, 0, 0]}}
-    out = apply_overrides(found, surface, [entry], posed=posed, depth=depth)
+    out = apply_overrides(found, surface, [entry], footage)
     assert len(out.objects) == 4
     new = max(o.id for o in out.objects)
     assert (surface.vertices[out.vertex_instance == new, 0] > 0).all()
@@ -110,8 +112,8 @@ def test_anchor_guards_against_another_reconstruction(scene):
     ("entry", "message"),
     [
         ({"id": 99, "drop": True}, "no object 99"),
-        ({"merge": [3]}, "at least two"),
-        ({"id": None, "relabel": "x"}, "no object None"),
+        ({"merge": [3]}, "at least 2"),
+        ({"id": None, "relabel": "x"}, "must be the number"),
         ({"merge": [3, 77]}, "no object 77"),
     ],
 )
@@ -133,6 +135,115 @@ def test_wrong_addresses_are_said(scene, entry, message):
     ],
 )
 def test_wrong_changes_are_said(scene, change, message):
-    surface, _, _, found = scene
+    surface, _, footage, found = scene
     with pytest.raises(UsageError, match=message):
-        apply_overrides(found, surface, [{"id": found.objects[0].id, **change}])
+        apply_overrides(found, surface, [{"id": found.objects[0].id, **change}], footage)
+
+
+def pixel_on(footage: Footage, point, row: int = 0) -> dict:
+    """Return a click on a world point in a keyframe, in the film's pixels."""
+    camera, pose = footage.posed.camera, footage.posed.world_from_camera[row]
+    local = (np.asarray(point) - pose[:3, 3]) @ pose[:3, :3]
+    x, y = camera.fx * local[0] / local[2] + camera.cx, camera.fy * local[1] / local[2] + camera.cy
+    return {"frame": int(footage.posed.indices[row]), "x": float(x), "y": float(y)}
+
+
+RED_TOP, BLUE_TOP, TABLE_TOP, FLOOR = (
+    (-0.24, 0.05, 0.65),
+    (0.16, 0.05, 0.62),
+    (-0.05, -0.3, 0.5),
+    (-0.9, -0.8, 0),
+)
+
+
+def labels_of(found, surface, point) -> str:
+    nearest = int(np.argmin(np.linalg.norm(surface.vertices - np.array(point), axis=1)))
+    number = found.vertex_instance[nearest]
+    return next((o.label for o in found.objects if o.id == number), "none")
+
+
+def test_a_thing_is_meant_by_a_click_or_by_a_point(scene):
+    surface, _, footage, found = scene
+    entries = [
+        {"pixel": pixel_on(footage, RED_TOP), "relabel": "red"},
+        {"at": list(BLUE_TOP), "relabel": "blue"},
+        {"pixel": pixel_on(footage, TABLE_TOP, row=2), "relabel": "desk"},
+    ]
+    out = apply_overrides(found, surface, entries, footage)
+    assert [labels_of(out, surface, p) for p in (RED_TOP, BLUE_TOP, TABLE_TOP)] == ["red", "blue", "desk"]
+
+
+def test_merge_by_clicks_and_go_on_with_what_it_made(scene):
+    surface, _, footage, found = scene
+    red, blue = ({"pixel": pixel_on(footage, p)} for p in (RED_TOP, BLUE_TOP))
+    out = apply_overrides(found, surface, [{"merge": [red, blue]}, {**blue, "relabel": "pair"}], footage)
+    assert len(out.objects) == 2
+    assert labels_of(out, surface, RED_TOP) == "pair"
+    assert consistent(out)
+
+
+def test_split_by_clicks_gives_each_part_its_color(scene):
+    """Merged wrongly, table and boxes come apart again at their creases, in the mesh and in the pictures."""
+    surface, _, footage, found = scene
+    whole = apply_overrides(found, surface, [{"merge": [o.id for o in found.objects]}], footage)
+    clicks = [{"pixel": pixel_on(footage, p)} for p in (TABLE_TOP, RED_TOP)] + [{"at": list(BLUE_TOP)}]
+    out = apply_overrides(whole, surface, [{"split": clicks}], footage)
+    assert len(out.objects) == 3
+    for point in (TABLE_TOP, RED_TOP, BLUE_TOP):
+        nearest = int(np.argmin(np.linalg.norm(surface.vertices - np.array(point), axis=1)))
+        before, after = (f.vertex_instance == f.vertex_instance[nearest] for f in (found, out))
+        assert (before & after).sum() > 0.93 * (before | after).sum()
+        shown_before = found.id_maps == found.vertex_instance[nearest]
+        shown_after = out.id_maps == out.vertex_instance[nearest]
+        assert (shown_before & shown_after).sum() > 0.9 * (shown_before | shown_after).sum()
+    assert consistent(out)
+
+
+def test_several_clicks_may_lie_on_one_part(scene):
+    surface, _, footage, found = scene
+    both = apply_overrides(found, surface, [{"merge": [o.id for o in found.objects]}], footage)
+    boxes = [{"at": list(RED_TOP)}, {"at": list(BLUE_TOP)}]
+    out = apply_overrides(both, surface, [{"split": [boxes, {"at": list(TABLE_TOP)}]}], footage)
+    assert len(out.objects) == 2
+    owner = [out.vertex_instance[np.argmin(np.linalg.norm(surface.vertices - np.array(p), axis=1))]
+             for p in (RED_TOP, BLUE_TOP, TABLE_TOP)]  # fmt: skip
+    assert owner[0] == owner[1] != owner[2]
+
+
+def test_the_split_plane_may_go_through_a_click(scene):
+    surface, _, footage, found = scene
+    entry = {"id": found.objects[0].id, "split": {"point": {"at": [0, -0.3, 0.5]}, "normal": [1, 0, 0]}}
+    assert len(apply_overrides(found, surface, [entry], footage).objects) == 4
+
+
+def test_a_click_on_the_floor_or_beside_the_film_is_said(scene):
+    surface, _, footage, found = scene
+    with pytest.raises(
+        UsageError, match=r"shows the floor \(1\), not a thing; the nearest is \w+ \d, \d+ pixels"
+    ):
+        apply_overrides(found, surface, [{"pixel": pixel_on(footage, FLOOR), "drop": True}], footage)
+    with pytest.raises(UsageError, match="outside the frame of 320 x 240"):
+        apply_overrides(found, surface, [{"pixel": {"frame": 0, "x": 400, "y": 3}, "drop": True}], footage)
+    with pytest.raises(UsageError, match=r"no camera is known of frame 77 .*nearest with one are 0, 1, 2"):
+        apply_overrides(found, surface, [{"pixel": {"frame": 77, "x": 4, "y": 3}, "drop": True}], footage)
+    with pytest.raises(UsageError, match=r"at \[0.00, 0.00, 2.00\] shows nothing .*m away"):
+        apply_overrides(found, surface, [{"at": [0, 0, 2], "drop": True}], footage)
+
+
+def test_splits_between_things_and_merges_of_one_are_said(scene):
+    surface, _, footage, found = scene
+    red, blue = {"at": list(RED_TOP)}, {"at": list(BLUE_TOP)}
+    with pytest.raises(UsageError, match="different things already"):
+        apply_overrides(found, surface, [{"split": [red, blue]}], footage)
+    with pytest.raises(UsageError, match="same thing"):
+        apply_overrides(found, surface, [{"merge": [red, {"at": [-0.2, 0.02, 0.65]}]}], footage)
+    with pytest.raises(UsageError, match="same spot"):
+        apply_overrides(found, surface, [{"split": [red, {"at": [-0.2401, 0.05, 0.65]}]}], footage)
+
+
+def test_a_click_may_count_in_another_size(scene):
+    surface, _, footage, found = scene
+    click = pixel_on(footage, RED_TOP)
+    twice = {"frame": click["frame"], "x": 2 * click["x"], "y": 2 * click["y"], "size": [640, 480]}
+    out = apply_overrides(found, surface, [{"pixel": twice, "relabel": "red"}], footage)
+    assert labels_of(out, surface, RED_TOP) == "red"

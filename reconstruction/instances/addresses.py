@@ -1,0 +1,121 @@
+"""How a user points at a thing: by id, by a point in the world, or by a click in a frame of the film.
+
+Ids are given by size and change with settings; world coordinates change with the scale. A frame number and a pixel of
+the film mean the same thing in every reconstruction of it: the anchor to keep in a file. See docs/overrides.md.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from registry.errors import UsageError
+
+KINDS = ("id", "at", "pixel")
+
+
+@dataclass(frozen=True)
+class Address:
+    """One way to say which thing is meant."""
+
+    kind: str  # one of KINDS
+    id: int = 0
+    near: tuple[float, float, float] | None = None  # guards an id
+    at: tuple[float, float, float] | None = None  # world metres
+    frame: int = 0  # video frame number
+    pixel: tuple[float, float] = (0.0, 0.0)  # in the video as filmed, upright
+    size: tuple[int, int] | None = None  # of the picture that `pixel` counts in; None: the video's own
+
+    def __str__(self) -> str:
+        """Return it as in the file."""
+        if self.kind == "id":
+            return f"id {self.id}"
+        if self.kind == "at":
+            return "at [" + ", ".join(f"{x:.2f}" for x in self.at) + "]"
+        return f"pixel ({self.pixel[0]:g}, {self.pixel[1]:g}) of frame {self.frame}"
+
+
+def parse_address(value: Any, where: str) -> Address:
+    """Read an address: a number, or a mapping with `id`, `at` or `pixel`; other keys of the mapping are ignored.
+
+    Raises:
+        UsageError: it is none of these.
+    """
+    if isinstance(value, int) and not isinstance(value, bool):
+        return Address("id", value)
+    given = [k for k in KINDS if k in value] if isinstance(value, dict) else []
+    if len(given) != 1:
+        raise UsageError(
+            f"{where}: needs one of `id: N`, `at: [x, y, z]` and `pixel: {{frame: N, x: X, y: Y}}`, "
+            f"got {value!r}"
+        )
+    if "near" in value and given[0] != "id":
+        raise UsageError(f"{where}: `near` belongs to `id`; {given[0]} says where on its own")
+    if given[0] == "at":
+        return Address("at", at=vector(value["at"], f"{where}: at"))
+    if given[0] == "pixel":
+        return _click(value["pixel"], where)
+    if not isinstance(value["id"], int) or isinstance(value["id"], bool):
+        raise UsageError(f"{where}: id must be the number of a thing in `simrecon show`, got {value['id']!r}")
+    near = vector(value["near"], f"{where}: near") if "near" in value else None
+    return Address("id", value["id"], near)
+
+
+def parse_addresses(values: Any, where: str, fewest: int) -> list[Address]:
+    """Read a list of addresses."""
+    if not isinstance(values, list) or len(set(map(repr, values))) < fewest:
+        raise UsageError(
+            f"{where} needs a list of at least {fewest} different things (ids or other addresses), got {values!r}"
+        )
+    return [parse_address(value, where) for value in values]
+
+
+def parse_parts(values: Any, where: str) -> list[list[Address]]:
+    """Read the points of a split: for each part one point (`pixel` or `at`), or a list of points."""
+    if not isinstance(values, list) or len(values) < 2:
+        raise UsageError(
+            f"{where} needs a plane {{point: [x, y, z], normal: [x, y, z]}}, or a list with a point on each part such "
+            f"as `- pixel: {{frame: 40, x: 812, y: 333}}`, got {values!r}"
+        )
+    parts = []
+    for value in values:
+        points = [parse_address(v, where) for v in (value if isinstance(value, list) else [value])]
+        if not points or any(point.kind == "id" for point in points):
+            raise UsageError(f"{where}: each part needs a point on it, `pixel` or `at`, got {value!r}")
+        parts.append(points)
+    return parts
+
+
+def vector(value: Any, where: str) -> tuple[float, float, float]:
+    """Check three finite numbers."""
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise UsageError(f"{where} must be three numbers, got {value!r}")
+    return tuple(float(x) for x in numbers)
+
+
+def _click(value: Any, where: str) -> Address:
+    def number(x: Any) -> bool:
+        return isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x)
+
+    size = value.get("size") if isinstance(value, dict) else None
+    if (
+        not isinstance(value, dict)
+        or not {"frame", "x", "y"} <= set(value) <= {"frame", "x", "y", "size"}
+        or not all(number(value[k]) for k in ("frame", "x", "y"))
+        or value["frame"] != int(value["frame"])
+        or not (size is None or (isinstance(size, list) and len(size) == 2 and all(map(number, size))))
+    ):
+        raise UsageError(
+            f"{where}: pixel needs {{frame: N, x: X, y: Y}}, the video's frame number and a pixel of it "
+            f"(with `size: [width, height]` where another size than the video's is counted in), got {value!r}"
+        )
+    return Address(
+        "pixel",
+        frame=int(value["frame"]),
+        pixel=(float(value["x"]), float(value["y"])),
+        size=tuple(int(x) for x in size) if size else None,
+    )

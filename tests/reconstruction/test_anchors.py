@@ -1,0 +1,215 @@
+"""Anchors mean the same thing in another reconstruction of the same film; clicks go through the lens."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from reconstruction.cache import StageStore, fingerprint
+from reconstruction.config import PipelineConfig
+from reconstruction.gaussians import Gaussians, GaussianScene
+from reconstruction.instance_views import choose_views
+from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.instances.addresses import Address, parse_address
+from reconstruction.instances.anchors import Footage, Pointer
+from reconstruction.instances.lens import Lens
+from reconstruction.overrides import Overrides
+from reconstruction.pipeline import STAGES, Run
+from reconstruction.progress import NO_PROGRESS
+from reconstruction.surface import SurfaceConfig, fuse_surface
+from reconstruction.types import ScaleEstimate, WorldFrame
+from registry.errors import UsageError
+
+
+def cut(posed, depth, voxel_size_m: float) -> Pointer:
+    config = SurfaceConfig(voxel_size_m=voxel_size_m)
+    surface = fuse_surface(posed, depth, config, progress=NO_PROGRESS)
+    found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
+    lens = Lens(posed.camera.width, posed.camera.height)
+    return Pointer(found, surface, Footage(posed, depth, surface, lens))
+
+
+@pytest.fixture(scope="module")
+def first(small_capture) -> Pointer:
+    return cut(small_capture.posed, small_capture.depth, 0.012)
+
+
+def clicks(pointer: Pointer) -> dict[int, Address]:
+    """Return the anchor that a user is given for each thing."""
+    source = pointer.footage.posed.source
+    ids = [o.id for o in pointer.found.objects]
+    views = choose_views(pointer.found.id_maps, ids, pointer.footage.lens)
+    out = {}
+    for number, (row, x, y) in views.anchors.items():
+        frame = int(pointer.footage.posed.indices[row])
+        out[number] = parse_address(
+            {"pixel": {"frame": frame, "x": x * source.width, "y": y * source.height}}, ""
+        )
+    return out
+
+
+def same_place(pointer: Pointer, a, other: Pointer, b, scale: float) -> bool:
+    """Tell whether two things overlap for the most part, by their boxes parallel to the axes."""
+    boxes = []
+    for p, item, s in ((pointer, a, 1.0), (other, b, scale)):
+        points = p.surface.vertices[p.found.vertex_instance == item.id] / s
+        boxes.append(np.percentile(points, [2, 98], axis=0))
+    shared = np.prod(
+        np.maximum(np.minimum(boxes[0][1], boxes[1][1]) - np.maximum(boxes[0][0], boxes[1][0]), 0)
+    )
+    return shared > 0.3 * max(np.prod(box[1] - box[0]) for box in boxes)
+
+
+def test_every_thing_has_an_anchor_that_means_it(first):
+    anchors = clicks(first)
+    assert set(anchors) == {o.id for o in first.found.objects}
+    for number, address in anchors.items():
+        assert first.thing(address).id == number
+
+
+@pytest.mark.parametrize(("voxel_size_m", "scale"), [(0.016, 1.0), (0.015, 1.25)])
+def test_clicks_survive_another_spacing_and_another_scale(small_capture, first, voxel_size_m, scale):
+    """Ids are given anew, metres are others; the clicks still mean the same things."""
+    posed, depth = small_capture.in_sfm_space(np.diag([scale, scale, scale, 1.0]))
+    again = cut(posed, depth, voxel_size_m * scale)
+    kept = 0
+    for number, address in clicks(first).items():
+        item = next(o for o in first.found.objects if o.id == number)
+        if not any(same_place(first, item, again, other, scale) for other in again.found.objects):
+            continue  # the other cut does not have this thing
+        assert same_place(first, item, again, again.thing(address), scale), item.label
+        kept += 1
+    assert kept >= 0.7 * len(first.found.objects)
+
+
+def test_clicks_in_held_out_and_in_skipped_frames(first):
+    """A held-out frame has a camera; one that was never posed is between two that were."""
+    posed = first.footage.posed
+    table = max(first.found.objects, key=lambda o: np.prod(o.extents_m[:2]))
+    points = first.surface.vertices[first.found.vertex_instance == table.id]
+    held = int(posed.held_out_indices[-1])
+    skipped = int(posed.indices[5])
+    without = replace(
+        posed,
+        indices=np.delete(posed.indices, 5),
+        world_from_camera=np.delete(posed.world_from_camera, 5, axis=0),
+    )
+    for frame, pose, footage in (
+        (held, posed.held_out_world_from_camera[-1], first.footage),
+        (skipped, posed.world_from_camera[5], replace(first.footage, posed=without)),
+    ):
+        seen = first.footage.seen_vertices(pose)
+        mask = np.where(seen >= 0, first.found.vertex_instance[seen], 0) == table.id
+        inner = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+        row, column = np.unravel_index(np.argmax(inner), inner.shape)
+        address = Address("pixel", frame=frame, pixel=(column + 0.5, row + 0.5))
+        pointer = replace(first, footage=footage)
+        assert pointer.thing(address).id == table.id
+        hit = first.surface.vertices[pointer.vertex(address, table)]
+        assert np.linalg.norm(points - hit, axis=1).min() == 0
+
+
+def test_a_frame_far_from_any_camera_is_refused(first):
+    with pytest.raises(UsageError, match=r"no camera is known of frame 500 \(the film has 14\)"):
+        first.thing(Address("pixel", frame=500, pixel=(3, 3)))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {},
+        {"id": 3, "pixel": {"frame": 1, "x": 2, "y": 3}},
+        {"id": True},
+        {"at": [1, 2]},
+        {"at": [0, 0, 0], "near": [0, 0, 0]},
+        {"pixel": [1, 2, 3]},
+        {"pixel": {"frame": 1.5, "x": 2, "y": 3}},
+        {"pixel": {"frame": 1, "x": 2, "y": float("nan")}},
+        {"pixel": {"frame": 1, "x": 2, "y": 3, "size": [4]}},
+        "mug",
+    ],
+)
+def test_what_is_no_address_is_said(value):
+    with pytest.raises(UsageError, match="entry 7"):
+        parse_address(value, "entry 7")
+
+
+def test_the_lens_is_measured_on_the_frames(small_capture):
+    """Frames filmed through a lens with barrel distortion: clicks are right to half a pixel everywhere."""
+    camera, frames = small_capture.posed.camera, small_capture.frame_set()
+    matrix, bent = shifted(camera), np.array([-0.12, 0.03, 0.001, 0.0])
+    maps = cv2.initUndistortRectifyMap(
+        matrix, bent, None, matrix, (camera.width, camera.height), cv2.CV_32FC1
+    )
+    straight = np.stack([cv2.remap(image, *maps, cv2.INTER_CUBIC) for image in frames.images])
+    lens = Lens.measure(frames, replace(small_capture.posed, images=straight))
+    grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2) + 0.5
+    there = cv2.undistortPoints(grid[:, None] - 0.5, matrix, bent, P=matrix)[:, 0] + 0.5
+    kept = ((there > 0) & (there < [camera.width, camera.height])).all(
+        axis=1
+    )  # straightening cuts the rest off
+    error = np.linalg.norm(lens.straightened(grid) - there, axis=1)[kept]
+    assert np.linalg.norm(there - grid, axis=1)[kept].max() > 4
+    assert np.median(error) < 0.1
+    assert error.max() < 0.5
+    assert Lens.measure(frames, small_capture.posed).model is None
+
+
+def shifted(camera) -> np.ndarray:
+    """Return K for OpenCV, whose pixel centers are at whole numbers."""
+    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+
+
+def seeded_store(folder, results: dict, config: PipelineConfig) -> StageStore:
+    """Return a store in which the stages before the cut are finished."""
+    store, keys = StageStore(folder), {}
+    for number, stage in enumerate(STAGES[:6], start=1):
+        upstream = tuple(keys[name] for name in stage.needs) or (results["frames"].source.sha256,)
+        keys[stage.name] = fingerprint(stage.name, stage.module, (getattr(config, stage.name), []), upstream)
+        usage = {"wall_s": 1.0, "cpu_s": 1.0, "peak_memory_mb": 1.0}
+        record = {"usage": usage, "notes": []}
+        store.save(results[stage.name], number, stage.name, keys[stage.name], record)
+    return store
+
+
+def test_another_correction_redoes_nothing_but_itself(small_capture, first, tmp_path):
+    """The cut is made once; each set of corrections is applied to it, by clicks in the film."""
+    posed, depth = small_capture.in_sfm_space(np.eye(4))
+    n = len(posed.images)
+    none = np.zeros((0, 3), np.float32)
+    gain, bias = np.ones((n, 3), np.float32), np.zeros((n, 3), np.float32)
+    disks = Gaussians(
+        none, np.zeros((0, 4), np.float32), none[:, :2], none[:, 0], none, gain, bias, posed.world_from_camera
+    )
+    results = {
+        "frames": small_capture.frame_set(),
+        "poses": posed,
+        "depth": depth,
+        "world": WorldFrame(np.eye(4), ScaleEstimate("marker", 0.01, ""), "planes", 0.1, True, True),
+        "gaussians": GaussianScene(disks, depth),
+        "surface": first.surface,
+    }
+    config = PipelineConfig()
+    store = seeded_store(tmp_path, results, config)
+    click = next(iter(clicks(first).values()))
+    said = {"pixel": {"frame": click.frame, "x": click.pixel[0], "y": click.pixel[1]}}
+
+    def cut_with(label: str) -> Run:
+        corrections = Overrides([{**said, "relabel": label}])
+        digest = results["frames"].source.sha256
+        run = Run(Path("film.mp4"), config, store, corrections, input_digest=digest)
+        run.execute(until="instances")
+        assert [o.label for o in run.results["instances"].objects].count(label) == 1
+        return run
+
+    run = cut_with("anvil")
+    assert run.computed == {"instances"}
+    folders = {p: p.stat().st_ctime_ns for p in tmp_path.glob("07_*/manifest.json")}
+    assert len(folders) == 2  # the cut as found, and corrected
+    again = cut_with("harp")
+    kept = [p for p in tmp_path.glob("07_*/manifest.json") if folders.get(p) == p.stat().st_ctime_ns]
+    assert len(kept) == 1
+    assert again.keys["instances"] != run.keys["instances"]
+    assert again.usage["instances"].wall_s > 0
