@@ -51,11 +51,16 @@ def upright_box(points: np.ndarray, areas: np.ndarray, yaw_rad: float | None = N
 
 
 def _range(values: np.ndarray, weights: np.ndarray, trim: float) -> tuple[float, float]:
-    """Return the weighted quantiles `trim` and 1 - `trim`."""
+    low, high = quantiles(values, weights, (trim, 1 - trim))
+    return float(low), float(high)
+
+
+def quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> np.ndarray:
+    """Return the weighted quantiles of values (n,), so that it does not matter how densely a mesh samples them."""
     order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    low, high = np.searchsorted(total, [trim * total[-1], (1 - trim) * total[-1]])
-    return float(values[order[low]]), float(values[order[min(high, len(order) - 1)]])
+    total = np.cumsum(np.maximum(weights, 1e-12)[order])
+    index = np.searchsorted(total, np.asarray(shares) * total[-1])
+    return np.asarray(values, np.float64)[order[np.minimum(index, len(order) - 1)]]
 
 
 def with_bottom(box: UprightBox, bottom: float) -> UprightBox:

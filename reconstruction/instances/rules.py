@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from reconstruction.instances.base import base_skirts
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.feet import merge_feet
@@ -24,6 +25,9 @@ def cut_by_rules(
     for thing in things:
         hung[thing.vertices] = True
     rest = np.flatnonzero((owner == 0) & ~hung & ~shell.behind)
+    for vertices, number in base_skirts(graph, rest, planes, config.bridge_gap_m):
+        owner[vertices] = number
+    rest = rest[owner[rest] == 0]
     segmented, crumbs = _without_base_crumbs(graph, segment(graph, rest, config), planes)
     for vertices, number in crumbs:
         owner[vertices] = number

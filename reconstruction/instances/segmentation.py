@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.instances.bodies import find_bodies
 from reconstruction.instances.candidates import candidates_on
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.neighbors import neighbors_of
 from reconstruction.instances.splitting import split_touching
 from reconstruction.instances.supports import SupportRegion, find_supports
-from reconstruction.surface.mesh_graph import MeshGraph, pieces
+from reconstruction.surface.mesh_graph import MeshGraph
 
 _MAX_DEPTH = 4
 
@@ -28,11 +29,16 @@ class Thing:
 
 def segment(graph: MeshGraph, rest: np.ndarray, config: InstancesConfig) -> list[Thing]:
     """Cut vertices `rest` (indices, without the base) into things; parents come before what rests on them."""
-    bridge = max(config.bridge_gap_m, 1.6 * graph.spacing_m)
-    bodies = _join_parts(graph, pieces(graph, rest, bridge), config)
     things: list[Thing] = []
-    for body in bodies:
-        things.extend(_decompose(graph, body, None, 0, config))
+    bodies = find_bodies(graph, rest, config)
+    carriers = []
+    for body in bodies.whole:
+        carriers.append(_decompose(graph, body, None, 0, config))
+        things.extend(carriers[-1])
+    for vertices, index in bodies.standing:
+        things.extend(
+            _decompose(graph, vertices, _nearest_below(graph, vertices, carriers[index]), 1, config)
+        )
     return _absorb_fragments(graph, things, config)
 
 
@@ -120,109 +126,6 @@ def _nearest_below(graph: MeshGraph, candidate: np.ndarray, carriers: list[Thing
     foot = points[points[:, 2] < points[:, 2].min() + 0.02]
     gaps = [float(np.median(cKDTree(graph.points[c.vertices]).query(foot)[0])) for c in carriers]
     return carriers[int(np.argmin(gaps))]
-
-
-def _join_parts(graph: MeshGraph, found: list[np.ndarray], config: InstancesConfig) -> list[np.ndarray]:
-    """Join legs and torn pieces to the furniture above them that they must belong to."""
-    bodies = [piece for piece in found if len(piece) >= config.min_object_vertices]
-    crumbs = [piece for piece in found if len(piece) < config.min_object_vertices]
-    changed = True
-    while changed:
-        changed = False
-        for i, lower in enumerate(bodies):
-            for j, upper in enumerate(bodies):
-                if i != j and _is_leg_of(graph, lower, upper):
-                    bodies[j] = np.sort(np.concatenate([upper, lower]))
-                    del bodies[i]
-                    changed = True
-                    break
-            if changed:
-                break
-    bodies = _join_torn(graph, _carry_floating(graph, bodies))
-    if not bodies or not crumbs:
-        return bodies
-    owner = np.concatenate([np.full(len(body), i) for i, body in enumerate(bodies)])
-    tree = cKDTree(graph.points[np.concatenate(bodies)])
-    extra: dict[int, list[np.ndarray]] = {}
-    for crumb in crumbs:
-        distance, index = tree.query(graph.points[crumb])
-        if distance.min() < 0.04:
-            extra.setdefault(int(owner[index[np.argmin(distance)]]), []).append(crumb)
-    return [np.sort(np.concatenate([body, *extra.get(i, [])])) for i, body in enumerate(bodies)]
-
-
-def _carry_floating(graph: MeshGraph, bodies: list[np.ndarray]) -> list[np.ndarray]:
-    """Join large things in mid-air to what must carry them: the pieces under them that reach up highest."""
-    bodies = list(bodies)
-    for i in sorted(range(len(bodies)), key=lambda k: -graph.areas[bodies[k]].sum()):
-        if len(bodies[i]) == 0:
-            continue
-        upper = graph.points[bodies[i]]
-        low, high = np.percentile(upper, [2, 98], axis=0)
-        flat = np.sort(high[:2] - low[:2])[0] > 0.25
-        if low[2] < 0.1 or not flat or graph.normals[bodies[i], 2].mean() < 0.2:
-            continue
-        for j, lower in enumerate(bodies):
-            if j == i or len(lower) == 0:
-                continue
-            points = graph.points[lower]
-            under = ((points[:, :2] > low[:2] - 0.03) & (points[:, :2] < high[:2] + 0.03)).all(
-                axis=1
-            ).mean() > 0.8
-            if under and low[2] > points[:, 2].max() - 0.05 and points[:, 2].max() > 0.4 * low[2]:
-                bodies[i] = np.sort(np.concatenate([bodies[i], lower]))
-                bodies[j] = lower[:0]
-    return [body for body in bodies if len(body)]
-
-
-def _join_torn(graph: MeshGraph, bodies: list[np.ndarray]) -> list[np.ndarray]:
-    """Join pieces in mid-air to the furniture around them that has their color: boards torn off by holes."""
-    floor_m = 0.1
-    bodies = list(bodies)
-    whole = [i for i, b in enumerate(bodies) if graph.points[b, 2].min() < floor_m]
-    for i in range(len(bodies)):
-        points = graph.points[bodies[i]]
-        if i in whole or points[:, 2].min() < floor_m:
-            continue
-        color = np.median(graph.lab[bodies[i]], axis=0)
-        best, best_gap = -1, 0.12
-        for j in whole:
-            around = graph.points[bodies[j]]
-            low, high = around.min(axis=0) - 0.05, around.max(axis=0) + 0.05
-            if ((points > low) & (points < high)).all(axis=1).mean() < 0.8:
-                continue
-            gap, index = cKDTree(around).query(points[:: max(1, len(points) // 500)])
-            near = bodies[j][index[np.argsort(gap, kind="stable")[: max(10, len(gap) // 5)]]]
-            alike = np.linalg.norm(np.median(graph.lab[near], axis=0) - color) < 12.0
-            if alike and gap.min() < best_gap:
-                best, best_gap = j, float(gap.min())
-        if best >= 0:
-            bodies[best] = np.sort(np.concatenate([bodies[best], bodies[i]]))
-            bodies[i] = bodies[i][:0]
-    return [body for body in bodies if len(body)]
-
-
-def _is_leg_of(graph: MeshGraph, lower: np.ndarray, upper: np.ndarray) -> bool:
-    """A slim piece under a larger one that reaches up to nearly its underside is its leg (or its side)."""
-    if graph.areas[lower].sum() > graph.areas[upper].sum():
-        return False
-    low, high = graph.points[lower], graph.points[upper]
-    top_of_lower = float(np.percentile(low[:, 2], 98))
-    bottom, top = np.percentile(high[:, 2], [2, 90])
-    if low[:, 2].min() > bottom or top < 0.2 or top_of_lower > top + 0.02:
-        return False
-    margin = 0.05
-    inside = ((low[:, :2] > high[:, :2].min(0) - margin) & (low[:, :2] < high[:, :2].max(0) + margin)).all(
-        axis=1
-    )
-    if inside.mean() < 0.8:
-        return False
-    thickness = float(np.sort(np.ptp(low, axis=0))[0])
-    slim = thickness < 0.12 and np.ptp(low[:, 2]) > 0.05
-    if slim and thickness < 0.05:
-        return True
-    gap = top - top_of_lower
-    return gap < 0.15 * top or (slim and gap < 0.85 * top)
 
 
 def _absorb_fragments(graph: MeshGraph, things: list[Thing], config: InstancesConfig) -> list[Thing]:
