@@ -27,7 +27,8 @@ class InstancesConfig:
     `vlm` (an OpenAI-compatible endpoint, see `SIMRECON_VLM_URL`)."""
 
     labels_model: str = ""
-    """For `clip`: the model's name on the Hugging Face hub, or its folder."""
+    """For `clip`: the model's name on the Hugging Face hub, or its folder; empty is CLIP ViT-B/32. For `vlm`: its name
+    at the endpoint; empty is `SIMRECON_VLM_MODEL`."""
 
     labels_vocabulary: str = ""
     """For `clip`: comma-separated words to choose from; empty is a list of household things."""

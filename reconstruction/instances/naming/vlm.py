@@ -1,0 +1,73 @@
+"""Labels by a vision-language model: asked object by object, with pictures from up to three sides."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from reconstruction.instances.naming.base import Name, is_label
+from reconstruction.instances.naming.views import ObjectView, best_views, collage
+from reconstruction.progress import Progress
+from reconstruction.types import Instance, InstanceSet, PosedFrames
+from reconstruction.vlm import VlmClient, VlmError, VlmUnavailable
+
+# What models say of their own certainty is optimistic; "unsure" ones do not replace anything.
+_CONFIDENCE = {"certain": 0.8, "likely": 0.5}
+
+
+class NamedObject(BaseModel):
+    """What the model answers."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: int
+    label: str
+    certainty: Literal["certain", "likely", "unsure"]
+
+
+class VlmNamer:
+    """Any OpenAI-compatible endpoint: a `Namer`."""
+
+    def __init__(self, client: VlmClient) -> None:
+        """Wrap a client."""
+        self._client = client
+        self._prompt = (Path(__file__).parent / "prompt.txt").read_text()
+        self.name = client.name
+
+    def name_objects(
+        self, found: InstanceSet, posed: PosedFrames, *, progress: Progress
+    ) -> list[Name | None]:
+        """See `Namer.name_objects`; questions that fail are noted, and asked no more once the endpoint is away."""
+        views = best_views(found, posed)
+        progress.start(len(found.objects), f"names by {self.name}")
+        names: list[Name | None] = []
+        for item in found.objects:
+            try:
+                names.append(self._ask(item, views[item.id]) if views[item.id] else None)
+            except VlmUnavailable as error:
+                left = len(found.objects) - len(names)
+                progress.note(f"labels: {error}; {left} objects are not asked about")
+                return names + [None] * left
+            except VlmError as error:
+                progress.note(f"labels: object {item.id}: {error}")
+                names.append(None)
+            progress.advance()
+        return names
+
+    def _ask(self, item: Instance, views: list[ObjectView]) -> Name | None:
+        width, depth, height = (max(1, round(100 * float(side))) for side in item.extents_m)
+        prompt = self._prompt.format(
+            id=item.id, views=len(views), width_cm=width, depth_cm=depth, height_cm=height
+        )
+
+        def check(answer: NamedObject) -> None:
+            if answer.id != item.id:
+                raise ValueError(f"there is no object {answer.id} in the pictures; the id is {item.id}")
+            if not is_label(answer.label.strip().lower()):
+                raise ValueError("the label is not one to three plain words")
+
+        answer = self._client.ask(prompt, [collage([view.outlined() for view in views])], NamedObject, check)
+        label = answer.label.strip().lower()
+        if label == "unknown" or answer.certainty not in _CONFIDENCE:
+            return None
+        return Name(label, _CONFIDENCE[answer.certainty])
