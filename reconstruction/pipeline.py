@@ -114,6 +114,8 @@ class Run:
         options = ()
         if stage.name == "poses" and config.import_path and Path(config.import_path).exists():
             options += (digest_input(Path(config.import_path)),)
+        if stage.name == "instances":
+            options += importlib.import_module(stage.module).outside_inputs(config)
         if self.oracle is not None and self.oracle.of_stage(stage.name):
             options += (self.oracle.of_stage(stage.name),)
 
@@ -216,7 +218,11 @@ class Run:
         if stage.name == "surface":
             return module.fuse_surface(posed, depth, config, progress=progress)
         if stage.name == "instances":
-            return module.find_instances(posed, depth, done["surface"], config, progress=progress)
+            namer = module.load_namer(config)  # first, so that what it lacks is said before the work is done
+            found = module.find_instances(posed, depth, done["surface"], config, progress=progress)
+            return (
+                module.name_instances(namer, found, posed, progress=progress) if namer is not None else found
+            )
         return module.build_assets(
             posed, depth, done["surface"], done["instances"], config, progress=progress
         )

@@ -16,6 +16,7 @@ from reconstruction.assembly import base_slabs
 from reconstruction.assets.gltf import write_glb, write_obj
 from reconstruction.cache import canonical_json
 from reconstruction.gaussians import write_ply
+from reconstruction.instances import backends as instance_backends
 from reconstruction.preview import render_preview
 from reconstruction.profiling import OTHER, PUBLISH, Usage, UsageMeter
 from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
@@ -250,10 +251,13 @@ def _backends(run: "Run") -> dict[str, str]:
         "poses": "pycolmap",
         "depth": "plane-sweep",
         "gaussians": run.config.gaussians.backend,
+        **instance_backends(run.config.instances),
         "assets": "embedded",
         "relations": "geometry",
     }
     if run.oracle is not None:
+        if "instances" in run.oracle.stages:
+            del backends["masks"], backends["labels"]
         backends |= dict.fromkeys(run.oracle.stages, "ground-truth")
     return backends
 

@@ -167,7 +167,9 @@ class VlmClient:
             try:
                 response = self._post(sent)
             except requests.Timeout:
-                problem = f"no answer within {self._endpoint.timeout_s:g} s"
+                problem = f"no answer within {self._endpoint.timeout_s:g} s, {attempt + 1} times"
+                if attempt:
+                    break
                 continue
             except requests.RequestException as error:
                 problem = f"cannot be reached ({type(error).__name__})"

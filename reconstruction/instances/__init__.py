@@ -2,8 +2,20 @@
 
 from reconstruction.instances.config import INSTANCES_PRESETS, InstancesConfig
 from reconstruction.instances.find import find_instances
+from reconstruction.instances.naming import load_namer, name_instances
+from reconstruction.instances.outside import backends, outside_inputs
 from reconstruction.instances.overrides import apply_overrides
 
 VERSION = 2
 
-__all__ = ["INSTANCES_PRESETS", "VERSION", "InstancesConfig", "apply_overrides", "find_instances"]
+__all__ = [
+    "INSTANCES_PRESETS",
+    "VERSION",
+    "InstancesConfig",
+    "apply_overrides",
+    "backends",
+    "find_instances",
+    "load_namer",
+    "name_instances",
+    "outside_inputs",
+]

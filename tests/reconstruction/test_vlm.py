@@ -1,11 +1,10 @@
 """The client of vision-language models against a server that speaks the protocol, and breaks it in every way."""
 
 import json
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
+from chat_server import Server, chat
 from pydantic import BaseModel, ConfigDict
 
 from reconstruction.vlm import Endpoint, VlmClient, VlmError, VlmUnavailable, json_part
@@ -22,60 +21,13 @@ class Color(BaseModel):
     color: str
 
 
-def chat(text: str, status: int = 200) -> tuple[int, dict, str]:
-    """Return a response of the protocol."""
-    body = {"choices": [{"index": 0, "message": {"role": "assistant", "content": text}}]}
-    return status, {"Content-Type": "application/json"}, json.dumps(body)
-
-
 GOOD = chat('{"id": 7, "color": "red"}')
-
-
-class Server:
-    """Answers requests with a list of responses, the last one for ever, and keeps what it was asked."""
-
-    def __init__(self) -> None:
-        self.responses: list = []
-        self.requests: list[dict] = []
-        self.headers: list[dict] = []
-        outer, self._released = self, threading.Event()
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                body = self.rfile.read(int(self.headers["Content-Length"]))
-                outer.requests.append(json.loads(body) | {"path": self.path})
-                outer.headers.append(dict(self.headers))
-                response = outer.responses.pop(0) if len(outer.responses) > 1 else outer.responses[0]
-                if response == "hang":
-                    outer._released.wait(5)
-                    return
-                status, headers, text = response
-                self.send_response(status)
-                for name, value in headers.items():
-                    self.send_header(name, value)
-                self.send_header("Content-Length", str(len(text.encode())))
-                self.end_headers()
-                self.wfile.write(text.encode())
-
-            def log_message(self, *args) -> None:
-                return
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self._server.server_port}/v1"
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._released.set()
-        self._server.shutdown()
-        self._server.server_close()
 
 
 @pytest.fixture
 def server():
-    running = Server()
-    yield running
-    running.close()
+    with Server() as running:
+        yield running
 
 
 def client_of(server: Server, **options) -> VlmClient:
