@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from reconstruction.evaluation.alignment import Alignment, align
-from reconstruction.evaluation.ground_truth import GroundTruth, TrueEntity
-from reconstruction.evaluation.matching import box_iou, graph_f1, match, match_base
+from reconstruction.evaluation.ground_truth import GroundTruth
+from reconstruction.evaluation.object_boxes import instance_box_figures
+from reconstruction.evaluation.object_scores import score_graph, score_objects
 from reconstruction.evaluation.perceptual import perceptual_scores
 from reconstruction.evaluation.rendering import render_views, score_pictures, video_frames
 from reconstruction.evaluation.scene import (
@@ -23,9 +24,7 @@ from reconstruction.evaluation.scene import (
 from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.evaluation.surfaces import (
     COMPOSITION_POINTS,
-    OBJECT_POINTS,
     compare,
-    sample,
     sample_seen,
 )
 from reconstruction.evaluation.visibility import spread_poses
@@ -35,9 +34,7 @@ from registry import SceneBundle
 from registry.errors import UsageError
 
 SCHEMA = "simrecon.evaluation/1"
-COMPOSITION_BOUND_M, OBJECT_BOUND_M = 0.05, 0.01
-IOU_BOUNDS = (0.25, 0.5)
-_MATCH_BOUND = IOU_BOUNDS[0]
+COMPOSITION_BOUND_M = 0.05
 _PHYSICS_KEYS = (
     "stable_rate",
     "stable_rate_10cm_0.1rad",
@@ -250,87 +247,11 @@ def _objects(bundle: SceneBundle, scene: list[PlacedMesh], truth: GroundTruth, o
         for name in ("object_recall_25", "object_precision_25", "object_cd_cm", "object_f_1cm", "graph_f1"):
             out.left_out[name] = "the truth has no entities"
         return
-    found = [m for m in scene if not m.base]
-    wanted = list(truth.evaluated)
-    iou = box_iou(np.array([e.mesh.bounds for e in wanted]), np.array([m.bounds for m in found]))
-    for bound in IOU_BOUNDS:
-        pairs = match(iou, bound)
-        name = f"{round(100 * bound)}"
-        out.metrics[f"object_recall_{name}"] = len(pairs) / len(wanted) if wanted else 1.0
-        out.metrics[f"object_precision_{name}"] = len(pairs) / len(found) if found else float(not wanted)
-    pairs = dict(match(iou, _MATCH_BOUND))
-    scores = [
-        _object_score(entity, found[pairs[row]] if row in pairs else None)
-        for row, entity in enumerate(wanted)
-    ]
-    out.metrics["object_cd_cm"] = float(np.mean([s["cd_cm"] for s in scores])) if scores else 0.0
-    out.metrics["object_f_1cm"] = float(np.mean([s["f_1cm"] for s in scores])) if scores else 100.0
-    out.metrics["matched_object_cd_cm"] = _mean_or_none(
-        [s["cd_cm"] for s in scores if s["match"] is not None]
-    )
-    out.metrics["matched_object_f_1cm"] = _mean_or_none(
-        [s["f_1cm"] for s in scores if s["match"] is not None]
-    )
-    _graph(bundle, scene, truth, {found[c].id: wanted[r].id for r, c in pairs.items()}, scores, out)
-    for row, score in enumerate(scores):
-        score["box_iou"] = float(iou[row, pairs[row]]) if row in pairs else float(iou[row].max(initial=0.0))
-    out.objects = scores
-    used = set(pairs.values())
-    out.extra = [{"id": m.id, "label": m.label} for c, m in enumerate(found) if c not in used]
-
-
-def _mean_or_none(values: list[float]) -> float | None:
-    return float(np.mean(values)) if values else None
-
-
-def _object_score(entity: TrueEntity, found: PlacedMesh | None) -> dict[str, Any]:
-    """Compare complete surfaces; a miss counts as the object's diagonal and as 0."""
-    out = {"true_id": entity.id, "name": entity.name, "label": entity.label, "match": None}
-    score = None
-    if found is not None:
-        out.update(match=found.id, found_label=found.label)
-        true = sample(entity.mesh.vertices, entity.mesh.faces, OBJECT_POINTS)
-        score = compare(sample(found.vertices, found.faces, OBJECT_POINTS), true, OBJECT_BOUND_M)
-    if score is None:
-        diagonal = float(np.linalg.norm(entity.mesh.bounds[1] - entity.mesh.bounds[0]))
-        return {**out, "cd_cm": 100 * diagonal, "f_1cm": 0.0}
-    center = found.bounds.mean(axis=0) - entity.mesh.bounds.mean(axis=0)
-    return {
-        **out,
-        "cd_cm": score.cd_cm,
-        "f_1cm": score.f,
-        "center_error_cm": float(100 * np.linalg.norm(center)),
-    }
-
-
-def _graph(
-    bundle: SceneBundle,
-    scene: list[PlacedMesh],
-    truth: GroundTruth,
-    true_of: dict[int, int],
-    scores: list[dict[str, Any]],
-    out: Evaluation,
-) -> None:
-    """F1 of the edges over everything evaluated, and over matched children only."""
-    base = match_base([m for m in scene if m.base], truth.base)
-
-    def name(item: int) -> tuple[str, int]:
-        if item in base:
-            return "true", base[item]
-        return ("true", true_of[item]) if item in true_of else ("found", item)
-
-    estimated = {(name(e["child"]), e["relation"], name(e["parent"])) for e in bundle.scene["graph"]["edges"]}
-    true = {(("true", e.id), e.relation, ("true", e.parent)) for e in truth.evaluated}
-    matched = {("true", i) for i in true_of.values()}
-    out.metrics["graph_f1"] = graph_f1(estimated, true)
-    out.metrics["graph_f1_matched"] = graph_f1(
-        {e for e in estimated if e[0] in matched}, {e for e in true if e[0] in matched}
-    )
-    edge_of = {e[0]: e for e in estimated}
-    for score in scores:
-        child = ("true", score["true_id"])
-        if child in edge_of:
-            score["relation_right"] = edge_of[child] in true
+    scores = score_objects([m for m in scene if not m.base], truth)
+    edges, base = bundle.scene["graph"]["edges"], [m for m in scene if m.base]
+    out.metrics.update(scores.metrics)
+    out.metrics.update(score_graph(edges, base, truth, scores.true_of, scores.records))
+    out.objects, out.extra = scores.records, scores.extra
 
 
 def _stage_figures(truth: GroundTruth, stages: StageResults, alignment: Alignment, out: Evaluation) -> None:
@@ -356,7 +277,8 @@ def _stage_figures(truth: GroundTruth, stages: StageResults, alignment: Alignmen
         if truth.entities:
             on_surface = figures.instance_figures_3d(surface, instances, alignment, truth)
             per_view = figures.instance_figures_2d(posed, surface, instances, truth)
-            out.stages["instances"] = {"surface": on_surface, "per_view": per_view}
+            boxes = instance_box_figures(surface, instances, alignment, truth)
+            out.stages["instances"] = {"surface": on_surface, "per_view": per_view, "boxes": boxes}
         else:
             out.left_out["stage instances"] = "the truth has no entities"
 

@@ -105,8 +105,15 @@ def _stages(evaluation: Evaluation) -> list[str]:
             value = value.get(key) if isinstance(value, dict) else None
         if value is not None:
             lines.append(f"  {stage:<10} {name:<26} {form.format(value):>10}   {meaning}")
-    for part, figures in (evaluation.stages.get("instances") or {}).items():
-        if figures:
+    instances = evaluation.stages.get("instances") or {}
+    for part, figures in instances.items():
+        if figures and "mean_iou" in figures:
             found = f"mean IoU; found at 0.5: {figures['recall_50']:.2f}"
             lines.append(f"  instances  {part:<26} {figures['mean_iou']:>10.2f}   {found}")
+    if "boxes" in instances:
+        boxes = instances["boxes"]
+        found = (
+            f"recall before assets are made, box IoU >= 0.25; precision {boxes['object_precision_25']:.2f}"
+        )
+        lines.append(f"  instances  {'boxes':<26} {boxes['object_recall_25']:>10.2f}   {found}")
     return ["stages", *lines] if lines else []

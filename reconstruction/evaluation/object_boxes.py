@@ -1,0 +1,101 @@
+"""Which true objects were found: boxes matched one to one, and one record an object for breakdowns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from reconstruction.evaluation.alignment import Alignment
+from reconstruction.evaluation.ground_truth import GroundTruth, TrueEntity
+from reconstruction.evaluation.matching import box_iou, match
+from reconstruction.evaluation.object_facts import ObjectFacts, object_facts
+from reconstruction.types import InstanceSet, Surface
+
+IOU_BOUNDS = (0.25, 0.5)
+_TRIMMED_PERCENT = 1.0
+
+
+@dataclass(frozen=True)
+class BoxMatch:
+    """True and found boxes, matched one to one at each of IOU_BOUNDS."""
+
+    iou: np.ndarray  # float64 (true, found)
+    pairs: dict[float, dict[int, int]]  # bound -> row of a true object -> column of a found one
+
+    def figures(self) -> dict[str, float]:
+        """Return `object_recall_25`, `object_precision_25` and the same at 50."""
+        rows, columns = self.iou.shape
+        out: dict[str, float] = {}
+        for bound, pairs in self.pairs.items():
+            name = f"{round(100 * bound)}"
+            out[f"object_recall_{name}"] = len(pairs) / rows if rows else 1.0
+            out[f"object_precision_{name}"] = len(pairs) / columns if columns else float(not rows)
+        return out
+
+    def box_iou(self, row: int) -> float:
+        """Return the IoU of a true object with its match, or with the nearest box where it was missed."""
+        column = self.pairs[IOU_BOUNDS[0]].get(row)
+        return float(self.iou[row].max(initial=0.0) if column is None else self.iou[row, column])
+
+
+def match_boxes(wanted: Sequence[TrueEntity], boxes: np.ndarray) -> BoxMatch:
+    """Match true objects with found boxes (m, 2, 3), axis-aligned in the true world."""
+    iou = box_iou(np.array([e.mesh.bounds for e in wanted]), boxes)
+    return BoxMatch(iou, {bound: dict(match(iou, bound)) for bound in IOU_BOUNDS})
+
+
+def object_records(
+    wanted: Sequence[TrueEntity], facts: dict[int, ObjectFacts], matched: BoxMatch, found_ids: Sequence[int]
+) -> list[dict[str, Any]]:
+    """Return one record a true object: what it is, what makes it hard, whether it was found at which IoU.
+
+    `match` is the id of the object that it was matched with at the lower bound; `gap_cm` is None for an object without
+    any neighbor.
+    """
+    out = []
+    for row, entity in enumerate(wanted):
+        fact, column = facts[entity.id], matched.pairs[IOU_BOUNDS[0]].get(row)
+        out.append(
+            {
+                "true_id": entity.id,
+                "name": entity.name,
+                "label": entity.label,
+                "longest_side_cm": 100 * fact.longest_side_m,
+                "support": fact.support,
+                "gap_cm": None if fact.neighbor is None else 100 * fact.gap_m,
+                "neighbor": fact.neighbor,
+                "match": None if column is None else found_ids[column],
+                "box_iou": matched.box_iou(row),
+                **{f"found_{round(100 * bound)}": row in pairs for bound, pairs in matched.pairs.items()},
+            }
+        )
+    return out
+
+
+def instance_boxes(vertices: np.ndarray, instances: InstanceSet, alignment: Alignment) -> np.ndarray:
+    """Return the boxes (m, 2, 3) of the instances stage in the true world, before any mesh is made of them.
+
+    `vertices` (n, 3) are the surface's, to which `instances` gives ids. A box is the middle 98 % of an object's surface
+    along each axis, down to where the stage says that it stands.
+    """
+    points = alignment.to_true(vertices)
+    boxes = np.zeros((len(instances.objects), 2, 3))
+    for row, item in enumerate(instances.objects):
+        own = points[instances.vertex_instance == item.id]
+        boxes[row] = np.percentile(own, [_TRIMMED_PERCENT, 100 - _TRIMMED_PERCENT], axis=0)
+        bottom = item.center - [0.0, 0.0, 0.5 * item.extents_m[2]]
+        boxes[row, 0, 2] = min(boxes[row, 0, 2], alignment.to_true(bottom[None])[0, 2])
+    return boxes
+
+
+def instance_box_figures(
+    surface: Surface, instances: InstanceSet, alignment: Alignment, truth: GroundTruth
+) -> dict[str, Any]:
+    """Return recall and precision of the stage's own boxes, and a record of each evaluated object."""
+    matched = match_boxes(truth.evaluated, instance_boxes(surface.vertices, instances, alignment))
+    ids = [o.id for o in instances.objects]
+    records = object_records(truth.evaluated, object_facts(truth), matched, ids)
+    used = set(matched.pairs[IOU_BOUNDS[0]].values())
+    extra = [{"id": o.id, "label": o.label} for c, o in enumerate(instances.objects) if c not in used]
+    return {**matched.figures(), "found": len(ids), "objects": records, "extra": extra}
