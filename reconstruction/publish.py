@@ -16,6 +16,7 @@ from reconstruction.assembly import base_slabs
 from reconstruction.assets.gltf import write_glb, write_obj
 from reconstruction.cache import canonical_json
 from reconstruction.gaussians import write_ply
+from reconstruction.instance_views import write_views
 from reconstruction.instances import backends as instance_backends
 from reconstruction.preview import render_preview
 from reconstruction.profiling import OTHER, PUBLISH, Usage, UsageMeter
@@ -92,6 +93,17 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "gaussians": _gaussians(run, folder),
         "report": _report(run),
     }
+    scene["instances"], anchors = write_views(
+        run.results["instances"],
+        [o["id"] for o in scene["objects"]],
+        run.results["frames"],
+        posed,
+        run.lens(),
+        folder,
+    )
+    for item in scene["objects"]:
+        if item["id"] in anchors:
+            item["anchor"] = anchors[item["id"]]
     picture = render_preview(assets, assembled, posed)
     cv2.imwrite(str(folder / "preview.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     return scene

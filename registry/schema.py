@@ -64,6 +64,8 @@ def validate_scene(scene: Any) -> None:
     _report(_mapping(_get(scene, "report", ""), "report"))
     if "gaussians" in scene:  # bundles of before had none
         _path(_mapping(scene["gaussians"], "gaussians"), "file", "gaussians", ".ply")
+    if "instances" in scene:  # nor these
+        _instance_views(_mapping(scene["instances"], "instances"))
 
 
 def referenced_files(scene: dict) -> dict[str, str]:
@@ -77,6 +79,8 @@ def referenced_files(scene: dict) -> dict[str, str]:
         found.update({path: f"objects[{i}].collision[{k}]" for k, path in enumerate(item["collision"])})
     if "gaussians" in scene:
         found[scene["gaussians"]["file"]] = "gaussians.file"
+    for i, frame in enumerate(scene.get("instances", {"frames": []})["frames"]):
+        found.update({frame[key]: f"instances.frames[{i}].{key}" for key in ("image", "ids")})
     return found
 
 
@@ -128,6 +132,22 @@ def _cameras(cameras: dict) -> None:
         _transform(frame, "world_from_camera", where)
 
 
+def _instance_views(views: dict) -> None:
+    seen: set[int] = set()
+    for i, frame in enumerate(_sequence(_get(views, "frames", "instances"), "instances.frames")):
+        where = f"instances.frames[{i}]"
+        _mapping(frame, where)
+        _unique(_integer(frame, "index", where, low=0), seen, f"{where}.index")
+        _path(frame, "image", where, ".jpg")
+        _path(frame, "ids", where, ".png")
+
+
+def _anchor(anchor: dict, where: str) -> None:
+    _integer(anchor, "frame", where, low=0)
+    for key in ("x", "y"):
+        _number(anchor, key, where, low=0)
+
+
 def _base(items: list) -> set[int]:
     seen: set[int] = set()
     for i, item in enumerate(items):
@@ -167,6 +187,8 @@ def _objects(items: list, base_ids: set[int]) -> set[int]:
             _text(provenance, key, f"{where}.provenance")
         _number(provenance, "observed_fraction", f"{where}.provenance", low=0, high=1)
         _sequence(_get(item, "views", where), f"{where}.views")
+        if "anchor" in item:
+            _anchor(_mapping(item["anchor"], f"{where}.anchor"), f"{where}.anchor")
     return seen - base_ids
 
 

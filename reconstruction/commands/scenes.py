@@ -4,8 +4,10 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 from registry import SceneBundle, SceneRecord, SceneRegistry
+from registry.errors import EnvironmentMissing, UsageError
 
 
 def add_parsers(verbs: argparse._SubParsersAction) -> None:
@@ -21,7 +23,22 @@ def add_parsers(verbs: argparse._SubParsersAction) -> None:
         return parser
 
     add("list", "list the scenes of the registry", run_list, scene=False)
-    add("show", "show what a scene holds: objects, relations, scale, stability, files", run_show)
+    show = add("show", "show what a scene holds: objects, relations, scale, stability, files", run_show)
+    show.add_argument(
+        "--instances",
+        action="store_true",
+        help="list every thing with an anchor for --overrides, and write contact sheets: frames with outlined, "
+        "numbered things, and a picture of each thing",
+    )
+    show.add_argument(
+        "--out", type=Path, metavar="DIR", help="where contact sheets go (default: SCENE_instances here)"
+    )
+    show.add_argument(
+        "--overrides-template",
+        type=Path,
+        metavar="FILE",
+        help="with --instances: also write a file for --overrides with a commented line for every thing",
+    )
     verify = add("verify", "check every file of a scene against its hash and its schema", run_verify)
     verify.add_argument(
         "--physics", action="store_true", help="also simulate 10 s and recompute the report card"
@@ -56,6 +73,10 @@ def run_show(arguments: argparse.Namespace) -> int:
     registry = SceneRegistry(arguments.registry)
     record = registry.get(arguments.scene)
     bundle = registry.load(arguments.scene)
+    if arguments.instances:
+        return _show_instances(arguments, bundle)
+    if arguments.out or arguments.overrides_template:
+        raise UsageError("--out and --overrides-template belong to: simrecon show SCENE --instances")
     if arguments.json:
         from reconstruction.profiling import costs_json
 
@@ -63,6 +84,48 @@ def run_show(arguments: argparse.Namespace) -> int:
         print(json.dumps({"record": _record_json(record), "costs": costs, "scene": bundle.scene}, indent=2))
     else:
         print(describe_scene(record, bundle))
+    return 0
+
+
+def _show_instances(arguments: argparse.Namespace, bundle: SceneBundle) -> int:
+    """Write contact sheets and print every thing with its anchor."""
+    from reconstruction.report.contact_page import overrides_template, write_contact_sheets
+    from reconstruction.report.contact_sheet import ContactSheet, anchor_text
+
+    sheet = ContactSheet.of(bundle)
+    folder = arguments.out or Path(f"{arguments.scene}_instances")
+    template = arguments.overrides_template
+    try:
+        if template is not None:
+            if template.exists():
+                raise UsageError(
+                    f"{template} is there already; it may hold your corrections and is not overwritten"
+                )
+            template.write_text(overrides_template(sheet), encoding="utf-8")
+        files = write_contact_sheets(sheet, folder)
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"cannot write {error.filename}: {error.strerror}; choose another --out"
+        ) from error
+    if arguments.json:
+        things = [
+            {
+                "id": number,
+                "label": item["label"],
+                "label_confidence": item["label_confidence"],
+                "scale": item["scale"],
+                "anchor": item.get("anchor"),
+            }
+            for number, item in sheet.objects.items()
+        ]
+        print(json.dumps({"things": things, "files": [str(path) for path in files]}, indent=2))
+        return 0
+    for number, item in sheet.objects.items():
+        label, confidence, size, held = sheet.facts(number)
+        print(f"{number:4d}  {label:<22} {confidence:>4}  {size:<18} {held:<24} {anchor_text(item)}")
+    print(f"contact sheets: {folder / 'index.html'} and {len(files) - 1} pictures beside it")
+    if template is not None:
+        print(f"corrections to edit: {template}")
     return 0
 
 

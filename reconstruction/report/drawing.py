@@ -198,15 +198,19 @@ def outlined(
     colors: dict[int, tuple[int, int, int]],
     labels: dict[int, str] | None = None,
     tint: float = 0.28,
+    smallest: float = 3e-4,
 ) -> np.ndarray:
-    """Tint, outline and label (with their ids) what an id map (h, w) shows; the rest of the picture is paled."""
+    """Tint, outline and label (with their ids) what an id map (h, w) shows; the rest of the picture is paled.
+
+    What covers less than `smallest` of the picture is left out.
+    """
     height, width = image.shape[:2]
     ids = cv2.resize(ids.astype(np.uint16), (width, height), interpolation=cv2.INTER_NEAREST)
     picture = (0.5 * image + 0.5 * PAPER).astype(np.uint8)
     places = []
     for number in sorted(colors):
         mask = ids == number
-        if mask.sum() < 3e-4 * mask.size:
+        if mask.sum() < max(1, smallest * mask.size):
             continue
         smooth = cv2.medianBlur(mask.astype(np.uint8), 5)
         picture[mask] = ((1 - tint) * image[mask] + tint * np.array(colors[number])).astype(np.uint8)
@@ -236,8 +240,8 @@ def badge(
 
     size = max(11, round(image.shape[1] / 44))
     picture = Image.fromarray(image)
-    draw, font = ImageDraw.Draw(picture), _font(size)
-    half, tall = draw.textlength(text, font=font) / 2 + 0.36 * size, 0.68 * size
+    draw, bold = ImageDraw.Draw(picture), font(size)
+    half, tall = draw.textlength(text, font=bold) / 2 + 0.36 * size, 0.68 * size
     column = int(np.clip(column, half + 1, image.shape[1] - half - 2))
     for shift in (0, -1, 1, -2, 2, -3, 3, 0):
         middle = int(np.clip(row + 2.05 * tall * shift, tall + 1, image.shape[0] - tall - 2))
@@ -247,14 +251,15 @@ def badge(
     taken.append(box)
     draw.rounded_rectangle(box, radius=0.5 * size, fill=color, outline=(255, 255, 255), width=1)
     dark = 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2] > 140
-    draw.text((column, middle), text, font=font, fill=(20, 22, 26) if dark else (255, 255, 255), anchor="mm")
+    draw.text((column, middle), text, font=bold, fill=(20, 22, 26) if dark else (255, 255, 255), anchor="mm")
     return np.asarray(picture)
 
 
 @cache
-def _font(size: int) -> "ImageFont.FreeTypeFont":
-    """Return the bold font that comes with matplotlib, so that pictures are the same everywhere."""
+def font(size: int, weight: str = "Bold") -> "ImageFont.FreeTypeFont":
+    """Return a font that comes with matplotlib ("Bold", or "" for regular): pictures are the same everywhere."""
     import matplotlib
     from PIL import ImageFont
 
-    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans-Bold.ttf", size)
+    name = f"DejaVuSans-{weight}" if weight else "DejaVuSans"
+    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/{name}.ttf", size)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from registry import BundleError, UsageError, check_scene_id, validate_scene
+from registry.schema import referenced_files
 
 
 def put(scene: dict, place: str, value: object) -> None:
@@ -147,3 +148,19 @@ def test_the_suggestion_is_itself_a_good_id():
     with pytest.raises(UsageError, match="'kitchen_1'"):
         check_scene_id("Kitchen 1!")
     assert check_scene_id("kitchen_1") == "kitchen_1"
+
+
+def test_frames_of_contact_sheets_are_checked(scene):
+    frame = {"index": 3, "image": "instances/00003.jpg", "ids": "instances/00003.png"}
+    scene["instances"] = {"frames": [frame]}
+    scene["objects"][0]["anchor"] = {"frame": 3, "x": 10.5, "y": 2}
+    validate_scene(scene)
+    assert set(referenced_files(scene)) >= {"instances/00003.jpg", "instances/00003.png"}
+    for key, wrong in (("image", "../x.jpg"), ("ids", "instances/00003.exr"), ("index", -1)):
+        scene["instances"]["frames"] = [{**frame, key: wrong}]
+        with pytest.raises(BundleError, match=rf"instances.frames\[0\].{key}"):
+            validate_scene(scene)
+    scene["instances"]["frames"] = [frame]
+    scene["objects"][0]["anchor"]["x"] = "left"
+    with pytest.raises(BundleError, match=r"objects\[0\].anchor.x"):
+        validate_scene(scene)
