@@ -5,6 +5,7 @@ all at the same time, so that the whole takes seconds.
 """
 
 import importlib.metadata
+import json
 import os
 import platform
 import re
@@ -34,7 +35,9 @@ _REQUIRED = {
     "pillow": "PIL",
     "psutil": "psutil",
     "pycolmap": "pycolmap",
+    "pydantic": "pydantic",
     "pyyaml": "yaml",
+    "requests": "requests",
     "sapien": "sapien",
     "scikit-image": "skimage",
     "scipy": "scipy",
@@ -123,6 +126,13 @@ name = torch.cuda.get_device_name(0)
 print(f"gsplat {getattr(gsplat, '__version__', '?')} on {name}")
 """
 
+_LEARNED_CODE = """
+import dataclasses, json, sys
+sys.path.insert(0, {root!r})
+from reconstruction.doctor_learned import learned_checks
+print(json.dumps([dataclasses.asdict(check) for check in learned_checks()]))
+"""
+
 
 @dataclass(frozen=True)
 class Check:
@@ -143,6 +153,7 @@ def run_checks() -> list[Check]:
         "rendering": _start(_RENDER_CODE),
         "CUDA (optional)": _start(_CUDA_CODE),
     }
+    learned = _start(_LEARNED_CODE.format(root=str(Path(__file__).parents[1])))
     checks = [_python(), *_packages(), _opencv(), _numba_cache(), _machine(), _disk(), _registry()]
     reinstall = f"{sys.executable} -m pip install --force-reinstall "
     fixes = {
@@ -154,7 +165,8 @@ def run_checks() -> list[Check]:
             False,
         ),
     }
-    return checks + [_finish(name, process, *fixes[name]) for name, process in tried.items()]
+    checks += [_finish(name, process, *fixes[name]) for name, process in tried.items()]
+    return checks + _learned(learned)
 
 
 def format_checks(checks: list[Check]) -> str:
@@ -342,6 +354,16 @@ def _rendering_fix() -> str:
     if script.is_file():
         return f"bash {script}   (installs Mesa >= 24.3, or says what to do)"
     return "install a Vulkan driver: Mesa >= 24.3 (mesa-vulkan-drivers and libvulkan1), or that of the GPU"
+
+
+def _learned(process: subprocess.Popen) -> list[Check]:
+    """Return what another process found: it imports packages that may be the broken ones."""
+    code, out, err = _wait(process)
+    if code == 0:
+        return [Check(**found) for found in json.loads(out.strip().splitlines()[-1])]
+    reason = err.strip().splitlines()[-1] if err.strip() else f"exit code {code}"
+    fix = "repair what is missing above first"
+    return [Check("learned models (optional)", False, f"could not be looked for: {reason}", fix, False)]
 
 
 def _existing(path: Path) -> Path:

@@ -37,6 +37,16 @@ class Server:
                 self.end_headers()
                 self.wfile.write(text.encode())
 
+            def do_GET(self) -> None:
+                known = self.path == "/v1/models"
+                text = (
+                    json.dumps({"object": "list", "data": [{"id": "tiny-vl"}]}) if known else "no such page"
+                )
+                self.send_response(200 if known else 404)
+                self.send_header("Content-Length", str(len(text)))
+                self.end_headers()
+                self.wfile.write(text.encode())
+
             def log_message(self, *args) -> None:
                 return
 

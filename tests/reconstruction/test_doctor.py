@@ -1,5 +1,6 @@
 """`simrecon doctor` finds what is there, and says what is missing when it is taken away."""
 
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -8,8 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from chat_server import Server
 
-from reconstruction import doctor
+from reconstruction import doctor, doctor_learned
 from reconstruction.doctor import Check, format_checks, run_checks
 
 
@@ -95,3 +97,56 @@ def test_table_names_what_is_missing_and_what_to_do() -> None:
     assert "MISSING  bb  gone" in text
     assert "-> get it" in text
     assert "cannot work here yet: bb" in text
+
+
+# ---- Learned models.
+
+
+def test_weights_are_looked_for_in_the_cache_of_the_hub(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("HF_HUB_CACHE", raising=False)
+    monkeypatch.setenv("HF_HOME", str(tmp_path))
+    checks = {check.name: check for check in doctor_learned.learned_checks()}
+    sam = checks["instances.masks=sam2"]
+    assert not sam.ok
+    assert not sam.required
+    assert sam.fix == "hf download facebook/sam2.1-hiera-small"
+    snapshot = tmp_path / "hub" / "models--facebook--sam2.1-hiera-small" / "snapshots" / "abc"
+    snapshot.mkdir(parents=True)
+    (snapshot / "config.json").write_text("{}")
+    assert not doctor_learned.has_weights("facebook/sam2.1-hiera-small")
+    (snapshot / "model.safetensors").write_bytes(b"1")
+    assert doctor_learned.has_weights("facebook/sam2.1-hiera-small")
+    assert {"instances.masks=sam3", "instances.masks=mask2former", "instances.labels=clip"} <= set(checks)
+
+
+def test_without_transformers_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    (check,) = (c for c in doctor_learned.learned_checks() if "vlm" not in c.name)
+    assert "simrecon[models]" in check.fix
+
+
+def test_the_endpoint_is_asked_for_its_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Server() as server:
+        monkeypatch.setenv("SIMRECON_VLM_URL", server.url)
+        monkeypatch.setenv("SIMRECON_VLM_MODEL", "tiny-vl")
+        assert doctor_learned._endpoint().ok
+        monkeypatch.setenv("SIMRECON_VLM_MODEL", "large-vl")
+        other = doctor_learned._endpoint()
+        assert not other.ok
+        assert "serves tiny-vl, not large-vl" in other.detail
+        monkeypatch.setenv("SIMRECON_VLM_URL", server.url + "/nothing")
+        assert "does not list its models" in doctor_learned._endpoint().detail
+    monkeypatch.delenv("SIMRECON_VLM_URL")
+    assert "SIMRECON_VLM_URL" in doctor_learned._endpoint().fix
+
+
+def test_packages_too_broken_to_look_are_no_crash() -> None:
+    (check,) = doctor._learned(doctor._start("import no_such_package"))
+    assert not check.ok
+    assert not check.required
+    assert "no_such_package" in check.detail

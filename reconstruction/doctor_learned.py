@@ -1,0 +1,80 @@
+"""The part of `simrecon doctor` about learned models: all of them are optional, and none is loaded to look."""
+
+import importlib.metadata
+import os
+from pathlib import Path
+
+from reconstruction.depth.config import DepthConfig
+from reconstruction.doctor import Check
+from reconstruction.instances.masks.load import DEFAULT_MODELS
+from reconstruction.instances.naming.load import DEFAULT_CLIP_MODEL
+from reconstruction.learned import EXTRA
+from reconstruction.world.config import WorldConfig
+
+_WEIGHTS = ("*.safetensors", "*.bin")
+_PATIENCE_S = 3.0
+
+
+def learned_checks() -> list[Check]:
+    """Look for transformers, the weights of each backend's own choice, and the endpoint of a VLM."""
+    return [*_models(), _endpoint()]
+
+
+def _models() -> list[Check]:
+    try:
+        version = importlib.metadata.version("transformers")
+    except importlib.metadata.PackageNotFoundError:
+        fix = f"pip install 'simrecon[{EXTRA}]', for masks, labels and depth by learned models"
+        return [Check("learned models (optional)", False, "transformers is not installed", fix, False)]
+    wanted = {f"instances.masks={name}": model for name, model in DEFAULT_MODELS.items()}
+    wanted |= {
+        "instances.labels=clip": DEFAULT_CLIP_MODEL,
+        "depth.monocular=transformers": DepthConfig().monocular_model,
+        "world.metric_depth=transformers": WorldConfig().metric_depth_model,
+    }
+    checks = [Check("learned models (optional)", True, f"transformers {version}", "", False)]
+    for option, model in wanted.items():
+        found = has_weights(model)
+        detail = f"{model} is {'here' if found else 'not on this machine'}"
+        checks.append(Check(option, found, detail, f"hf download {model}", False))
+    return checks
+
+
+def hub_cache() -> Path:
+    """Return where the Hugging Face hub keeps what it downloaded."""
+    home = Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface")
+    return Path(os.environ.get("HF_HUB_CACHE") or home / "hub").expanduser()
+
+
+def has_weights(model: str) -> bool:
+    """Tell whether the weights of a model, named as on the hub, lie in its cache."""
+    snapshots = hub_cache() / f"models--{model.replace('/', '--')}" / "snapshots"
+    return any(True for pattern in _WEIGHTS for _ in snapshots.glob(f"*/{pattern}"))
+
+
+def _endpoint() -> Check:
+    name = "instances.labels=vlm"
+    url, model = os.environ.get("SIMRECON_VLM_URL", ""), os.environ.get("SIMRECON_VLM_MODEL", "")
+    if not url or not model:
+        fix = "set SIMRECON_VLM_URL and SIMRECON_VLM_MODEL to an OpenAI-compatible endpoint (docs/labels.md)"
+        return Check(name, False, "no endpoint is set", fix, False)
+    fix = "start the endpoint, or correct SIMRECON_VLM_URL, SIMRECON_VLM_MODEL or SIMRECON_VLM_KEY"
+    try:
+        served = _served_models(url)
+    except (OSError, ValueError, KeyError, TypeError) as error:  # requests' errors are OSErrors
+        return Check(name, False, f"{url} does not list its models ({type(error).__name__})", fix, False)
+    detail = f"{url} serves {', '.join(served[:5]) or 'nothing'}"
+    return Check(name, model in served, detail + ("" if model in served else f", not {model}"), fix, False)
+
+
+def _served_models(url: str) -> list[str]:
+    import requests
+
+    key = os.environ.get("SIMRECON_VLM_KEY", "")
+    response = requests.get(
+        url.rstrip("/").removesuffix("/chat/completions") + "/models",
+        headers={"Authorization": f"Bearer {key}"} if key else {},
+        timeout=_PATIENCE_S,
+    )
+    response.raise_for_status()
+    return [str(entry["id"]) for entry in response.json()["data"]]
