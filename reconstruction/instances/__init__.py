@@ -6,7 +6,7 @@ from reconstruction.instances.naming import load_namer, name_instances
 from reconstruction.instances.outside import backends, outside_inputs
 from reconstruction.instances.overrides import apply_overrides
 
-VERSION = 2
+VERSION = 3
 
 __all__ = [
     "INSTANCES_PRESETS",

@@ -1,4 +1,7 @@
-"""Coarse labels from size, shape, place and support; honest about how little that says."""
+"""Coarse labels from size, shape, place and support; honest about how little that says.
+
+Confidences are what the rules were right in, in generated rooms (docs/instances.md, `python -m benchmarks.labels`).
+"""
 
 from dataclasses import dataclass
 
@@ -7,6 +10,8 @@ import numpy as np
 
 from reconstruction.instances.boxes import UprightBox
 from reconstruction.surface.mesh_graph import MeshGraph
+
+UNKNOWN = ("unknown", 0.0)
 
 
 @dataclass(frozen=True)
@@ -20,7 +25,10 @@ class ShapeFacts:
     flat_top_share: float  # up-facing area near its top, over its ground plan
     levels: int  # number of large horizontal regions at different heights
     hollow: bool  # seen from above its middle is lower than its rim
-    round_plan: bool  # ground plan closer to a disc than to a rectangle
+    squareness: float  # 1: its sides face two directions at right angles; 0: they face all around
+    outward: float  # 1: its sides face away from its middle; 0: they also face inwards, as in a shelf
+    side_share: float  # area of upright surface over all area
+    fill: float  # outline from above (of what hangs: from the front) over its bounding rectangle
     greenness: float  # share of green vertices
 
 
@@ -44,9 +52,9 @@ def shape_facts(
     local = np.abs((points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]])) / (0.5 * box.extents_m[:2])
     middle = (local.max(axis=1) < 0.45) & up
     hollow = bool(middle.any() and np.median(points[middle, 2]) < top - max(0.015, 0.3 * box.extents_m[2]))
-    hull = cv2.contourArea(cv2.convexHull(points[:, :2].astype(np.float32))) / max(plan, 1e-9)
     lab = graph.lab[vertices]
     green = (lab[:, 1] < -8) & (lab[:, 2] > 5)
+    squareness, outward, side_share = _sides(points[:, :2] - box.center[:2], normals, areas)
     return ShapeFacts(
         box.extents_m,
         on_floor,
@@ -55,57 +63,106 @@ def shape_facts(
         float(areas[near_top].sum()) / max(plan, 1e-9),
         int((levels > 0.25 * plan).sum()),
         hollow,
-        0.65 < hull < 0.87 and 0.8 < box.extents_m[0] / box.extents_m[1] < 1.25,
+        squareness,
+        outward,
+        side_share,
+        _fill(points, box, attached),
         float(green.mean()),
     )
 
 
+def _sides(flat: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> tuple[float, float, float]:
+    """Return squareness, outwardness and share of the upright part of points (n, 2) around a middle."""
+    upright = np.abs(normals[:, 2]) < 0.5
+    total = float(areas[upright].sum())
+    if total <= 0:
+        return 0.0, 0.0, 0.0
+    facing, weights = normals[upright, :2], areas[upright] / total
+    angle = np.arctan2(facing[:, 1], facing[:, 0])
+    squareness = float(np.hypot((weights * np.cos(4 * angle)).sum(), (weights * np.sin(4 * angle)).sum()))
+    lengths = np.linalg.norm(flat[upright], axis=1) * np.linalg.norm(facing, axis=1)
+    outward = float((weights * (flat[upright] * facing).sum(axis=1) / np.maximum(lengths, 1e-9)).sum())
+    return squareness, outward, total / max(float(areas.sum()), 1e-12)
+
+
+def _fill(points: np.ndarray, box: UprightBox, attached: bool) -> float:
+    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+    local = (points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]])
+    outline = (
+        np.column_stack([local[:, int(np.argmax(box.extents_m[:2]))], points[:, 2]]) if attached else local
+    )
+    hull = cv2.convexHull(outline.astype(np.float32))
+    return float(cv2.contourArea(hull)) / max(float(np.prod(np.ptp(outline, axis=0))), 1e-9)
+
+
 def coarse_label(facts: ShapeFacts) -> tuple[str, float]:
-    """Return (label, confidence)."""
-    if facts.attached:
-        thin = facts.extents_m[:2].min() < 0.1
-        return ("picture", 0.6) if thin else ("unknown", 0.2)
+    """Return (label, confidence); an unknown thing has confidence 0."""
     width, depth = sorted(facts.extents_m[:2], reverse=True)[:2]
     height = float(facts.extents_m[2])
+    if facts.attached:
+        return _on_wall(width, depth, height, facts)
     if facts.on_floor and max(width, height) > 0.35:
         return _furniture(width, depth, height, facts)
     return _small_thing(width, depth, height, facts)
 
 
+def _on_wall(width: float, depth: float, height: float, facts: ShapeFacts) -> tuple[str, float]:
+    if depth < 0.1 and min(width, height) > 0.2 and 0.3 < height / width < 3.3 and facts.fill > 0.85:
+        return "picture", 0.6
+    if 0.1 < depth < 0.5 and facts.flat_top_share > 0.4 and width > 2 * height:
+        return "shelf", 0.4
+    return UNKNOWN
+
+
 def _furniture(width: float, depth: float, height: float, facts: ShapeFacts) -> tuple[str, float]:
+    solid = facts.outward > 0.55 and facts.side_share > 0.5
     if facts.greenness > 0.4 and facts.flat_top_share < 0.3:
         return "plant", 0.5
     if facts.levels >= 3 and height > 0.6:
-        return "shelf", 0.6
-    if 0.25 < height < 1.15 and facts.flat_top_share > 0.55 and width > 0.5:
-        return "table", 0.65 if facts.carries else 0.5
-    if 0.6 < height < 1.3 and 0.35 < width < 1.0 and facts.levels >= 1 and facts.flat_top_share < 0.4:
-        return "seat", 0.45
-    if height > 1.0 and height > 1.2 * depth:
+        return "shelf", 0.7
+    if facts.levels >= 2 and height > 0.9 and facts.hollow:
+        return "shelf", 0.5
+    if height > 0.4 and solid and facts.squareness > 0.6:
         return "cabinet", 0.4
-    if 0.3 < height < 1.1 and width > 1.2 and facts.flat_top_share < 0.5:
+    top = facts.flat_top_share > 0.55 or (facts.carries >= 3 and facts.levels >= 1)
+    if top and 0.3 < height < 0.6 and depth < 0.42 * width:
+        return "seat", 0.4
+    if top and 0.25 < height < 1.15 and width > 0.5 and not solid:
+        return "table", 0.7 if facts.carries else 0.5
+    if 0.3 < height < 0.6 and width < 0.5 and facts.flat_top_share > 0.5:
         return "seat", 0.35
-    if height <= 0.5 and width < 0.7:
+    if 0.6 < height < 1.3 and 0.35 < width < 0.8 and facts.levels >= 1 and facts.flat_top_share < 0.5:
+        return "seat", 0.4
+    if height <= 0.5 and width < 0.7 and facts.squareness > 0.3:
         return "box", 0.4
-    return "unknown", 0.2
+    return UNKNOWN
 
 
 def _small_thing(width: float, depth: float, height: float, facts: ShapeFacts) -> tuple[str, float]:
     slender = height / max(width, 1e-3)
-    if facts.greenness > 0.5 and height > 0.1:
+    square = facts.squareness > 0.27
+    if facts.greenness > 0.5 and height > 0.1 and not square and facts.outward < 0.8:
         return "plant", 0.3
-    if height < 0.035 and facts.round_plan and width > 0.12:
+    if height < 0.05 and not square and depth > 0.75 * width and width > 0.15:
         return "plate", 0.5
-    if height < 0.075 and width > 0.1 and depth > 0.08 and facts.flat_top_share > 0.55:
-        return "book", 0.4
-    if facts.hollow and slender < 0.75:
-        if facts.round_plan and width < 0.35:
-            return "bowl", 0.45
-        return ("tray", 0.45) if height < 0.2 and width > 0.2 else ("box", 0.4)
-    if 0.06 < height < 0.16 and facts.hollow:
-        return "cup", 0.45
-    if slender > 1.5 and facts.round_plan and height > 0.1:
-        return "bottle", 0.35
-    if facts.flat_top_share > 0.5 and not facts.round_plan:
-        return "box", 0.4
-    return "unknown", 0.2
+    if square:
+        return _square_thing(width, depth, height, facts)
+    if max(width, height) < 0.075:
+        return UNKNOWN
+    if slender < 0.5:
+        return ("bowl", 0.5) if facts.hollow and 0.1 < width < 0.4 else UNKNOWN
+    if slender < 0.95:
+        return ("cup", 0.5) if facts.hollow else UNKNOWN
+    if slender < 1.55:
+        return ("can", 0.35) if facts.flat_top_share > 0.3 and width < 0.13 else UNKNOWN
+    return "bottle", 0.35
+
+
+def _square_thing(width: float, depth: float, height: float, facts: ShapeFacts) -> tuple[str, float]:
+    if facts.hollow and width > 0.2 and height < 0.6 * width:
+        return ("tray", 0.35) if height < 0.2 else ("box", 0.5)
+    if height < 0.07 and width > 0.13 and facts.flat_top_share > 0.4:
+        return "book", 0.3
+    if height < 0.04 or facts.side_share < 0.1 or facts.outward < 0:
+        return UNKNOWN  # too little of it was seen to have a shape
+    return "box", 0.5

@@ -7,9 +7,11 @@ import numpy as np
 from reconstruction.instances.addresses import KINDS, parse_address, parse_addresses, parse_parts, vector
 from reconstruction.instances.anchors import Footage, Pointer
 from reconstruction.instances.base import BASE_LABELS
-from reconstruction.instances.boxes import upright_box
+from reconstruction.instances.boxes import UprightBox, upright_box
 from reconstruction.instances.clicked_split import grown_parts, split_maps
+from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.surface.base_planes import base_outline
+from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.errors import UsageError
 
@@ -135,9 +137,22 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
     parts = [replace(item, id=int(number)) for number in numbers]
     others = tuple(parts[0] if o.id == item.id else o for o in found.objects)
     out = replace(found, vertex_instance=labels, id_maps=maps, objects=(*others, *parts[1:]))
+    graph = MeshGraph.from_surface(surface)
     for each in parts:
-        out = _with(out, _refit(each, out, surface))
+        out = _with(out, _renamed_by_shape(_refit(each, out, surface), out, graph))
     return out
+
+
+def _renamed_by_shape(part: Instance, found: InstanceSet, graph: MeshGraph) -> Instance:
+    """Return a part of a thing with a label of its own: what the whole was called says little about it."""
+    on_floor = any(b.id == part.support_hint and b.label == "floor" for b in found.base)
+    carries = sum(o.support_hint == part.id for o in found.objects)
+    chosen = np.flatnonzero(found.vertex_instance == part.id)
+    box = UprightBox(part.center, part.yaw_rad, part.extents_m)
+    label, confidence = coarse_label(
+        shape_facts(graph, chosen, box, on_floor and not part.attached_hint, part.attached_hint, carries)
+    )
+    return replace(part, label=label, label_confidence=confidence)
 
 
 def _split_thing(pointer: Pointer, how: object) -> Instance:

@@ -103,11 +103,8 @@ def anchor_text(item: dict) -> str:
     return f"pixel: {{frame: {anchor['frame']}, x: {anchor['x']:g}, y: {anchor['y']:g}}}"
 
 
-def frame_sheet(sheet: ContactSheet, frame: SheetFrame) -> np.ndarray:
-    """Draw one frame with its things outlined, numbered and named, and a legend to the right: uint8 (h, w, 3).
-
-    The frame itself begins in the upper left corner, so that a pixel of it is a pixel of the sheet.
-    """
+def frame_picture(sheet: ContactSheet, frame: SheetFrame) -> np.ndarray:
+    """Draw one frame with its things outlined, numbered and, unless they are many, named; longest side FRAME_PX."""
     height, width = frame.image.shape[:2]
     scale = FRAME_PX / max(height, width)
     size = (round(width * scale), round(height * scale))
@@ -115,11 +112,20 @@ def frame_sheet(sheet: ContactSheet, frame: SheetFrame) -> np.ndarray:
     shown = sheet.shown_in(frame)
     words = {n: str(n) if len(shown) > _CROWDED else f"{n} {sheet.facts(n)[0]}" for n in shown}
     colors = {n: sheet.colors[n] for n in shown}
-    picture = drawing.outlined(image, frame.ids, colors, words, tint=0.2, smallest=0.0)
-    legend = _legend(sheet, frame, shown, max(size[1], 200), size)
-    out = np.full((max(size[1], legend.shape[0]), size[0] + legend.shape[1], 3), 255, np.uint8)
-    out[: size[1], : size[0]] = picture
-    out[: legend.shape[0], size[0] :] = legend
+    return drawing.outlined(image, frame.ids, colors, words, tint=0.2, smallest=0.0)
+
+
+def frame_sheet(sheet: ContactSheet, frame: SheetFrame) -> np.ndarray:
+    """Draw one frame (`frame_picture`) with a legend to the right: uint8 (h, w, 3).
+
+    The frame itself begins in the upper left corner, so that a pixel of it is a pixel of the sheet.
+    """
+    picture = frame_picture(sheet, frame)
+    height, width = picture.shape[:2]
+    legend = _legend(sheet, frame, sheet.shown_in(frame), max(height, 200), (width, height))
+    out = np.full((max(height, legend.shape[0]), width + legend.shape[1], 3), 255, np.uint8)
+    out[:height, :width] = picture
+    out[: legend.shape[0], width:] = legend
     return out
 
 
@@ -149,13 +155,13 @@ def _widest(words: list[str], font: object) -> int:
     return int(max((font.getlength(word) for word in words), default=0))
 
 
-def crops_sheet(sheet: ContactSheet) -> np.ndarray:
+def crops_sheet(sheet: ContactSheet, columns: int = _COLUMNS) -> np.ndarray:
     """Draw every thing for itself, in the frame that shows it best, with what is said of it: uint8 (h, w, 3)."""
     tiles = [_tile(sheet, number) for number in sheet.objects]
     if not tiles:
         raise UsageError(f"{sheet.scene['id']}: nothing was found in this scene; there is nothing to show")
     blank = np.full_like(tiles[0], 255)
-    columns = min(_COLUMNS, len(tiles))
+    columns = min(columns, len(tiles))
     tiles += [blank] * (-len(tiles) % columns)
     return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])
 

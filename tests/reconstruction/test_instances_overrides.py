@@ -189,6 +189,9 @@ def test_split_by_clicks_gives_each_part_its_color(scene):
     clicks = [{"pixel": pixel_on(footage, p)} for p in (TABLE_TOP, RED_TOP)] + [{"at": list(BLUE_TOP)}]
     out = apply_overrides(whole, surface, [{"split": clicks}], footage)
     assert len(out.objects) == 3
+    assert labels_of(out, surface, RED_TOP) != labels_of(
+        out, surface, TABLE_TOP
+    )  # each named by its own shape
     for point in (TABLE_TOP, RED_TOP, BLUE_TOP):
         nearest = int(np.argmin(np.linalg.norm(surface.vertices - np.array(point), axis=1)))
         before, after = (f.vertex_instance == f.vertex_instance[nearest] for f in (found, out))
