@@ -145,7 +145,7 @@ def object_solid(
     if len(seen.points) < config.min_points:
         return *box_fallback(item, seen.points), "box-fallback"
     frame = frame_object(item, seen, stands.level(item.id), found)
-    hanging = hanging_slab(frame, posed, depth.camera, found, config)
+    hanging = hanging_slab(item.id, frame, posed, depth.camera, found, config)
     if hanging is not None:
         return hanging.body, frame, "observed+slab" + ("+completed" if hanging.completed else "")
     noise = object_noise(posed, depth, pixels, seen, item.id)

@@ -10,16 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.hanging_front import front_of
 from reconstruction.assets.solid import Solid, box_solid
 from reconstruction.assets.volume import ObjectFrame
 from reconstruction.types import Camera, InstanceSet, PosedFrames
 from registry.geometry import transform_points
 
 _MAX_THICKNESS_M = 0.10
-_MAX_SPREAD_M = 0.018
+_MAX_SPREAD_M, _LAYER_M = 0.025, 0.035
 _MIN_FLAT_SHARE = 0.6
 _CELL_M, _MAX_CELLS = 0.008, 120
 _MIN_COVERED = 0.5  # of what a well covered strip has
+_MIN_STRIP = 4  # cells of a strip that must be in view to judge it by less
+_EDGE_PX = 6.0
 _BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02
 _MIN_WITNESSES = 2
 _PROBES = 7
@@ -34,11 +37,17 @@ class Hanging:
 
 
 def hanging_slab(
-    frame: ObjectFrame, posed: PosedFrames, camera: Camera, found: InstanceSet, config: AssetsConfig
+    item: int,
+    frame: ObjectFrame,
+    posed: PosedFrames,
+    camera: Camera,
+    found: InstanceSet,
+    config: AssetsConfig,
 ) -> Hanging | None:
     """Return the slab of a thing that hangs flat on its wall; None for what is thick, bent or not on a wall.
 
     Args:
+        item: The thing's id.
         frame: What was seen of the thing; +y of its grid frame looks into the wall.
         posed: The keyframes' poses, in world space.
         camera: The camera at the resolution of the instance maps.
@@ -50,11 +59,13 @@ def hanging_slab(
     away_m = frame.wall_y - frame.points[:, 1]
     thickness = float(np.median(away_m))
     spread = 1.4826 * float(np.median(np.abs(away_m - thickness)))
-    flat = np.abs(away_m - thickness) < max(2.5 * spread, 0.01)
+    # Depth takes a plain front for the wall behind it, and finds the frame around it: both are the thing.
+    flat = np.abs(away_m - thickness) < max(2.5 * spread, _LAYER_M)
     if thickness > _MAX_THICKNESS_M or spread > _MAX_SPREAD_M or flat.mean() < _MIN_FLAT_SHARE:
         return None
-    thickness = max(thickness, config.flat_thickness_m)
-    low, high = _covered_rectangle(frame.points[flat][:, [0, 2]])
+    low, high = _covered_rectangle(frame, flat, posed, camera)
+    front = front_of(frame.world_from_grid, frame.wall_y, low, high, item, posed, camera, found)
+    thickness = max(thickness if front is None else front, config.flat_thickness_m)
     size = high - low
     if size.min() < 2 * thickness:
         return None
@@ -76,11 +87,15 @@ def hanging_slab(
     return Hanging(body, completed)
 
 
-def _covered_rectangle(across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners (2,) of the rectangle that points (k, 2) cover.
+def _covered_rectangle(
+    frame: ObjectFrame, flat: np.ndarray, posed: PosedFrames, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners (2,) x and z of the rectangle that the `flat` ones of the seen points cover.
 
-    What counts is that a strip is covered, not how often: the part at the image's edge is in few frames only.
+    What counts is that a strip is covered where any frame could see it, not how often: the part at the image's edge is
+    in few frames only.
     """
+    across = frame.points[flat][:, [0, 2]]
     start, end = across.min(axis=0), across.max(axis=0)
     cell = max(_CELL_M, float((end - start).max()) / _MAX_CELLS)
     index = np.floor((across - start) / cell).astype(int)
@@ -88,13 +103,32 @@ def _covered_rectangle(across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     filled = (
         np.bincount(np.ravel_multi_index(index.T, shape), minlength=int(np.prod(shape))).reshape(shape) > 0
     )
+    x, z = np.meshgrid(*(start[k] + (np.arange(shape[k]) + 0.5) * cell for k in (0, 1)), indexing="ij")
+    centers = np.stack([x, np.full(shape, frame.wall_y), z], axis=-1).reshape(-1, 3)
+    visible = filled | _in_view(transform_points(frame.world_from_grid, centers), posed, camera).reshape(
+        shape
+    )
     low, high = np.empty(2), np.empty(2)
     for axis in (0, 1):
-        covered = filled.sum(axis=1 - axis)
+        covered = filled.sum(axis=1 - axis) / np.maximum(visible.sum(axis=1 - axis), _MIN_STRIP)
         strips = np.flatnonzero(covered >= _MIN_COVERED * np.percentile(covered, 90))
         low[axis] = start[axis] + strips[0] * cell
         high[axis] = start[axis] + (strips[-1] + 1) * cell
     return np.maximum(low, start), np.minimum(high, end)
+
+
+def _in_view(world: np.ndarray, posed: PosedFrames, camera: Camera) -> np.ndarray:
+    """Return which points (n, 3) are inside some frame and off its very edge, where depth is missing."""
+    out = np.zeros(len(world), bool)
+    for pose in posed.world_from_camera:
+        local = (world - pose[:3, 3]) @ pose[:3, :3]
+        z = np.maximum(local[:, 2], 1e-6)
+        u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
+        inside = (
+            (u > _EDGE_PX) & (v > _EDGE_PX) & (u < camera.width - _EDGE_PX) & (v < camera.height - _EDGE_PX)
+        )
+        out |= inside & (local[:, 2] > 0.05)
+    return out
 
 
 def _wall_beyond(

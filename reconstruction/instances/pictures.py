@@ -15,6 +15,7 @@ from reconstruction.surface.mesh_graph import MeshGraph, lab_from_rgb
 from reconstruction.types import DepthMaps, PosedFrames
 from registry.geometry import invert_rigid
 
+_FADED_CELLS = 8
 _DEPTH_M = 0.06  # how far in front of the wall a picture may reach
 
 
@@ -182,7 +183,28 @@ def _picture_region(
         return None
     grid = np.zeros(region.shape, np.uint8)
     cv2.fillConvexPoly(grid, np.ascontiguousarray(hull[..., ::-1]), 1)
-    return ndimage.binary_dilation(grid.astype(bool), iterations=1)
+    return _to_the_edge(ndimage.binary_dilation(grid.astype(bool), iterations=1), texture.seen)
+
+
+def _to_the_edge(region: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Let a picture that the images' edge cuts go on to the last that was seen, where its outline has faded."""
+    out = region.copy()
+    for axis in (0, 1):
+        side = region.any(axis=1 - axis)
+        first, last = np.flatnonzero(side)[[0, -1]]
+        across = np.flatnonzero(region.any(axis=axis))
+        lanes = np.zeros(region.shape[1 - axis], bool)
+        lanes[across[0] : across[-1] + 1] = True
+        profile = (seen[:, lanes] if axis == 0 else seen[lanes].T).mean(axis=1)
+        for end, step in ((first, -1), (last, 1)):
+            probe = end + step * (_FADED_CELLS + 1)
+            if 0 <= probe < len(profile) and profile[probe] > 0.2:
+                continue  # wall is seen beyond: this side is the picture's own
+            rim = np.zeros(len(profile), bool)
+            low, high = sorted((end, end + step * _FADED_CELLS))
+            rim[max(low, 0) : high + 1] = True
+            out |= seen & (np.outer(rim, lanes) if axis == 0 else np.outer(lanes, rim))
+    return out
 
 
 def _filled(region: np.ndarray, seen: np.ndarray) -> np.ndarray:

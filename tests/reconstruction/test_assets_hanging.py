@@ -5,6 +5,7 @@ import pytest
 
 from reconstruction.assets import AssetsConfig
 from reconstruction.assets.hanging import hanging_slab
+from reconstruction.assets.hanging_front import front_of
 from reconstruction.assets.volume import ObjectFrame
 from reconstruction.types import BaseEntity, Camera, InstanceSet, Plane, PosedFrames, VideoSource
 from registry.geometry import rigid
@@ -51,7 +52,7 @@ def slab(frame: ObjectFrame, posed: PosedFrames, config: AssetsConfig | None = N
     maps = np.ones((len(posed.images), 240, 320), np.uint16)
     maps[:, :blind_rows] = 0
     found = InstanceSet(np.zeros(0, np.int32), (WALL,), (), maps)
-    return hanging_slab(frame, posed, CAMERA, found, config or AssetsConfig())
+    return hanging_slab(2, frame, posed, CAMERA, found, config or AssetsConfig())
 
 
 def size_of(hanging) -> np.ndarray:
@@ -110,3 +111,47 @@ def test_what_is_thick_or_bent_or_stands_is_no_slab():
     assert slab(seen(noise=0.05), frames(*TWICE)) is None
     standing = ObjectFrame(np.eye(4), seen().points, seen().normals, True, None)
     assert slab(standing, frames(*TWICE)) is None
+
+
+def filmed(pattern, thickness: float, eyes) -> PosedFrames:
+    """Frames of a wall at y = 2.02 with a picture of a pattern, a function of x and z in metres, in front of it."""
+    posed = frames(*eyes)
+    v, u = np.mgrid[:240, :320] + 0.0
+    rays = np.stack([(u - 160) / 280, np.ones_like(u), -(v - 120) / 280], axis=-1)
+    for image, pose in zip(posed.images, posed.world_from_camera):
+        front = pose[:3, 3] + rays * (2.02 - thickness - pose[1, 3])
+        inside = (np.abs(front[..., 0]) < 0.4) & (front[..., 2] > 1.2) & (front[..., 2] < 1.6)
+        image[:] = np.where(inside, pattern(front[..., 0], front[..., 2]), 180.0)[..., None]
+    return posed
+
+
+EYES = tuple((x, 0.0, z) for x in (-0.7, -0.35, 0.0, 0.35, 0.7) for z in (1.0, 1.5))
+
+
+def front(posed: PosedFrames) -> float | None:
+    maps = np.full((len(posed.images), 240, 320), 2, np.uint16)
+    found = InstanceSet(np.zeros(0, np.int32), (WALL,), (), maps)
+    grid = rigid(translation=np.array([0, 2.0, 1.2]))
+    return front_of(grid, 0.02, np.array([-0.38, 0.02]), np.array([0.38, 0.38]), 2, posed, CAMERA, found)
+
+
+@pytest.mark.parametrize("thickness", [0.015, 0.035])
+def test_the_images_tell_how_far_a_picture_stands_out(thickness):
+    def waves(x, z):
+        return 120 + 60 * np.sin(x * 90) * np.sin(z * 70)
+
+    assert front(filmed(waves, thickness, EYES)) == pytest.approx(thickness, abs=0.004)
+
+
+def test_a_plain_picture_or_a_still_camera_tell_nothing():
+    assert front(filmed(lambda x, z: 180.0, 0.03, EYES)) is None
+    assert front(filmed(lambda x, z: 120 + 60 * np.sin(x * 90), 0.03, ((0.0, 0.0, 1.3),) * 6)) is None
+
+
+def test_a_plain_middle_taken_for_the_wall_does_not_shrink_the_picture():
+    """Depth found the frame 3 cm before the wall, and the plain middle on the wall."""
+    frame = seen(noise=0.002)
+    x, z = frame.points[:, 0], frame.points[:, 2]
+    middle = (np.abs(x) < 0.32) & (z > 0.06) & (z < 0.24)
+    frame.points[middle, 1] = 0.02
+    assert size_of(slab(frame, frames(*TWICE)))[[0, 2]] == pytest.approx([0.8, 0.3], abs=0.02)
