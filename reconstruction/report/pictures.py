@@ -127,9 +127,9 @@ def _frame(image: np.ndarray, alt: str, caption: str = "", width: int = FRAME_PX
 
 
 def instance_frames(g: Gathered, count: int = 6) -> list[Picture]:
-    """Keyframes with what was found in them; beside each the true outlines, where they are known."""
+    """Keyframes that show every thing well, with what was found in them; beside each the true outlines, if known."""
     out = []
-    for row in g.keyframe_rows(count):
+    for row in _telling_rows(g, count):
         index = int(g.posed.indices[row])
         image = drawing.fit_width(np.asarray(g.posed.images[row]), FRAME_PX + 60)
         found = drawing.outlined(image, np.asarray(g.instances.id_maps[row]), g.colors)
@@ -137,6 +137,13 @@ def instance_frames(g: Gathered, count: int = 6) -> list[Picture]:
         if g.truth is not None and g.truth.has_meshes:
             out.append(_true_instances(g, index, row, image))
     return out
+
+
+def _telling_rows(g: Gathered, count: int) -> list[int]:
+    """Return the keyframes of the contact sheets; evenly spread ones where the bundle names none."""
+    rows = {int(index): row for row, index in enumerate(g.posed.indices)}
+    named = [f["index"] for f in g.scene.get("instances", {"frames": []})["frames"]]
+    return [rows[index] for index in named if index in rows] or g.keyframe_rows(count)
 
 
 def _true_instances(g: Gathered, index: int, row: int, image: np.ndarray) -> Picture:

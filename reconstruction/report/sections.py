@@ -25,6 +25,7 @@ from reconstruction.report.blocks import (
     left_out,
 )
 from reconstruction.report.collect import Gathered
+from reconstruction.report.contact_sheet import anchor_text
 
 
 def all_sections(g: Gathered) -> list[Section]:
@@ -227,6 +228,8 @@ def _object_facts(item: dict, score: dict | None) -> list[tuple[str, str]]:
         ("shape", f"{item['provenance']['geometry']}; {len(item['collision'])} collision parts"),
         ("label", f"{item['label']}, sure to {item['label_confidence']:.0%}"),
     ]
+    if "anchor" in item:
+        out.append(("for --overrides", anchor_text(item)))
     if score is not None:
         out.append(
             (

@@ -102,3 +102,10 @@ def test_a_bundle_of_before_says_what_to_do(reconstructed):
     bundle.scene.pop("instances")
     with pytest.raises(UsageError, match="no frames for contact sheets"):
         ContactSheet.of(bundle)
+
+
+def test_the_report_shows_the_same_frames_and_anchors(sheet, page):
+    for frame in sheet.frames:
+        assert f"instances in frame {frame.index}" in page
+    for item in sheet.objects.values():
+        assert anchor_text(item) in page
