@@ -42,6 +42,13 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=f"variants:\n{text}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    add_arguments(parser)
+    parser.add_argument("--page", type=Path, default=DEFAULT_PAGE, metavar="FILE", help="the page to write")
+    return parser
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what every command takes that measures captures in variants."""
     parser.add_argument(
         "--captures",
         type=Path,
@@ -58,7 +65,6 @@ def build_parser() -> argparse.ArgumentParser:
         "--variant", action="append", default=[], metavar="NAME=ARGUMENTS", help="one more, of your own"
     )
     parser.add_argument("--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="where results are kept")
-    parser.add_argument("--page", type=Path, default=DEFAULT_PAGE, metavar="FILE", help="the page to write")
     parser.add_argument("--force", action="store_true", help="do again what is done")
     parser.add_argument("--retry-failed", action="store_true", help="do again what failed")
     parser.add_argument(
@@ -69,7 +75,6 @@ def build_parser() -> argparse.ArgumentParser:
         "--discard-stages", action="store_true", help="delete a capture's stage results when it is done"
     )
     parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
-    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -89,8 +94,22 @@ def _run(arguments: argparse.Namespace) -> int:
     captures = find_captures(arguments.captures, arguments.only)
     names = arguments.variants or ([] if arguments.variant else ["default"])
     variants = choose_variants(names, arguments.variant)
-    machine = describe_machine()
     out = arguments.out.resolve()
+    failed = measure_scenes(captures, variants, out, arguments)
+    if not arguments.dry_run:
+        write_page(load_results(out), arguments.page, describe_code())
+        print(f"{arguments.page} is written", flush=True)
+    return 1 if failed else 0
+
+
+def measure_scenes(
+    captures: Sequence[Capture], variants: Sequence[Variant], out: Path, arguments: argparse.Namespace
+) -> int:
+    """Reconstruct and evaluate what is not done yet, and keep the results; return how many failed.
+
+    `arguments` has `force`, `retry_failed`, `keep_stale`, `timeout_s`, `discard_stages` and `dry_run`.
+    """
+    machine = describe_machine()
     failed = 0
     for capture in captures:
         inputs = capture.digest()
@@ -120,10 +139,7 @@ def _run(arguments: argparse.Namespace) -> int:
             failed += result.failed
         if arguments.discard_stages and not arguments.dry_run:
             shutil.rmtree(home_of(out, capture) / "work", ignore_errors=True)
-    if not arguments.dry_run:
-        write_page(load_results(out), arguments.page, describe_code())
-        print(f"{arguments.page} is written", flush=True)
-    return 1 if failed else 0
+    return failed
 
 
 def _known(

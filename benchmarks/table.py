@@ -89,7 +89,7 @@ def _variant_names(results: Sequence[Result]) -> list[str]:
     return list(dict.fromkeys(result.variant for result in sorted(results, key=lambda r: _order(r)[1:])))
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> list[str]:
+def table_lines(heads: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> list[str]:
     """Lay out a Markdown table whose first `texts` columns are text and the others numbers."""
     align = ["---"] * texts + ["---:"] * (len(heads) - texts)
     lines = [heads, align, *rows]
@@ -132,7 +132,7 @@ def _means(results: Sequence[Result]) -> str:
             cells += [_mean_cell(group, column, done, notes) for column in columns]
             rows.append(cells)
         heads = ["variant", "captures done", *(column.head for column in columns)]
-        parts += ["", f"### {title}", "", *_table(heads, rows, 2), *notes.lines()]
+        parts += ["", f"### {title}", "", *table_lines(heads, rows, 2), *notes.lines()]
     return "\n".join(parts)
 
 
@@ -160,7 +160,7 @@ def _paper() -> str:
     heads = ["method (ScanNet, RTX A6000)"]
     heads += [column.head + ("" if column.key == "time_s" else " *") for column in PAPER]
     rows = [[name, *(column.shown(values[column.key]) for column in PAPER)] for name, values in PAPER_ROWS]
-    return "\n".join(_table(heads, rows, 1))
+    return "\n".join(table_lines(heads, rows, 1))
 
 
 # -- Oracles -------------------------------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ def _oracles(results: Sequence[Result]) -> str:
     first = [f"{BASELINE} (absolute)", f"{len(base_runs)}"]
     first += [_mean_cell(base_runs, column, len(base_runs), notes) for column in ORACLE] if base_runs else []
     heads = ["variant", "captures", *(column.head for column in ORACLE)]
-    return "\n".join(_table(heads, [first, *rows] if base_runs else rows, 2) + notes.lines())
+    return "\n".join(table_lines(heads, [first, *rows] if base_runs else rows, 2) + notes.lines())
 
 
 def _difference(
@@ -219,7 +219,7 @@ def _times(results: Sequence[Result]) -> str:
         group = [result.report["timings_s"] for result in done if result.variant == name]
         means = [sum(times.get(step, 0.0) for times in group) / len(group) for step in steps]
         rows.append([name, f"{len(group)}", *(f"{mean:.1f}" for mean in means), f"{sum(means):.0f}"])
-    return "\n".join(_table(["variant", "captures", *steps, "total"], rows, 2)) if rows else ""
+    return "\n".join(table_lines(["variant", "captures", *steps, "total"], rows, 2)) if rows else ""
 
 
 # -- Capture by capture --------------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ def _rows(
         cells = [*first, label, keys[id(result)]]
         rows.append(cells + _cells(result, columns, notes))
     heads = [*(["capture"] if with_capture else []), "variant", "run", *(column.head for column in columns)]
-    return "\n".join(_table(heads, rows, 3 if with_capture else 2) + notes.lines())
+    return "\n".join(table_lines(heads, rows, 3 if with_capture else 2) + notes.lines())
 
 
 def _cells(result: Result, columns: Sequence[Column], notes: Notes) -> list[str]:
@@ -283,7 +283,7 @@ def _runs(results: Sequence[Result], keys: dict[int, str], code: dict) -> str:
         ]
         for result in results
     ]
-    return "\n".join([*lines, "", *_table(heads, rows, 6), "", *_meanings(results)])
+    return "\n".join([*lines, "", *table_lines(heads, rows, 6), "", *_meanings(results)])
 
 
 def _meanings(results: Sequence[Result]) -> list[str]:

@@ -39,6 +39,12 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("default", (), "the preset `default`"),
     Variant("fast", ("--preset", "fast"), "the preset `fast`"),
     Variant("quality", ("--preset", "quality"), "the preset `quality`"),
+    Variant(
+        "true-masks",
+        ("--set", "instances.masks=folder", "--set", f"instances.masks_path={GROUND_TRUTH}/instances"),
+        "the true id images of every tenth frame as masks from a folder: what the lifting makes of perfect masks",
+        "scene",
+    ),
     _oracle("poses", "cameras", "poses"),
     _oracle("depth", "scene", "depth"),
     _oracle("world", "scene", "world"),

@@ -127,9 +127,9 @@ def run(arguments: argparse.Namespace) -> int:
             scene_id=arguments.scene,
             registry_root=arguments.registry,
             work_dir=arguments.work_dir,
-            config=_config(arguments),
+            config=config_of(arguments),
             overrides=Overrides.load(arguments.overrides) if arguments.overrides else None,
-            oracle=_oracle(arguments),
+            oracle=oracle_of(arguments),
             require_stable=arguments.require_stable,
             keep_results=arguments.keep_results,
             listener=listener,
@@ -138,7 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _oracle(arguments: argparse.Namespace) -> object | None:
+def oracle_of(arguments: argparse.Namespace) -> object | None:
     """Read the truth that stands in for stages; without --oracle the truth is never touched."""
     from registry.errors import UsageError
 
@@ -178,7 +178,8 @@ def _gaussians_backend(device: str) -> str:
         ) from error
 
 
-def _config(arguments: argparse.Namespace) -> object:
+def config_of(arguments: argparse.Namespace) -> object:
+    """Return the pipeline's config that a command line asks for."""
     from reconstruction.config import PipelineConfig
 
     config = PipelineConfig.from_preset(arguments.preset).with_seed(arguments.seed)

@@ -14,7 +14,7 @@ import numpy as np
 from reconstruction.evaluation.object_facts import SUPPORTS
 
 SIZE_EDGES_CM = (5.0, 10.0, 20.0, 50.0)  # of the longest side; a bin holds its lower edge
-GAP_EDGES_CM = (2.0, 5.0, 10.0)  # to the nearest neighbor
+GAP_EDGES_CM = (2.0, 5.0, 10.0, 30.0)  # to the nearest neighbor
 _Z_95 = 1.959963984540054  # two-sided 95 % of the normal distribution
 _ON = {"floor": "on the floor", "furniture": "on furniture", "thing": "on a thing", "wall": "on a wall"}
 

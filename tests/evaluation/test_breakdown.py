@@ -115,7 +115,7 @@ def test_a_thing_alone_has_no_gap(tmp_path):
         truth.evaluated, object_facts(truth), match_boxes(truth.evaluated, np.zeros((0, 2, 3))), []
     )
     assert [r["gap_cm"] for r in records] == [None, None]  # each is the other's support or load
-    assert breakdown(records)["gap"][0].name == "≥ 10 cm"
+    assert breakdown(records)["gap"][0].name == "≥ 30 cm"
 
 
 def test_records_say_what_was_found_at_which_overlap(truth):
@@ -182,7 +182,8 @@ def test_bins_hold_their_lower_edge_and_every_object_is_in_one():
         "< 2 cm": (1, 1, 2),
         "2–5 cm": (1, 0, 1),
         "5–10 cm": (0, 0, 1),
-        "≥ 10 cm": (2, 2, 2),
+        "10–30 cm": (1, 1, 1),
+        "≥ 30 cm": (1, 1, 1),
         "all": (4, 3, 6),
     }
     assert len(SIZE_EDGES_CM) == 4
