@@ -66,11 +66,13 @@ class InstancesConfig:
     wall_color_contrast: float = 9.0
     """CIELAB distance from the wall's own color at which a part of it may be a picture."""
 
-    split_color_contrast: float = 14.0
-    """CIELAB distance between touching patches below which they are never cut apart."""
+    split_color_contrast: float = 13.0
+    """CIELAB distance across the contact of two touching patches that tells two things apart where the crease along it
+    has `split_angle_deg`; the product of both counts."""
 
-    split_angle_deg: float = 18.0
-    """Mean concave angle along the contact of two patches below which they are never cut apart."""
+    split_angle_deg: float = 30.0
+    """Mean concave angle along the contact of two touching patches that tells two things apart where their colors have
+    `split_color_contrast`."""
 
     snap_radius_px: int = 3
     """How far the borders of id maps may move to a color edge, at depth resolution."""

@@ -3,169 +3,158 @@
 A label on a can has another color but no crease; the inside of a bowl has creases but one color: neither is cut.
 """
 
+from heapq import heappop, heappush
+
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.patches import LIGHTNESS_WEIGHT, Contacts, contacts_of, crease_patches, palette
 from reconstruction.surface.mesh_graph import MeshGraph
 
-_MAX_VERTICES = 40_000
-# Shading changes lightness within one thing; two things mostly differ in hue or strongly in lightness.
-LIGHTNESS_WEIGHT = np.array([0.5, 1.0, 1.0], np.float32)
+_SHORT_M = 0.03  # borders shorter than this count for less
+_STEEP_DEG = 85.0  # a crease cannot be more than a right angle's worth of evidence
+_VIVID = 50.0  # nor a gap of colors more than this
+_GROUND_M = 0.03  # how far above the ground of the whole a part that stands on it may begin
+_LIES_SHARE = 0.3  # of a part's border along which a neighbor faces up, if it lies on that
+_PALETTE = 24
+_MIN_COLOR_SHARE = 0.05  # of a region: colors it has less of are strays
 
 
 def split_touching(graph: MeshGraph, body: np.ndarray, config: InstancesConfig) -> list[np.ndarray]:
     """Split vertices `body` (sorted indices) into one or more parts, the largest first."""
-    if len(body) < 4 * config.min_object_vertices or len(body) > _MAX_VERTICES:
+    if len(body) < 4 * config.min_object_vertices:
         return [body]
-    local = np.full(len(graph.points), -1, np.int64)
-    local[body] = np.arange(len(body))
-    links = local[graph.edges]
-    links = links[(links >= 0).all(axis=1)]
-    if len(links) == 0:
-        return [body]
-    patch = _color_patches(graph.lab[body] * LIGHTNESS_WEIGHT, links, config)
+    patch, links = crease_patches(graph, body)
     if patch.max() == 0:
         return [body]
-    label = _merge_patches(graph, body, links, patch, config)
-    parts = [body[label == i] for i in np.unique(label)]
+    regions = Regions(graph, body, patch, contacts_of(graph, body, links, patch), config)
+    regions.merge_alike()
+    regions.merge_no_things()
+    parts = [body[regions.label == i] for i in np.unique(regions.label)]
     return sorted(parts, key=lambda part: (-graph.areas[part].sum(), part[0]))
 
 
-def _color_patches(lab: np.ndarray, links: np.ndarray, config: InstancesConfig) -> np.ndarray:
-    """Return a patch per vertex: connected pieces of one color out of the few that the thing has."""
-    centers = [np.median(lab, axis=0)]
-    for _ in range(7):  # farthest color first, ignoring a few percent of strays
-        distance = np.min([np.linalg.norm(lab - c, axis=1) for c in centers], axis=0)
-        limit = np.percentile(distance, 96)
-        if limit < config.split_color_contrast:
-            break
-        far = distance >= limit
-        seed = lab[int(np.argmin(np.abs(distance - limit)))]
-        near = far | (np.linalg.norm(lab - seed, axis=1) < 0.5 * config.split_color_contrast)
-        centers.append(np.median(lab[near & (np.linalg.norm(lab - seed, axis=1) < 20)], axis=0))
-    means = np.array(centers)
-    for _ in range(6):
-        nearest = np.argmin(np.linalg.norm(lab[:, None] - means[None], axis=2), axis=1)
-        means = np.array(
-            [lab[nearest == k].mean(axis=0) if (nearest == k).any() else m for k, m in enumerate(means)]
+class Regions:
+    """Patches of one body, merged step by step; what was measured of them and along their borders adds up."""
+
+    def __init__(
+        self,
+        graph: MeshGraph,
+        body: np.ndarray,
+        patch: np.ndarray,
+        contacts: Contacts,
+        config: InstancesConfig,
+    ) -> None:
+        """Begin with every patch a region of its own."""
+        self.graph, self.body, self.config = graph, body, config
+        self.label = patch.copy()
+        areas = graph.areas[body]
+        self.area = np.bincount(patch, weights=areas)
+        nearest, means = palette(graph.lab[body] * LIGHTNESS_WEIGHT, _PALETTE, 4.0)
+        self.color_gaps = np.linalg.norm(means[:, None] - means[None], axis=2)
+        count = len(self.color_gaps)
+        flat = np.bincount(patch * count + nearest, weights=areas, minlength=len(self.area) * count)
+        self.colors = flat.reshape(-1, count)  # area of each color
+        # (a, b) with a < b -> length, length * bend, length * color, length where a, where b faces up
+        self.border = {
+            (int(a), int(b)): length * np.array([1.0, bend, color, *level])
+            for (a, b), length, bend, color, level in zip(
+                contacts.pairs, contacts.length_m, contacts.bend_deg, contacts.color, contacts.level
+            )
+        }
+        self.neighbors: dict[int, set[int]] = {int(k): set() for k in np.unique(patch)}
+        self.perimeter = np.zeros(len(self.area))
+        for (a, b), sums in self.border.items():
+            self.neighbors[a].add(b)
+            self.neighbors[b].add(a)
+            self.perimeter[[a, b]] += sums[0]
+
+    def facts(self, pair: tuple[int, int]) -> tuple[float, float, float]:
+        """Return the length in metres, mean bend in degrees and color gap of the border of two regions."""
+        length, bend, color = self.border[pair][:3]
+        small, large = sorted(pair, key=lambda k: (self.area[k], k))
+        common = self.colors[large] > _MIN_COLOR_SHARE * self.area[large]
+        foreign = self.color_gaps[:, common].min(axis=1) if common.any() else np.zeros(len(self.color_gaps))
+        gap = float(self.colors[small] @ foreign) / max(self.area[small], 1e-12)
+        return float(length), float(bend / length), max(float(color / length), gap)
+
+    def separateness(self, pair: tuple[int, int]) -> float:
+        """Return how surely two neighbors are two things: 1 and more is enough to cut."""
+        length, bend, color = self.facts(pair)
+        crease = np.clip(bend, 0.0, _STEEP_DEG) / self.config.split_angle_deg
+        contrast = np.clip(color, 0.0, _VIVID) / self.config.split_color_contrast
+        both = crease * contrast if min(crease, contrast) > 0.35 else 0.0
+        return float(both * min(1.0, length / _SHORT_M))
+
+    def likeness(self, pair: tuple[int, int]) -> float:
+        """Return how much two neighbors look like one thing: smooth, of one color, with a long common border."""
+        length, bend, color = self.facts(pair)
+        around = max(min(self.perimeter[pair[0]], self.perimeter[pair[1]]), 1e-9)
+        return float(np.sqrt(length / around) * np.exp(-bend / 20.0) / (color + 8.0))
+
+    def merge(self, pair: tuple[int, int]) -> None:
+        """Join the second region of a pair into the first."""
+        keep, gone = pair
+        self.label[self.label == gone] = keep
+        self.area[keep] += self.area[gone]
+        self.colors[keep] += self.colors[gone]
+        self.perimeter[keep] += self.perimeter[gone] - 2.0 * self.border.pop(pair)[0]
+        self.neighbors[keep].discard(gone)
+        for third in self.neighbors.pop(gone) - {keep}:
+            sums = self.border.pop((min(gone, third), max(gone, third)))
+            key = (min(keep, third), max(keep, third))
+            if (gone < third) != (keep < third):
+                sums = sums[[0, 1, 2, 4, 3]]
+            self.border[key] = self.border.get(key, np.zeros(5)) + sums
+            self.neighbors[third].discard(gone)
+            self.neighbors[third].add(keep)
+            self.neighbors[keep].add(third)
+
+    def merge_alike(self) -> None:
+        """Merge what looks most like one thing until all that are left are separate; small patches go first."""
+        small_m2 = 0.3 * self.config.min_object_area_m2
+        changed = np.zeros(len(self.area), np.int64)
+        queue: list[tuple] = []
+
+        def put(pair: tuple[int, int]) -> None:
+            tiny = bool(self.area[list(pair)].min() < small_m2)
+            if tiny or self.separateness(pair) < 1.0:
+                heappush(queue, (not tiny, -self.likeness(pair), pair, *changed[list(pair)]))
+
+        for pair in self.border:
+            put(pair)
+        while queue:
+            _, _, pair, *seen = heappop(queue)
+            if pair not in self.border or list(changed[list(pair)]) != seen:
+                continue  # one of the two has grown since
+            self.merge(pair)
+            keep = pair[0]
+            changed[keep] += 1
+            for third in sorted(self.neighbors[keep]):
+                put((min(keep, third), max(keep, third)))
+
+    def merge_no_things(self) -> None:
+        """Give regions that are no things back to the neighbor that they look most like, the smallest first."""
+        while True:
+            for region in sorted(self.neighbors, key=lambda k: (self.area[k], k)):
+                around = [(min(region, k), max(region, k)) for k in sorted(self.neighbors[region])]
+                if around and not self._may_be_a_thing(region):
+                    self.merge(max(around, key=lambda p: (self.likeness(p), -p[0], -p[1])))
+                    break
+            else:
+                return
+
+    def _may_be_a_thing(self, region: int) -> bool:
+        """A thing is large enough, and stands on the ground of the whole or lies on a neighbor: no handle does."""
+        points = self.graph.points[self.body[self.label == region]]
+        if self.area[region] < self.config.min_object_area_m2:
+            return False
+        if np.sort(np.ptp(points, axis=0))[1] < self.config.min_object_m:
+            return False
+        if points[:, 2].min() < self.graph.points[self.body, 2].min() + _GROUND_M:
+            return True
+        level = sum(
+            self.border[region, k][4] if region < k else self.border[k, region][3]
+            for k in sorted(self.neighbors[region])
         )
-    same = nearest[links[:, 0]] == nearest[links[:, 1]]
-    adjacency = coo_matrix(
-        (np.ones(same.sum(), np.int8), (links[same, 0], links[same, 1])), shape=(len(lab),) * 2
-    )
-    return connected_components(adjacency, directed=False)[1]
-
-
-def _merge_patches(
-    graph: MeshGraph, body: np.ndarray, links: np.ndarray, patch: np.ndarray, config: InstancesConfig
-) -> np.ndarray:
-    """Merge patches greedily, the least separate pair first, until every contact left is crease and color."""
-    label = patch.copy()
-    minimum = max(config.min_object_vertices, 12)
-    while True:
-        count = int(label.max()) + 1
-        if count == 1:
-            return label
-        sizes = np.bincount(label, minlength=count)
-        contact, strength, length = _contacts(graph, body, links, label, count, config)
-        if len(contact) == 0:
-            return label
-        small = sizes[contact].min(axis=1) < minimum
-        # Small patches merge first, into the neighbor with the longest contact.
-        cost = np.where(small, -length.astype(float) / length.max() - 1.0, strength)
-        weakest = int(np.argmin(cost))
-        if cost[weakest] >= 1.0:
-            return _only_compact(graph, body, label, contact, config)
-        a, b = sorted(contact[weakest])
-        label[label == b] = a
-        label = np.unique(label, return_inverse=True)[1]
-
-
-def _contacts(
-    graph: MeshGraph,
-    body: np.ndarray,
-    links: np.ndarray,
-    label: np.ndarray,
-    count: int,
-    config: InstancesConfig,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return touching pairs (n, 2), how separate each is (1 = cut), and contact lengths in edges."""
-    ends = label[links]
-    crossing = ends[:, 0] != ends[:, 1]
-    ends = np.sort(ends[crossing], axis=1)
-    if len(ends) == 0:
-        return np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0, np.int64)
-    keys = ends[:, 0] * count + ends[:, 1]
-    unique, inverse = np.unique(keys, return_inverse=True)
-    pairs = np.stack([unique // count, unique % count], axis=1)
-    length = np.bincount(inverse)
-    middle = 0.5 * (graph.points[body[links[crossing, 0]]] + graph.points[body[links[crossing, 1]]])
-    concave = crease_angles(graph, body, label, pairs, middle, inverse)
-    median_lab = np.stack([np.median(graph.lab[body[label == i]], axis=0) for i in range(count)])
-    color = np.linalg.norm((median_lab[pairs[:, 0]] - median_lab[pairs[:, 1]]) * LIGHTNESS_WEIGHT, axis=1)
-    strength = np.minimum(concave / config.split_angle_deg, color / config.split_color_contrast)
-    return pairs, strength, length
-
-
-def crease_angles(
-    graph: MeshGraph,
-    body: np.ndarray,
-    label: np.ndarray,
-    pairs: np.ndarray,
-    middle: np.ndarray,
-    which: np.ndarray,
-) -> np.ndarray:
-    """Return the mean crease along each contact in degrees, positive where concave.
-
-    Both sides are described by the mean position and normal of their vertices within a few spacings of the contact,
-    because the edge of a color rarely lies exactly in the crease.
-
-    Args:
-        graph: the surface.
-        body: vertices of the thing.
-        label: patch of each of them.
-        pairs: int (n, 2) touching patches.
-        middle: float (m, 3) middles of the mesh edges that cross from patch to patch.
-        which: int (m,) row of `pairs` that each belongs to.
-    """
-    points, normals = graph.points[body], graph.normals[body]
-    radius = max(0.02, 2.5 * graph.spacing_m)
-    trees = {int(k): np.flatnonzero(label == k) for k in np.unique(pairs)}
-    search = {k: cKDTree(points[index]) for k, index in trees.items()}
-    out = np.zeros(len(pairs))
-    for row, (a, b) in enumerate(pairs):
-        samples = middle[which == row]
-        samples = samples[:: max(1, len(samples) // 40)]
-        angles = []
-        sides = [search[int(k)].query_ball_point(samples, radius) for k in (a, b)]
-        for in_a, in_b in zip(*sides):
-            if len(in_a) < 3 or len(in_b) < 3:
-                continue
-            one, two = trees[int(a)][in_a], trees[int(b)][in_b]
-            normal_a, normal_b = normals[one].mean(axis=0), normals[two].mean(axis=0)
-            normal_a = normal_a / max(np.linalg.norm(normal_a), 1e-9)
-            normal_b = normal_b / max(np.linalg.norm(normal_b), 1e-9)
-            bend = np.degrees(np.arccos(np.clip(normal_a @ normal_b, -1, 1)))
-            across = points[two].mean(axis=0) - points[one].mean(axis=0)
-            angles.append(bend if (normal_a - normal_b) @ across > 0 else -bend)
-        out[row] = np.mean(np.clip(angles, -60, 90)) if angles else 0.0
-    return out
-
-
-def _only_compact(
-    graph: MeshGraph, body: np.ndarray, label: np.ndarray, contact: np.ndarray, config: InstancesConfig
-) -> np.ndarray:
-    """Give parts that are too small to be things back to a neighbor."""
-    for i in np.unique(label):
-        part = body[label == i]
-        extents = np.sort(np.ptp(graph.points[part], axis=0))
-        if extents[1] < config.min_object_m or len(part) < 2 * config.min_object_vertices:
-            neighbors = contact[(contact == i).any(axis=1)].ravel()
-            neighbors = neighbors[neighbors != i]
-            if len(neighbors):
-                sizes = [(label == n).sum() for n in neighbors]
-                label[label == i] = label[label == neighbors[int(np.argmax(sizes))]][0] if max(sizes) else i
-    return np.unique(label, return_inverse=True)[1]
+        return bool(level > _LIES_SHARE * self.perimeter[region])

@@ -1,5 +1,6 @@
 """Up-facing planar regions that carry things, and the test whether something stands on one or belongs to it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -10,6 +11,8 @@ from scipy.spatial import cKDTree
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.surface.levels import horizontal_levels, joined_levels
 from reconstruction.surface.mesh_graph import MeshGraph
+
+_MAX_GOES_ON = 0.4  # share of the known foot of a thing along which its side may go on below its support
 
 
 @dataclass(frozen=True)
@@ -99,8 +102,11 @@ def _merge_levels(graph: MeshGraph, levels: list[np.ndarray]) -> list[np.ndarray
 
     def of_one(i: int, j: int) -> bool:
         apart = np.maximum(boxes[i][0] - boxes[j][1], boxes[j][0] - boxes[i][1]).max()
-        alike = np.abs(np.median(graph.lab[levels[i]], 0) - np.median(graph.lab[levels[j]], 0)).max() < 25
         rise = abs(boxes[i][2] - boxes[j][2])
+        gap = np.abs(np.median(graph.lab[levels[i]], 0) - np.median(graph.lab[levels[j]], 0)).max()
+        alike = gap < (
+            25 if rise < 0.006 else 12
+        )  # the bottom of a tray is a little higher, and of another color
         return bool(alike and ((rise < 0.012 and apart < 0.06) or (rise < 0.008 and apart < 0.25)))
 
     return joined_levels(levels, of_one)
@@ -177,17 +183,11 @@ def _belongs_to_body(
     edge_cells = max(2, round(min(0.05, 0.2 * short_side) / cell))
     core = binary_erosion(support.footprint.filled, iterations=edge_cells)
     inner_print = Footprint(support.footprint.origin, cell, core, core)
-    # Continuation: right below the foot, outside the support, the same side goes on downwards.
-    points = graph.points[body]
-    below = (points[:, 2] < support.height_m - 0.012) & (points[:, 2] > support.height_m - 0.05)
-    side = below & (np.abs(graph.normals[body, 2]) < 0.6)
-    if side.any():
-        distance, _ = cKDTree(points[side, :2]).query(
-            foot[:, :2], distance_upper_bound=max(0.018, 1.8 * cell)
-        )
-        at_edge = 1.0 - inner_print.contains(foot[:, :2]).mean()
-        if np.isfinite(distance).mean() > 0.4 and color_gap < 30.0 and at_edge > 0.3:
-            return True
+    rests, goes_on = contact_shares(graph, body, support, candidate)
+    if goes_on > _MAX_GOES_ON * (rests + goes_on) and goes_on > 0.15 and color_gap < 30.0:
+        return True  # along much of its foot the same side goes on downwards, past the support
+    if rests > 0.5 and rests > 8.0 * goes_on and not _is_post(graph, candidate):
+        return False
     # Posts, arms and rims: the body's color, slim or along the edge of the support.
     gap = min(color_gap, _gap_to_sides(graph, body, support, candidate, foot))
     if gap < 9.0:
@@ -206,6 +206,77 @@ def _belongs_to_body(
     ):
         return True
     return ratio > 0.9 and color_gap < 8.0
+
+
+def contact_shares(
+    graph: MeshGraph, body: np.ndarray, support: SupportRegion, candidate: np.ndarray
+) -> tuple[float, float]:
+    """Return along what shares of a candidate's foot the support begins right outside it, and its side goes on below.
+
+    The rest of the foot is at holes of the surface or at other things. Sides of a container or the back of a seat stand
+    on the support inside, but go on below it outside; a thing that was put down stands on it all around.
+    """
+    inside = np.zeros(len(graph.points), bool)
+    inside[candidate] = True
+    of_body = np.zeros(len(graph.points), bool)
+    of_body[body] = True
+    edges = graph.edges[(inside[graph.edges].sum(axis=1) == 1) & of_body[graph.edges].all(axis=1)]
+    foot = np.unique(edges[inside[edges]])
+    foot = foot[graph.points[foot, 2] < support.height_m + 0.06]
+    if len(foot) == 0:
+        return 0.0, 0.0
+    outward = graph.normals[foot, :2]
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    z = graph.points[body, 2] - support.height_m
+    level = body[(np.abs(z) < 0.012) & (graph.normals[body, 2] > 0.75)]
+    level = level[~_encloses(graph, foot, level)]
+    side = body[(z < -0.012) & (z > -0.06) & (np.abs(graph.normals[body, 2]) < 0.6)]
+    rests = _reached(graph, foot, outward, level, 0.04, lambda step, out, _: (step * out).sum(axis=1) > 0.004)
+    goes_on = _reached(
+        graph, foot, outward, side, 0.025, lambda _, out, normal: (normal * out).sum(axis=1) > 0.5
+    )
+    return float((rests & ~goes_on).mean()), float((goes_on & ~rests).mean())
+
+
+def _encloses(graph: MeshGraph, foot: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return which of `others` lie within the outline of a foot, a centimetre or more inside."""
+    hull = cv2.convexHull(graph.points[foot, :2].astype(np.float32))
+    flat = graph.points[others, :2]
+    low, high = hull.min(axis=(0, 1)), hull.max(axis=(0, 1))
+    out = ((flat > low) & (flat < high)).all(axis=1)
+    for row in np.flatnonzero(out):
+        out[row] = cv2.pointPolygonTest(hull, (float(flat[row, 0]), float(flat[row, 1])), True) > 0.01
+    return out
+
+
+def _reached(
+    graph: MeshGraph,
+    foot: np.ndarray,
+    outward: np.ndarray,
+    targets: np.ndarray,
+    reach_m: float,
+    fits: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Return which foot vertices have a fitting target near; `fits` gets steps, outward and normals in plan."""
+    out = np.zeros(len(foot), bool)
+    if len(targets) == 0:
+        return out
+    near = cKDTree(graph.points[targets, :2]).query_ball_point(
+        graph.points[foot, :2], reach_m, return_sorted=True
+    )
+    rows = np.repeat(np.arange(len(foot)), [len(n) for n in near])
+    if len(rows) == 0:
+        return out
+    chosen = targets[np.concatenate([np.asarray(n, np.int64) for n in near if n])]
+    step = graph.points[chosen, :2] - graph.points[foot[rows], :2]
+    out[rows[fits(step, outward[rows], graph.normals[chosen, :2])]] = True
+    return out
+
+
+def _is_post(graph: MeshGraph, candidate: np.ndarray) -> bool:
+    """A slim upright on a support may be a part of it: a post, a divider."""
+    extents = np.ptp(graph.points[candidate], axis=0)
+    return bool(extents[:2].min() < 0.05 and extents[2] > 0.15)
 
 
 def _gap_to_sides(

@@ -1,0 +1,110 @@
+"""Small things on, in and beside others, on surfaces that are smooth and blurred where things touch."""
+
+import numpy as np
+import pytest
+from fused_surfaces import box, can, fused, tray
+from surfaces import frames_of
+
+from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.instances.splitting import split_touching
+from reconstruction.progress import NO_PROGRESS
+from reconstruction.surface.mesh_graph import MeshGraph
+
+WOOD, DARK, WHITE, RED, BLUE, GREEN = (
+    (205, 170, 115), (30, 40, 35), (235, 235, 230), (190, 30, 30), (40, 60, 190), (40, 140, 60)
+)  # fmt: skip
+TABLE = box((-0.4, -0.35, 0.0), (0.4, 0.35, 0.4), (120, 80, 50))
+
+
+def ids_at(surface, *points):
+    """Return the ids of the things at points, and what each rests on."""
+    posed, depth = frames_of(surface, 320, 240)
+    found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
+    nearest = [int(np.argmin(np.linalg.norm(surface.vertices - np.array(p), axis=1))) for p in points]
+    ids = [int(found.vertex_instance[i]) for i in nearest]
+    return ids, {o.id: o.support_hint for o in found.objects}
+
+
+def parts_of(solids, voxel_m=0.008):
+    """Return the split of what stands above the floor, and the graph."""
+    surface = fused(solids, voxel_m, half_m=0.25, top_m=0.45)
+    graph = MeshGraph.from_surface(surface)
+    return split_touching(graph, np.flatnonzero(graph.points[:, 2] > 0.01), InstancesConfig()), graph
+
+
+def part_at(parts, graph, point):
+    nearest = int(np.argmin(np.linalg.norm(graph.points - np.array(point), axis=1)))
+    return next(i for i, part in enumerate(parts) if nearest in part)
+
+
+def test_a_book_on_a_book_of_the_same_color_is_a_thing():
+    """The upper one is turned and smaller: the lower one begins all around its foot."""
+    lower_book = box((-0.15, -0.11, 0.4), (0.15, 0.11, 0.44), DARK)
+    upper_book = box((-0.1, -0.08, 0.44), (0.1, 0.08, 0.48), DARK, yaw_rad=0.4)
+    surface = fused([TABLE, lower_book, upper_book], top_m=0.6)
+    (table, lower, upper), rests = ids_at(surface, (-0.35, -0.3, 0.4), (0.14, 0.1, 0.44), (0, 0, 0.48))
+    assert len({table, lower, upper}) == 3
+    assert rests[upper] == lower
+    assert rests[lower] == table
+
+
+def test_things_in_a_tray_rest_on_it():
+    """Two cans, away from the sides and not, and the tray stays one."""
+    cans = [can((-0.1, 0.0), 0.035, 0.4, 0.52, RED), can((0.13, 0.08), 0.035, 0.4, 0.5, BLUE)]
+    surface = fused([TABLE, *tray((-0.2, -0.15, 0.4), (0.2, 0.15, 0.47), 0.012, WOOD), *cans], top_m=0.65)
+    points = (0.0, -0.1, 0.412), (-0.1, 0.0, 0.52), (0.13, 0.08, 0.5), (-0.2, 0.0, 0.44), (0.2, -0.1, 0.44)
+    (bottom, first, second, left, right), rests = ids_at(surface, *points)
+    assert len({bottom, first, second}) == 3
+    assert bottom == left == right
+    assert rests[first] == rests[second] == bottom
+
+
+@pytest.mark.parametrize("voxel_m", [0.005, 0.008])
+def test_touching_boxes_of_other_colors_are_cut_where_they_touch(voxel_m):
+    """Whatever the spacing of the mesh; and on the right side of the contact."""
+    parts, graph = parts_of(
+        [box((-0.1, -0.05, 0), (0.0, 0.05, 0.2), RED), box((0.0, -0.04, 0), (0.09, 0.06, 0.14), WHITE)],
+        voxel_m,
+    )
+    assert len(parts) == 2
+    high = parts[part_at(parts, graph, (-0.05, 0, 0.2))]
+    assert np.percentile(graph.points[high, 0], 98) < 0.012
+    other = parts[1 - part_at(parts, graph, (-0.05, 0, 0.2))]
+    assert np.percentile(graph.points[other, 0], 2) > -0.012
+
+
+@pytest.mark.parametrize(
+    "solids",
+    [
+        [box((-0.05, -0.05, 0), (0.05, 0.05, 0.1), RED), box((-0.05, -0.05, 0.1), (0.05, 0.05, 0.2), BLUE)],
+        [can((0, 0), 0.05, 0.0, 0.16, BLUE), box((0.04, -0.012, 0.05), (0.09, 0.012, 0.13), WHITE)],
+        [*tray((-0.15, -0.1, 0.0), (0.15, 0.1, 0.08), 0.014, WOOD)],
+        [box((-0.1, -0.05, 0), (0.0, 0.05, 0.2), WHITE), box((0.0, -0.05, 0), (0.09, 0.05, 0.14), WHITE)],
+    ],
+    ids=["a label", "a handle of another color", "the inside of a tray", "a step of one color"],
+)
+def test_one_thing_stays_whole(solids):
+    parts, _ = parts_of(solids)
+    assert len(parts) == 1
+
+
+def test_a_thing_amid_a_hole_of_its_table_rests_on_it():
+    """A glossy top that was not seen around the thing: the thing is in mid-air, at the height of the top."""
+    surface = fused([TABLE, box((-0.05, -0.04, 0.4), (0.05, 0.04, 0.55), GREEN)], top_m=0.65)
+    around = np.abs(surface.vertices[:, :2]).max(axis=1)
+    unseen = (np.abs(surface.vertices[:, 2] - 0.4) < 0.02) & (around < 0.16)
+    kept = ~unseen[surface.faces].any(axis=1)
+    holed = surface.__class__(**{**vars(surface), "faces": surface.faces[kept]})
+    (table, thing), rests = ids_at(holed, (-0.35, -0.3, 0.4), (0, 0, 0.55))
+    assert thing not in (0, table)
+    assert rests[thing] == table
+
+
+def test_the_back_of_a_seat_stays_with_it():
+    """It stands on the seat in front, but its back goes on below it."""
+    surface = fused(
+        [box((-0.2, -0.2, 0.0), (0.2, 0.2, 0.25), WOOD), box((-0.2, 0.15, 0.2), (0.2, 0.2, 0.5), WOOD)],
+        top_m=0.65,
+    )
+    (seat, back), _ = ids_at(surface, (0, -0.1, 0.25), (0, 0.15, 0.4))
+    assert seat == back
