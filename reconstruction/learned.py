@@ -13,6 +13,7 @@ from registry.errors import EnvironmentMissing
 
 EXTRA = "models"
 _MISSING_SHARE = 0.05
+_MASKS_AT_ONCE = 32
 
 
 @dataclass(frozen=True)
@@ -128,11 +129,13 @@ class SquareImages:
         return torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]
 
 
-def upsample(maps: Any, height: int, width: int) -> np.ndarray:
-    """Return float32 (k, height, width) of a tensor (k, h, w), bilinear."""
+def masks_of(logits: Any, height: int, width: int) -> np.ndarray:
+    """Return masks bool (k, height, width): where mask logits, a tensor (k, h, w), are positive between its pixels."""
     import torch
 
-    if not len(maps):
-        return np.zeros((0, height, width), np.float32)
-    larger = torch.nn.functional.interpolate(maps[None].float(), (height, width), mode="bilinear")
-    return larger[0].cpu().numpy()
+    out = np.zeros((len(logits), height, width), bool)
+    for first in range(0, len(logits), _MASKS_AT_ONCE):
+        some = logits[None, first : first + _MASKS_AT_ONCE].float()
+        larger = torch.nn.functional.interpolate(some, (height, width), mode="bilinear", align_corners=False)
+        out[first : first + _MASKS_AT_ONCE] = (larger[0] > 0).cpu().numpy()
+    return out

@@ -218,11 +218,7 @@ class Run:
         if stage.name == "surface":
             return module.fuse_surface(posed, depth, config, progress=progress)
         if stage.name == "instances":
-            namer = module.load_namer(config)  # first, so that what it lacks is said before the work is done
-            found = module.find_instances(posed, depth, done["surface"], config, progress=progress)
-            return (
-                module.name_instances(namer, found, posed, progress=progress) if namer is not None else found
-            )
+            return module.make_instances(posed, depth, done["surface"], config, progress=progress)
         return module.build_assets(
             posed, depth, done["surface"], done["instances"], config, progress=progress
         )

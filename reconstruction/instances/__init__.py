@@ -5,6 +5,7 @@ from reconstruction.instances.find import find_instances
 from reconstruction.instances.naming import load_namer, name_instances
 from reconstruction.instances.outside import backends, outside_inputs
 from reconstruction.instances.overrides import apply_overrides
+from reconstruction.instances.stage import make_instances
 
 VERSION = 3
 
@@ -16,6 +17,7 @@ __all__ = [
     "backends",
     "find_instances",
     "load_namer",
+    "make_instances",
     "name_instances",
     "outside_inputs",
 ]

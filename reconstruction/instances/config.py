@@ -22,6 +22,9 @@ class InstancesConfig:
     masks_concepts: str = ""
     """For `sam3`: comma-separated things to look for ("chair, cup"); empty is everything, from a grid of points."""
 
+    masks_points: int = 32
+    """For `sam2` and `sam3` without concepts: points along each side of the grid; the time grows with their square."""
+
     labels: Literal["embedded", "clip", "vlm"] = "embedded"
     """Who names things: `embedded` (coarse classes from shape and place), `clip` (any words, through transformers) or
     `vlm` (an OpenAI-compatible endpoint, see `SIMRECON_VLM_URL`)."""

@@ -33,8 +33,7 @@ def folders(tmp_path_factory):
 
 @pytest.fixture
 def open_filters(monkeypatch):
-    """Random weights are sure of nothing: let all their masks through, and ask for few."""
-    monkeypatch.setattr(sam, "_POINTS_A_SIDE", 4)
+    """Random weights are sure of nothing: let all their masks through."""
     monkeypatch.setattr(sam, "_POINTS_A_BATCH", 6)
     for module, names in (
         (sam, ("_MIN_TRUST", "_MIN_STABILITY", "_MIN_CONCEPT_SCORE")),
@@ -108,7 +107,6 @@ def test_learned_masks_keep_the_promises_of_the_seam(name, folders) -> None:
 
 @pytest.mark.parametrize("name", LEARNED)
 def test_masks_of_which_a_model_is_not_sure_are_left_out(name, folders, monkeypatch) -> None:
-    monkeypatch.setattr(sam, "_POINTS_A_SIDE", 2)
     monkeypatch.setattr(sam, "_MIN_TRUST", 1.1)
     monkeypatch.setattr(sam, "_MIN_CONCEPT_SCORE", 1.1)
     monkeypatch.setattr(mask2former, "_MIN_SCORE", 1.1)
@@ -149,7 +147,7 @@ def test_the_grid_is_the_middle_of_equal_cells() -> None:
 
 @pytest.mark.usefixtures("open_filters")
 def test_batches_of_points_do_not_change_the_masks(folders, monkeypatch) -> None:
-    segmenter = sam.PointGridMasks(ModelRequest(folders["sam2"], "masks", "masks_model"), "Sam2Model")
+    segmenter = sam.PointGridMasks(ModelRequest(folders["sam2"], "masks", "masks_model"), "Sam2Model", 4)
     image = noise()[0]
     together = segmenter.segment(image)
     monkeypatch.setattr(sam, "_POINTS_A_BATCH", 16)

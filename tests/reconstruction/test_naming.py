@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 import tiny_models
 from chat_server import Server, chat
+from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
 
-from reconstruction.instances import InstancesConfig, backends, load_namer, name_instances, outside_inputs
+from reconstruction.instances import (
+    InstancesConfig,
+    backends,
+    load_namer,
+    make_instances,
+    name_instances,
+    outside_inputs,
+)
 from reconstruction.instances.naming import Name, apply_names, best_views, collage
 from reconstruction.instances.naming.clip import choose, read_vocabulary
 from reconstruction.instances.naming.vlm import VlmNamer
@@ -280,6 +288,25 @@ def test_an_endpoint_that_is_away_is_noted_once(server) -> None:
 
 
 # ---- The stage.
+
+
+def test_the_stage_finds_things_and_has_them_named(server, monkeypatch) -> None:
+    surface = surface_from(
+        merged(floor_sheet((200, 200, 190)), solid_box((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4), (120, 80, 50)))
+    )
+    posed, depth = frames_of(surface, 160, 120)
+    server.responses = [chat('{"id": 2, "label": "crate", "certainty": "likely"}')]
+    monkeypatch.setenv("SIMRECON_VLM_URL", server.url)
+    monkeypatch.setenv("SIMRECON_VLM_MODEL", "tiny-vl")
+    watcher = Notes()
+    plain = make_instances(posed, depth, surface, InstancesConfig(), progress=watcher)
+    named = make_instances(posed, depth, surface, InstancesConfig(labels="vlm"), progress=watcher)
+    assert [(o.id, o.label, o.label_confidence) for o in named.objects] == [(2, "crate", 0.5)]
+    assert [o.id for o in plain.objects] == [2]
+    assert plain.objects[0].label != "crate"
+    assert np.array_equal(named.vertex_instance, plain.vertex_instance)
+    assert np.array_equal(named.id_maps, plain.id_maps)
+    assert "labels: tiny-vl named 1 of 1 objects" in watcher.notes
 
 
 def test_embedded_labels_need_nothing(monkeypatch) -> None:

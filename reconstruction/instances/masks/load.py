@@ -35,4 +35,5 @@ def _load_segmenter(config: InstancesConfig) -> ImageSegmenter:
     concepts = tuple(word.strip() for word in config.masks_concepts.split(",") if word.strip())
     if config.masks == "sam3" and concepts:
         return ConceptMasks(request, concepts)
-    return PointGridMasks(request, "Sam2Model" if config.masks == "sam2" else "Sam3TrackerModel")
+    class_name = "Sam2Model" if config.masks == "sam2" else "Sam3TrackerModel"
+    return PointGridMasks(request, class_name, config.masks_points)

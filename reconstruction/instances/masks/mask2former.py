@@ -3,7 +3,7 @@
 import numpy as np
 
 from reconstruction.instances.masks.base import flatten_masks
-from reconstruction.learned import ModelRequest, load_model, load_part, upsample
+from reconstruction.learned import ModelRequest, load_model, load_part, masks_of
 
 _MIN_SCORE = 0.5
 
@@ -38,5 +38,5 @@ class QueryMasks:
             sure = (logits.sigmoid() * inside).flatten(1).sum(1) / inside.flatten(1).sum(1).clamp(min=1)
             score = classes * sure
             good = score > _MIN_SCORE
-            masks = upsample(logits[good], *image.shape[:2]) > 0
+            masks = masks_of(logits[good], *image.shape[:2])
         return flatten_masks(masks, score[good].float().cpu().numpy())

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from reconstruction.instances.masks.base import flatten_masks
-from reconstruction.learned import ModelRequest, SquareImages, load_model, load_part, upsample
+from reconstruction.learned import ModelRequest, SquareImages, load_model, load_part, masks_of
 
-_POINTS_A_SIDE, _POINTS_A_BATCH = 32, 64
+_POINTS_A_BATCH = 64
 _MIN_TRUST = 0.8  # IoU that the model expects of its mask with the truth
 _MIN_STABILITY, _STABILITY_OFFSET = 0.95, 1.0  # IoU of the masks at thresholds that far above and below 0
 _DOUBLE = 0.7  # boxes with a larger IoU are of one thing
@@ -24,7 +24,7 @@ _TEXT_TOKENS = 32  # what SAM 3 was trained with
 class PointGridMasks:
     """SAM 2, or the tracker half of SAM 3, prompted with a grid of points: an `ImageSegmenter`."""
 
-    def __init__(self, request: ModelRequest, class_name: str) -> None:
+    def __init__(self, request: ModelRequest, class_name: str, points_a_side: int) -> None:
         """Load `Sam2Model` or `Sam3TrackerModel`.
 
         Raises:
@@ -32,13 +32,14 @@ class PointGridMasks:
         """
         self._model = load_model(request, class_name)
         self._square = SquareImages(request, _side(self._model.config.prompt_encoder_config.image_size))
+        self._grid = point_grid(points_a_side) * self._square.side_px
         self.name = request.model
 
     def segment(self, image: np.ndarray) -> np.ndarray:
         """See `ImageSegmenter.segment`."""
         import torch
 
-        points = torch.from_numpy(point_grid(_POINTS_A_SIDE) * self._square.side_px).to(self._model.device)
+        points = torch.from_numpy(self._grid).to(self._model.device)
         kept, scores = [], []
         with torch.inference_mode():
             pixels = self._square(image).to(self._model.device)
@@ -56,7 +57,7 @@ class PointGridMasks:
                 scores.append(trust[good])
             logits, trust = torch.cat(kept), torch.cat(scores).float().cpu().numpy()
             rows = without_doubles(boxes_of((logits > 0).cpu().numpy()), trust)
-            masks = upsample(logits[torch.from_numpy(rows).to(logits.device)], *image.shape[:2]) > 0
+            masks = masks_of(logits[torch.from_numpy(rows).to(logits.device)], *image.shape[:2])
         return flatten_large(masks, trust[rows])
 
 
@@ -100,7 +101,7 @@ class ConceptMasks:
                 out = self._model(vision_embeds=vision, text_embeds=text, attention_mask=seen)
                 score = out.pred_logits[0].sigmoid() * out.presence_logits[0].sigmoid()
                 good = score > _MIN_CONCEPT_SCORE
-                masks.append(upsample(out.pred_masks[0][good], *image.shape[:2]) > 0)
+                masks.append(masks_of(out.pred_masks[0][good], *image.shape[:2]))
                 scores.append(score[good].float().cpu().numpy())
         return flatten_large(np.concatenate(masks), np.concatenate(scores))
 
