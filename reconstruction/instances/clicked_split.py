@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import Surface
 
-_COLOR_STEP, _FOLD_RAD = 5.0, 0.30  # CIELAB and angle across an edge that double its length
+_COLOR_STEP, _FOLD_RAD = 5.0, 0.10  # CIELAB and inward angle across an edge that double its length
+_FLAT_RAD = 0.08  # smaller folds are noise
 _BRIDGE = (
     3.0  # pieces closer than this many vertex spacings are joined; a bridge counts four times its length
 )
@@ -68,7 +69,7 @@ def _lengths(graph: MeshGraph, edges: np.ndarray) -> np.ndarray:
     color = np.linalg.norm(graph.lab[a] - graph.lab[b], axis=1) / _COLOR_STEP
     # Normals that lean towards each other: the surface is concave there.
     fold = ((graph.normals[a] - graph.normals[b]) * along).sum(axis=1) / length
-    concave = np.maximum(fold, 0.0) / _FOLD_RAD
+    concave = np.maximum(fold - _FLAT_RAD, 0.0) / _FOLD_RAD
     return length * (1 + color**2 + concave**2)
 
 

@@ -139,6 +139,8 @@ def _furniture(width: float, depth: float, height: float, facts: ShapeFacts) -> 
 
 
 def _small_thing(width: float, depth: float, height: float, facts: ShapeFacts) -> tuple[str, float]:
+    if max(width, height) > 0.7:
+        return UNKNOWN
     slender = height / max(width, 1e-3)
     square = facts.squareness > 0.27
     if facts.greenness > 0.5 and height > 0.1 and not square and facts.outward < 0.8:
@@ -155,7 +157,7 @@ def _small_thing(width: float, depth: float, height: float, facts: ShapeFacts) -
         return ("cup", 0.5) if facts.hollow else UNKNOWN
     if slender < 1.55:
         return ("can", 0.35) if facts.flat_top_share > 0.3 and width < 0.13 else UNKNOWN
-    return "bottle", 0.35
+    return ("bottle", 0.35) if height < 0.45 else UNKNOWN
 
 
 def _square_thing(width: float, depth: float, height: float, facts: ShapeFacts) -> tuple[str, float]:

@@ -15,6 +15,8 @@ from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.errors import UsageError
 
+_STEP_M = 0.03  # a part this much higher than the lowest may rest on it
+
 
 def apply_overrides(
     found: InstanceSet, surface: Surface, overrides: list[dict], footage: Footage | None = None
@@ -138,8 +140,23 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
     others = tuple(parts[0] if o.id == item.id else o for o in found.objects)
     out = replace(found, vertex_instance=labels, id_maps=maps, objects=(*others, *parts[1:]))
     graph = MeshGraph.from_surface(surface)
-    for each in parts:
-        out = _with(out, _renamed_by_shape(_refit(each, out, surface), out, graph))
+    fitted = _stacked([_refit(part, out, surface) for part in parts])
+    for part in fitted:
+        out = _with(out, part)
+    for part in fitted:
+        out = _with(out, _renamed_by_shape(part, out, graph))
+    return out
+
+
+def _stacked(parts: list[Instance]) -> list[Instance]:
+    """Let parts that lie over the lowest one rest on it; the others keep what the whole rested on."""
+    bottoms = [float(part.center[2] - 0.5 * part.extents_m[2]) for part in parts]
+    lowest = parts[int(np.argmin(bottoms))]
+    out = []
+    for part, bottom in zip(parts, bottoms):
+        away = np.linalg.norm(part.center[:2] - lowest.center[:2])
+        over = away < 0.5 * np.linalg.norm(lowest.extents_m[:2]) and bottom > min(bottoms) + _STEP_M
+        out.append(replace(part, support_hint=lowest.id) if over and not part.attached_hint else part)
     return out
 
 

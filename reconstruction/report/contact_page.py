@@ -101,6 +101,6 @@ def overrides_template(sheet: ContactSheet) -> str:
     ]
     for number, item in sheet.objects.items():
         label, confidence, size, held = sheet.facts(number)
-        lines.append(f"# {number}: {label} ({confidence}), {size}, {held}")
+        lines.append(f"# {number}: {label}{f' ({confidence})' if confidence else ''}, {size}, {held}")
         lines.append(f"# - {{{anchor_text(item)}, relabel: {json.dumps(item['label'])}}}")
     return "\n".join(lines) + "\n"

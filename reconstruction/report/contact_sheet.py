@@ -3,8 +3,10 @@
 Everything comes from the bundle: `instances/` holds frames that show each thing well (`reconstruction.instance_views`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -49,16 +51,19 @@ class ContactSheet:
                 f"{bundle.scene['id']}: its bundle holds no frames for contact sheets; run its `simrecon reconstruct` "
                 "command again (what is cached is not computed again)"
             )
+        return cls.read(bundle.scene, bundle.resolve)
+
+    @classmethod
+    def read(cls, scene: dict, resolve: Callable[[str], Path]) -> "ContactSheet":
+        """Read the frames that `instances.frames` of a scene names; `resolve` says where a file lies."""
         frames = []
-        for entry in bundle.scene["instances"]["frames"]:
-            image = cv2.imread(str(bundle.resolve(entry["image"])), cv2.IMREAD_COLOR)
-            ids = cv2.imread(str(bundle.resolve(entry["ids"])), cv2.IMREAD_UNCHANGED)
+        for entry in scene["instances"]["frames"]:
+            image = cv2.imread(str(resolve(entry["image"])), cv2.IMREAD_COLOR)
+            ids = cv2.imread(str(resolve(entry["ids"])), cv2.IMREAD_UNCHANGED)
             if image is None or ids is None or ids.ndim != 2:
-                raise BundleError(
-                    f"bundle {bundle.root}: {entry['image']} or {entry['ids']} is no such picture"
-                )
+                raise BundleError(f"{scene['id']}: {entry['image']} or {entry['ids']} is no such picture")
             frames.append(SheetFrame(entry["index"], image[..., ::-1].copy(), ids.astype(np.uint16)))
-        return cls(bundle.scene, tuple(frames))
+        return cls(scene, tuple(frames))
 
     @cached_property
     def objects(self) -> dict[int, dict]:
@@ -87,7 +92,8 @@ class ContactSheet:
         how = {"supported_by": "on", "attached_to": "fixed to"}
         held = f"{how[edge['relation']]} {shortened(names[edge['parent']])} {edge['parent']}" if edge else ""
         size = " x ".join(f"{100 * side:.0f}" for side in item["scale"]) + " cm"
-        return shortened(item["label"]), f"{item['label_confidence']:.0%}", size, held
+        sure = "" if item["label"] == "unknown" else f"{item['label_confidence']:.0%}"
+        return shortened(item["label"]), sure, size, held
 
 
 def shortened(label: str) -> str:
