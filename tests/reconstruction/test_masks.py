@@ -24,6 +24,13 @@ SAVED = {
 LEARNED = ("sam2", "sam3", "sam3 of concepts", "mask2former")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Tiny models gain nothing from threads, and lose much to them on a busy machine."""
+    with tiny_models.one_thread():
+        yield
+
+
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     """One folder a kind of model, saved once."""

@@ -152,6 +152,13 @@ def test_what_files_could_stumble_over_is_no_label(label) -> None:
 # ---- CLIP.
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Tiny models gain nothing from threads, and lose much to them on a busy machine."""
+    with tiny_models.one_thread():
+        yield
+
+
 def test_confidence_is_the_margin_over_all_views() -> None:
     words = ("cup", "bowl", "box")
     sure = np.array([[0.7, 0.2, 0.05, 0.05], [0.6, 0.2, 0.1, 0.1]])

@@ -1,12 +1,25 @@
 """Learned models of a few thousand random parameters, saved as the real ones are, for tests of what loads them."""
 
 import json
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 SIDE = 64  # px, of what they look at
 WORDS = ("a", "photo", "of", "table", "chair", "cup", "lamp", "box")
+
+
+@contextmanager
+def one_thread():
+    """Let torch compute with one thread."""
+    torch = pytest.importorskip("torch")
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def random_weights(model, seed: int = 0):
@@ -138,7 +151,12 @@ def save_mask2former(folder: Path) -> str:
     )  # fmt: skip
     random_weights(transformers.Mask2FormerForUniversalSegmentation(config)).save_pretrained(folder)
     size = {"shortest_edge": SIDE, "longest_edge": 2 * SIDE}
-    transformers.Mask2FormerImageProcessorPil(size=size, size_divisor=32).save_pretrained(folder)
+    settings = {
+        "image_processor_type": "Mask2FormerImageProcessor",
+        "size": size,
+        "size_divisor": 32,
+    }  # as on the hub
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
     return str(folder)
 
 
@@ -153,5 +171,10 @@ def save_clip(folder: Path) -> str:
     random_weights(transformers.CLIPModel(config)).save_pretrained(folder)
     save_tokenizer(folder)
     size, crop = {"shortest_edge": 32}, {"height": 32, "width": 32}
-    transformers.CLIPImageProcessorPil(size=size, crop_size=crop).save_pretrained(folder)
+    settings = {
+        "feature_extractor_type": "CLIPFeatureExtractor",
+        "size": size,
+        "crop_size": crop,
+    }  # as on the hub
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
     return str(folder)

@@ -86,7 +86,9 @@ def _spread_out(score: np.ndarray, directions: np.ndarray, count: int) -> list[i
 def _crop(image: np.ndarray, mask: np.ndarray, row: int) -> ObjectView:
     """Cut an object out of its keyframe; the mask (h, w) may have another resolution than the image."""
     height, width = image.shape[:2]
-    large = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    large = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+    if not large.any():  # scattered pixels
+        large = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     ys, xs = np.nonzero(large.any(axis=1))[0], np.nonzero(large.any(axis=0))[0]
     pad_y, pad_x = (round(_MARGIN * (axis[-1] - axis[0] + 1)) + 4 for axis in (ys, xs))
     window = (
