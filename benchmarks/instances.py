@@ -6,8 +6,8 @@
 
 Until `instances`, captures are reconstructed up to that stage only and its own boxes are measured; stages before it
 come from the work folder that `python -m benchmarks.run` uses, too, so that after a change of the stage a capture takes
-seconds. Until `scene`, everything is as `benchmarks.run` does and keeps it. Captures are pooled by the folder that they
-lie in.
+seconds. Until `scene`, everything is as `benchmarks.run` does and keeps it, and the stage is measured as well. Captures
+are pooled by the folder that they lie in.
 """
 
 import argparse
@@ -279,7 +279,11 @@ def _run(arguments: argparse.Namespace) -> int:
     names = arguments.variants or ([] if arguments.variant else ["default"])
     variants, out = choose_variants(names, arguments.variant), arguments.out.resolve()
     stage_only = arguments.until == "instances"
-    failed = (measure_stages if stage_only else measure_scenes)(captures, variants, out, arguments)
+    failed = 0 if stage_only else measure_scenes(captures, variants, out, arguments)
+    if (
+        stage_only or not arguments.discard_stages
+    ):  # after a whole scene, the stage's own boxes only need measuring
+        failed += measure_stages(captures, variants, out, arguments)
     if arguments.dry_run:
         return 0
     if arguments.growth:
