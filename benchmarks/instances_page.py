@@ -154,8 +154,17 @@ def _missed(results: Sequence[Measured]) -> list[str]:
             if not r["found_25"]:
                 gap = "–" if r["gap_cm"] is None else f"{r['gap_cm']:.1f}"
                 cells = [m.capture, m.variant, r["name"], r["support"], f"{r['longest_side_cm']:.0f}", gap]
-                rows.append([*cells, f"{r['box_iou']:.2f}"])
-    heads = ["capture", "variant", "object", "on", "longest side cm", "gap cm", "best box IoU"]
+                rows.append([*cells, f"{r['visible_pixels']:,}", f"{r['box_iou']:.2f}"])
+    heads = [
+        "capture",
+        "variant",
+        "object",
+        "on",
+        "longest side cm",
+        "gap cm",
+        "pixels in all frames",
+        "best box IoU",
+    ]
     return ["", "### Missed at 0.25", "", *(table_lines(heads, rows, 4) if rows else ["Nothing."])]
 
 

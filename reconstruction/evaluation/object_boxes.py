@@ -61,6 +61,7 @@ def object_records(
                 "true_id": entity.id,
                 "name": entity.name,
                 "label": entity.label,
+                "visible_pixels": entity.visible_pixels,
                 "longest_side_cm": 100 * fact.longest_side_m,
                 "support": fact.support,
                 "gap_cm": None if fact.neighbor is None else 100 * fact.gap_m,

@@ -15,6 +15,7 @@ def record(name: str, side_cm: float, support: str, gap_cm: float | None, iou: f
     return {
         "true_id": 1,
         "name": name,
+        "visible_pixels": 5000,
         "longest_side_cm": side_cm,
         "support": support,
         "gap_cm": gap_cm,
@@ -84,7 +85,7 @@ def test_the_page_has_the_pool_the_captures_and_the_three_breakdowns():
 def test_misses_are_named_with_what_makes_them_hard():
     page = render(RESULTS, [], None, CODE)
     (missed,) = [cells for cells in rows(page, "one") if "mug" in cells]
-    assert missed == ["one", "default", "mug", "thing", "12", "1.5", "0.10"]
+    assert missed == ["one", "default", "mug", "thing", "12", "1.5", "5,000", "0.10"]
     assert not [cells for cells in rows(page, "two") if "plate" in cells]
 
 
