@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from reconstruction.cli import build_parser
+from reconstruction.overrides import Overrides
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -43,3 +44,13 @@ def test_make_targets_of_the_docs_exist():
     for page in PAGES:
         named = set(re.findall(r"^(?:    |)(?:make) ([\w-]+)", page.read_text(), re.MULTILINE))
         assert named <= targets, f"{page.name} names {named - targets}"
+
+
+def test_the_overrides_that_are_shown_are_legal(tmp_path):
+    shown = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "overrides.md").read_text(), re.DOTALL)
+    assert shown
+    for number, text in enumerate(shown):
+        path = tmp_path / f"{number}.yaml"
+        path.write_text(text)
+        assert len(Overrides.load(path).entries) >= 10
+    assert Overrides.load(ROOT / "examples" / "data" / "demo_fixes.yaml").entries

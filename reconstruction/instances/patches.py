@@ -125,7 +125,7 @@ def contacts_of(graph: MeshGraph, body: np.ndarray, links: np.ndarray, patch: np
     level = np.zeros((len(middle), 2))
     around = cKDTree(points).query_ball_point(middle, _SIDE_M, return_sorted=True)
     for row, near in enumerate(around):
-        near = np.asarray(near)
+        near = np.asarray(near, np.int64)  # of a coarse mesh there may be none
         owner = patch[near]
         one, two = near[owner == ends[row, 0]], near[owner == ends[row, 1]]
         if len(one) < 3 or len(two) < 3:

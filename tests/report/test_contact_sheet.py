@@ -45,12 +45,41 @@ def test_every_thing_is_outlined_and_numbered_where_its_anchor_is(sheet):
         assert colored(legend, sheet.colors[number], reach=12)
 
 
-def test_anchors_mean_the_things_that_they_stand_beside(sheet, reconstructed):
-    _, stages = reconstructed.open()
+def pointer_into(stages) -> Pointer:
+    """Return what clicks are looked up in after a run."""
     posed, depth = stages.in_world()
-    found, surface = stages.get("instances"), stages.get("surface")
+    surface = stages.get("surface")
     lens = Lens.measure(stages.get("frames"), stages.get("poses"))
-    pointer = Pointer(found, surface, Footage(posed, depth, surface, lens))
+    return Pointer(stages.get("instances"), surface, Footage(posed, depth, surface, lens))
+
+
+def test_later_stages_take_clicks_too(sheet, reconstructed):
+    """Mass by a click; a parent by a click on another thing, or on the floor."""
+    _, stages = reconstructed.open()
+    pointer, assets, graph = pointer_into(stages), stages.get("assets"), stages.get("scene_graph")
+    small, other = list(sheet.objects.values())[-2:]
+    clicks = [{"pixel": item["anchor"]} for item in (small, other)]
+    heavy = Overrides([{**clicks[0], "mass_kg": 7.5}]).apply_to_assets(assets, pointer)
+    changed = [a.id for a, b in zip(heavy.objects, assets.objects) if a.physics.mass_kg != b.physics.mass_kg]
+    assert changed == [small["id"]]
+    moved = Overrides([{**clicks[0], "parent": clicks[1]}]).apply_to_graph(graph, assets, pointer)
+    edge = next(e for e in moved.edges if e.child == small["id"])
+    assert (edge.parent, edge.evidence) == (other["id"], "user")
+    floor = next(b for b in pointer.found.base if b.label == "floor")
+    shown = np.argwhere(np.asarray(pointer.found.id_maps[0]) == floor.id)
+    row, column = shown[len(shown) // 2]
+    height, width = pointer.found.id_maps.shape[1:]
+    frame = int(pointer.footage.posed.indices[0])
+    there = {"frame": frame, "x": column + 0.5, "y": row + 0.5, "size": [width, height]}
+    there = {key: value if isinstance(value, list) else float(value) for key, value in there.items()}
+    moved = Overrides([{**clicks[0], "parent": {"pixel": there}}]).apply_to_graph(graph, assets, pointer)
+    assert next(e for e in moved.edges if e.child == small["id"]).parent == floor.id
+    with pytest.raises(UsageError, match="shows the floor"):
+        Overrides([{"pixel": there, "mass_kg": 1.0}]).apply_to_assets(assets, pointer)
+
+
+def test_anchors_mean_the_things_that_they_stand_beside(sheet, reconstructed):
+    pointer = pointer_into(reconstructed.open()[1])
     for number, item in sheet.objects.items():
         address = parse_address(yaml.safe_load("{" + anchor_text(item) + "}"), "")
         assert address.kind == "pixel"
