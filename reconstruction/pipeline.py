@@ -314,6 +314,10 @@ def reconstruct(
     video = Path(video)
     if not video.exists():
         raise UsageError(f"{video}: no such file or folder")
+    if config is not None and config.instances.masks == "folder":
+        from reconstruction.instances.masks import load_mask_backend
+
+        load_mask_backend(config.instances)  # a wrong folder is said now, not minutes later
     registry = SceneRegistry(registry_root, create=True)
     holder = registry.hold(scene_id) if scene_id is not None else registry.reserve_next_id()
     with holder as held_id:

@@ -18,6 +18,7 @@ from reconstruction.cache import canonical_json
 from reconstruction.gaussians import write_ply
 from reconstruction.instance_views import write_views
 from reconstruction.instances import backends as instance_backends
+from reconstruction.instances.gaussian_ids import add_instances_to_ply, gaussian_instances
 from reconstruction.preview import render_preview
 from reconstruction.profiling import OTHER, PUBLISH, Usage, UsageMeter
 from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
@@ -153,6 +154,11 @@ def _cameras(posed: PosedFrames) -> dict:
 def _gaussians(run: "Run", folder: Path) -> dict:
     gaussians = run.results["gaussians"].in_world(run.results["world"])
     write_ply(gaussians, folder / "gaussians.ply")
+    found, kept = run.results["instances"], run.results["assets"]
+    published = [item.id for item in (*kept.base, *kept.objects)]
+    labels = np.where(np.isin(found.vertex_instance, published), found.vertex_instance, 0)
+    instances = gaussian_instances(gaussians.means, run.results["surface"].vertices, labels)
+    add_instances_to_ply(folder / "gaussians.ply", instances)
     return {"file": "gaussians.ply", "count": len(gaussians)}
 
 

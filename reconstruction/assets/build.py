@@ -1,5 +1,7 @@
 """Stage 7: every instance becomes a closed, textured object with collision shape and mass; base surfaces get looks."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from reconstruction.assets import completion, solid, texture
@@ -25,6 +27,8 @@ from reconstruction.types import (
     Surface,
 )
 from registry.geometry import rigid, transform_points
+
+_COVERED_SHARE = 0.75  # of what was seen, along each axis
 
 
 def build_assets(
@@ -157,6 +161,9 @@ def object_solid(
     volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))
     field = completion.complete(volume, frame, config, furniture=furniture)
     body = solid.extract(field)
+    if field.symmetries and not _covers(body, frame):
+        field = completion.complete(volume, frame, replace(config, symmetry=False), furniture=furniture)
+        body = solid.extract(field)
     if body is None or body.volume < 1e-7:
         return *box_fallback(item, seen.points), "box-fallback"
     if frame.wall_y is None:
@@ -169,6 +176,14 @@ def object_solid(
     budget = config.faces_furniture if furniture else config.faces_small
     body = solid.lighten(body, budget, 0.3 * volume.voxel_m)
     return body, frame, "observed+" + ("+".join(field.symmetries) or "carved")
+
+
+def _covers(body: Solid | None, frame: ObjectFrame) -> bool:
+    """Tell whether a body is as large as what was seen: a wrong symmetry frees what was there."""
+    if body is None:
+        return False
+    seen = np.ptp(np.percentile(frame.points, [3, 97], axis=0), axis=0)
+    return bool((body.extents > _COVERED_SHARE * seen).all())
 
 
 def box_fallback(item: Instance, points: np.ndarray) -> tuple[Solid, ObjectFrame]:

@@ -4,8 +4,10 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.describe import describe
 from reconstruction.instances.id_maps import render_id_maps
+from reconstruction.instances.mask_cut import cut_by_masks
+from reconstruction.instances.masks import load_mask_backend
 from reconstruction.instances.rules import cut_by_rules
-from reconstruction.instances.scraps import without_fragments, without_unseen
+from reconstruction.instances.scraps import without_unseen
 from reconstruction.progress import Progress
 from reconstruction.types import DepthMaps, InstanceSet, PosedFrames, Surface
 
@@ -19,23 +21,28 @@ def find_instances(
         posed: keyframes with cameras in world space.
         depth: their depth in metres.
         surface: the fused surface in world space, floor at z = 0, walls roughly along the axes.
-        config: thresholds.
+        config: where the cut comes from, and thresholds.
         progress: told of decisions: a floor that had to be assumed, an empty room.
+
+    Raises:
+        UsageError: a folder of masks does not fit the capture.
+        EnvironmentMissing: the learned masks asked for need something that is not here.
 
     Returns:
         The instances; ids count from 1, base entities first (floor, walls, ceiling), then objects by size.
     """
+    backend = load_mask_backend(config)
+    masks = None if backend is None else backend.frame_masks(posed, depth, progress=progress)
     progress.start(3, "base planes and things")
     shell = Shell.of(surface, progress)
     progress.advance()
-    cut = cut_by_rules(shell, posed, depth, config, progress)
+    if masks is None:
+        cut = cut_by_rules(shell, posed, depth, config, progress)
+    else:
+        cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     progress.advance()
-    things = without_fragments(shell.graph, cut.things, shell.base[0].observed, config, progress)
     vertex_instance = cut.owner.copy()
-    for thing in things:
-        if thing.attached:
-            vertex_instance[thing.vertices] = 0
-    objects = describe(shell.graph, things, shell.base, vertex_instance)
+    objects = describe(shell.graph, cut.things, shell.base, vertex_instance)
     progress.advance()
     if not objects:
         progress.note("No separate things were found: the scene is an empty room.")

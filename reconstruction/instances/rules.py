@@ -7,6 +7,7 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.feet import merge_feet
 from reconstruction.instances.pictures import find_pictures
+from reconstruction.instances.scraps import without_fragments
 from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.stands import merge_stands
 from reconstruction.progress import Progress
@@ -33,7 +34,12 @@ def cut_by_rules(
         owner[vertices] = number
     owner[hung] = 0
     things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
-    return Cut(merge_stands(graph, merge_feet(graph, things, progress), progress), owner)
+    things = merge_stands(graph, merge_feet(graph, things, progress), progress)
+    things = without_fragments(graph, things, shell.base[0].observed, config, progress)
+    for thing in things:
+        if thing.attached:
+            owner[thing.vertices] = 0
+    return Cut(things, owner)
 
 
 def _pictures(

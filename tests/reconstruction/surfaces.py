@@ -22,10 +22,10 @@ class Patchwork:
     colors: np.ndarray
 
 
-def sheet(origin, u, v, color) -> Patchwork:
-    """Return a rectangle from `origin` along vectors `u` and `v`, facing u x v, in cells of about 1 cm."""
+def sheet(origin, u, v, color, step_m: float = STEP_M) -> Patchwork:
+    """Return a rectangle from `origin` along vectors `u` and `v`, facing u x v, in cells of about `step_m`."""
     origin, u, v = (np.asarray(x, float) for x in (origin, u, v))
-    nu, nv = (max(1, round(np.linalg.norm(x) / STEP_M)) for x in (u, v))
+    nu, nv = (max(1, round(np.linalg.norm(x) / step_m)) for x in (u, v))
     s, t = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1), indexing="ij")
     points = origin + s[..., None] * u + t[..., None] * v
     number = np.arange((nu + 1) * (nv + 1)).reshape(nu + 1, nv + 1)
@@ -49,9 +49,9 @@ def solid_box(low, high, color) -> Patchwork:
     )
 
 
-def floor_sheet(color, half_m: float = 1.2) -> Patchwork:
+def floor_sheet(color, half_m: float = 1.2, step_m: float = STEP_M) -> Patchwork:
     """Return a square floor at z = 0."""
-    return sheet((-half_m, -half_m, 0), (2 * half_m, 0, 0), (0, 2 * half_m, 0), color)
+    return sheet((-half_m, -half_m, 0), (2 * half_m, 0, 0), (0, 2 * half_m, 0), color, step_m)
 
 
 def merged(*parts: Patchwork) -> Patchwork:

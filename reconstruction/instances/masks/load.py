@@ -1,7 +1,10 @@
 """Which backend makes the masks: what the config asks for, loaded."""
 
+from pathlib import Path
+
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.masks.base import ImageSegmenter, KeyframeMasks, MaskBackend
+from reconstruction.instances.masks.folder import FolderMasks
 from reconstruction.learned import ModelRequest
 
 # Where the option names none. Licenses: docs/masks.md.
@@ -16,8 +19,11 @@ def load_mask_backend(config: InstancesConfig) -> MaskBackend | None:
     """Return the backend that `config.masks` asks for; None for the embedded cut, which needs no masks.
 
     Raises:
+        UsageError: `masks_path` is not a folder of id images.
         EnvironmentMissing: a learned one needs something that is not installed, or weights that are not there.
     """
+    if config.masks == "folder":
+        return FolderMasks(Path(config.masks_path))
     if config.masks in DEFAULT_MODELS:
         return KeyframeMasks(_load_segmenter(config))
     return None

@@ -1,0 +1,71 @@
+"""What a thing stands on, from the surface around its foot."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from reconstruction.surface.mesh_graph import MeshGraph
+
+_REACH_M, _FAR_REACH_M = 0.05, 0.3  # around the foot, in plan
+_RISE_M, _DROP_M = 0.03, 0.06  # the carrier's surface may lie this far above and below the foot
+_UP = 0.5  # z of the normal of what carries
+_ON_FLOOR_M = 0.05
+
+
+def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
+    """Return for each thing the row of the thing that it stands on, -1 for none (it stands on floor or hangs).
+
+    A thing is carried by what has most up-facing surface around and below its foot, if that begins lower than the
+    thing itself does. Nothing carries itself, not even by way of others.
+
+    Args:
+        graph: the surface.
+        things: int (n,) vertices of each.
+    """
+    bottoms = [float(np.percentile(graph.points[v, 2], 2)) for v in things]
+    owner = np.full(len(graph.points), -1, np.int64)
+    for row, vertices in enumerate(things):
+        owner[vertices] = row
+    up = np.flatnonzero((owner >= 0) & (graph.normals[:, 2] > _UP))
+    tree = cKDTree(graph.points[up]) if len(up) else None
+    out = [-1] * len(things)
+    for row in sorted(range(len(things)), key=lambda r: (bottoms[r], -len(things[r]))):
+        if tree is None or bottoms[row] < _ON_FLOOR_M:
+            continue
+        barred = [
+            other == row or bottoms[other] > bottoms[row] - 0.002 or _stands_on(out, other, row)
+            for other in range(len(things))
+        ]
+        for reach in (_REACH_M, _FAR_REACH_M):  # what it stands on may have a hole around it
+            area = _area_below(graph, things[row], bottoms[row], tree, up, owner, len(things), reach)
+            area[barred] = 0.0
+            if area.max(initial=0.0) > 0:
+                out[row] = int(np.argmax(area))
+                break
+    return out
+
+
+def _stands_on(carrier: list[int], upper: int, lower: int) -> bool:
+    while upper >= 0:
+        if upper == lower:
+            return True
+        upper = carrier[upper]
+    return False
+
+
+def _area_below(
+    graph: MeshGraph, vertices: np.ndarray, bottom: float, tree: cKDTree, up: np.ndarray, owner: np.ndarray, count: int,
+    reach: float,
+) -> np.ndarray:  # fmt: skip
+    """Return the up-facing area (count,) of each thing around and just below the foot."""
+    points = graph.points[vertices]
+    foot = points[points[:, 2] < bottom + max(0.02, 0.15 * np.ptp(points[:, 2]))].copy()
+    foot[:, 2] = bottom
+    foot = foot[:: max(1, len(foot) // 400)]
+    radius = np.hypot(reach, max(_RISE_M, _DROP_M))
+    found = np.unique(np.concatenate([np.asarray(x, np.int64) for x in tree.query_ball_point(foot, radius)]))
+    near = up[found.astype(np.int64)]
+    height = graph.points[near, 2] - bottom
+    near = near[(height < _RISE_M) & (height > -_DROP_M)]
+    gap = cKDTree(foot[:, :2]).query(graph.points[near, :2])[0]
+    weight = graph.areas[near] * np.clip(1.0 - gap / reach, 0.0, 1.0)
+    return np.bincount(owner[near], weights=weight, minlength=count)

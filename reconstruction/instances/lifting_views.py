@@ -1,0 +1,163 @@
+"""Which mask shows each vertex of the surface in each frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from reconstruction.instances.masks.base import FrameMasks
+from reconstruction.progress import Progress
+from reconstruction.rasterize import rasterize_mesh
+from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
+from registry.geometry import invert_rigid
+
+UNSEEN = -1
+_MAX_SIDE_PX = 960
+_FACING = -0.2  # least cosine between normal and view ray; noise turns the normals of thin things
+_DEPTH_SLACK = 0.012  # of depth: a vertex this far behind what is drawn there is seen all the same
+_MIN_MASK_SHARE = 5e-5  # of the image; smaller masks are specks
+_WITNESSES = 3  # keyframes nearest to a frame, whose depth says whether a line of sight is clear
+_TURN_M = 0.5  # a turn by one radian sets two views as far apart as a step of this length
+_AGREES = 0.03  # of depth: measured depth this near to a vertex confirms it
+
+
+@dataclass(frozen=True)
+class MaskViews:
+    """The surface as the masks' frames see it. Masks are numbered from 1 through all frames."""
+
+    seen: np.ndarray  # int32 (n, v): mask that shows a vertex in a frame, 0 = in no mask, -1 = not seen
+    mask_frame: np.ndarray  # int32 (m + 1,) row of the frame that each mask is of; entry 0 stands for no mask
+    mask_id: np.ndarray  # int32 (m + 1,) its id in that frame's id image
+
+    @property
+    def mask_count(self) -> int:
+        """Return how many masks there are."""
+        return len(self.mask_frame) - 1
+
+
+def view_masks(
+    graph: MeshGraph,
+    surface: Surface,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    masks: FrameMasks,
+    progress: Progress,
+) -> MaskViews:
+    """Project the surface into every frame of the masks.
+
+    What is hidden or turned away is not seen there, nor is what only shows through a hole in the surface: one of the
+    nearest keyframes must have measured depth where the vertex lies.
+
+    Args:
+        graph: the surface as a graph.
+        surface: the surface, in world space.
+        posed: keyframes.
+        depth: their depth in metres.
+        masks: id images of some frames.
+        progress: told of every frame.
+    """
+    camera = _working_camera(masks.camera)
+    columns, rows = _samples(masks.camera.width, camera.width), _samples(masks.camera.height, camera.height)
+    count = len(masks.frame_indices)
+    seen = np.full((count, len(graph.points)), UNSEEN, np.int32)
+    frame_of, id_of = [UNSEEN], [0]
+    points, normals = np.ascontiguousarray(graph.points), np.ascontiguousarray(graph.normals)
+    key_poses = np.asarray(posed.world_from_camera, np.float64)
+    progress.start(count, "masks onto the surface")
+    for row in range(count):
+        ids = np.ascontiguousarray(masks.ids[row][rows[:, None], columns[None, :]])
+        numbers, first = _numbered(ids, len(frame_of))
+        frame_of += [row] * len(numbers)
+        id_of += numbers.tolist()
+        pose = np.asarray(masks.world_from_camera[row], np.float64)
+        drawn = rasterize_mesh(points, surface.faces, camera, pose).depth
+        near = _nearest_views(pose, key_poses)
+        confirmed = np.zeros(len(points), bool)
+        for key in near:
+            _confirm(
+                points, invert_rigid(key_poses[key]), depth.camera.fx, depth.camera.fy, depth.camera.cx,
+                depth.camera.cy, np.ascontiguousarray(depth.depth[key], np.float32), _AGREES, confirmed,
+            )  # fmt: skip
+        _look_up(
+            points, normals, invert_rigid(pose), pose[:3, 3], camera.fx, camera.fy, camera.cx, camera.cy,
+            drawn, first[ids], confirmed, _DEPTH_SLACK, _FACING, seen[row],
+        )  # fmt: skip
+        progress.advance()
+    return MaskViews(seen, np.array(frame_of, np.int32), np.array(id_of, np.int32))
+
+
+def _nearest_views(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the rows of the few poses (n, 4, 4) whose place and direction are most like those of `pose`."""
+    step = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1)
+    turn = np.arccos(np.clip(others[:, :3, 2] @ pose[:3, 2], -1.0, 1.0))
+    return np.argsort(step + _TURN_M * turn, kind="stable")[:_WITNESSES]
+
+
+def _working_camera(camera: Camera) -> Camera:
+    scale = min(1.0, _MAX_SIDE_PX / max(camera.width, camera.height))
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def _samples(full: int, wanted: int) -> np.ndarray:
+    """Return which of `full` pixels lie at the centers of `wanted` ones."""
+    return np.minimum(((np.arange(wanted) + 0.5) * full / wanted).astype(np.int64), full - 1)
+
+
+def _numbered(ids: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ids of one frame that are masks, and a table int32 from id to mask number (0: none)."""
+    counts = np.bincount(ids.ravel())
+    counts[0] = 0
+    numbers = np.flatnonzero(counts >= max(1, _MIN_MASK_SHARE * ids.size))
+    table = np.zeros(len(counts), np.int32)
+    table[numbers] = start + np.arange(len(numbers))
+    return numbers, table
+
+
+@njit(cache=True)
+def _confirm(
+    points, camera_from_world, fx, fy, cx, cy, measured, agrees, confirmed
+):  # pragma: no cover - compiled
+    """Set `confirmed` for vertices at which a keyframe measured depth."""
+    height, width = measured.shape
+    m = camera_from_world
+    for i in range(points.shape[0]):
+        if confirmed[i]:
+            continue
+        x, y, z = points[i]
+        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        if depth < 0.05:
+            continue
+        u = fx * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + cx
+        v = fy * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + cy
+        if 0.0 <= u < width and 0.0 <= v < height:
+            found = measured[int(v), int(u)]
+            confirmed[i] = found > 0.0 and abs(found - depth) < agrees * depth
+
+
+@njit(cache=True)
+def _look_up(
+    points, normals, camera_from_world, eye, fx, fy, cx, cy, drawn, mask, confirmed, slack, facing, out
+):  # pragma: no cover - compiled
+    """Write the mask at each vertex that is seen into `out`."""
+    height, width = drawn.shape
+    m = camera_from_world
+    for i in range(points.shape[0]):
+        if not confirmed[i]:
+            continue
+        x, y, z = points[i]
+        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        if depth < 0.05:
+            continue
+        u = fx * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + cx
+        v = fy * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + cy
+        if not (0.0 <= u < width and 0.0 <= v < height):
+            continue
+        column, row = int(u), int(v)
+        if drawn[row, column] <= 0.0 or depth > drawn[row, column] * (1.0 + slack):
+            continue
+        dx, dy, dz = eye[0] - x, eye[1] - y, eye[2] - z
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2] < facing * distance:
+            continue
+        out[i] = mask[row, column]
