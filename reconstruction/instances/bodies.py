@@ -21,7 +21,6 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.supports import SupportRegion, contact_height, find_supports
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
-_MIN_AREA_M2 = 0.0015  # of a body; smaller pieces are crumbs of what is near them
 _CRUMB_REACH_M = 0.04
 _AIR_M = 0.1  # what begins higher than this does not stand on the floor
 _OVER_LOW_M, _OVER_HIGH_M, _MIN_OVER = (
@@ -30,7 +29,7 @@ _OVER_LOW_M, _OVER_HIGH_M, _MIN_OVER = (
     0.6,
 )  # foot over a support, and its share within the outline
 _TORN_GAP_M, _TORN_COLOR = 0.12, 12.0
-_SCRAP_GAP_M, _SCRAP_COLOR = 0.1, 6.0
+_SCRAP_GAP_M, _SCRAP_COLOR = 0.15, 6.0
 
 
 @dataclass
@@ -83,8 +82,8 @@ class Bodies:
 def find_bodies(graph: MeshGraph, rest: np.ndarray, config: InstancesConfig) -> Bodies:
     """Return the bodies among vertices `rest` (sorted indices, without the base)."""
     found = [_Body(graph, piece) for piece in pieces(graph, rest, config.bridge_gap_m)]
-    bodies = [body for body in found if body.area_m2 >= _MIN_AREA_M2]
-    crumbs = [body.vertices for body in found if body.area_m2 < _MIN_AREA_M2]
+    bodies = [body for body in found if body.area_m2 >= config.min_piece_area_m2]
+    crumbs = [body.vertices for body in found if body.area_m2 < config.min_piece_area_m2]
     bodies = _with_stands(_with_legs(bodies))
     over = _over_supports(bodies, config)
     apart = {id(piece) for piece, _, _ in over}
@@ -93,7 +92,7 @@ def find_bodies(graph: MeshGraph, rest: np.ndarray, config: InstancesConfig) -> 
     for piece, body, support in over:
         level = support.height_m + contact_height(support, config)
         high = piece.vertices[graph.points[piece.vertices, 2] > level]
-        if graph.areas[high].sum() >= _MIN_AREA_M2:
+        if graph.areas[high].sum() >= config.min_piece_area_m2:
             standing.append((high, next(i for i, b in enumerate(bodies) if body.vertices[0] in b.vertices)))
         else:
             high = high[:0]

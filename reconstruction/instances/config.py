@@ -45,6 +45,9 @@ class InstancesConfig:
     min_object_vertices: int = 25
     """Things with fewer surface vertices than this are fragments."""
 
+    min_piece_area_m2: float = 0.0015
+    """Pieces of surface smaller than this are crumbs of what is near them."""
+
     min_object_area_m2: float = 0.003
     """Things of which less surface than this was seen are scraps."""
 

@@ -7,6 +7,7 @@ really carries a thing alone (a plate, a book, a coaster) reaches beyond it.
 import cv2
 import numpy as np
 
+from reconstruction.instances.merging import merge_pairs
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -20,16 +21,7 @@ _MIN_INSIDE = 0.6
 
 def merge_feet(graph: MeshGraph, things: list[Thing], progress: Progress) -> list[Thing]:
     """Join feet with what stands on them, from the top of each pile down."""
-    merged = 0
-    while True:
-        foot = next((thing for thing in things if _foot_of(graph, thing, things) is not None), None)
-        if foot is None:
-            break
-        above = _foot_of(graph, foot, things)
-        above.vertices = np.union1d(above.vertices, foot.vertices)
-        above.rests_on = foot.rests_on
-        things = [thing for thing in things if thing is not foot]
-        merged += 1
+    things, merged = merge_pairs(things, lambda thing, among: _foot_of(graph, thing, among))
     if merged:
         progress.note(f"{merged} thin slices below things are taken for their feet")
     return things

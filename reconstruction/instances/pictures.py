@@ -49,7 +49,7 @@ def find_pictures(
         depth: their depth, which tells where they see the wall.
         config: thresholds.
     """
-    texture = _wall_texture(graph, wall, taken, posed, depth)
+    texture = _wall_texture(graph, wall, taken, posed, depth, config)
     if texture is None:
         return []
     contrast = _contrast(texture)
@@ -66,11 +66,19 @@ def find_pictures(
             continue
         inside = region[texture.cells[:, 0], texture.cells[:, 1]]
         found.append(np.sort(texture.used[inside]))
-    return sorted((v for v in found if len(v) >= config.min_object_vertices), key=lambda v: (-len(v), v[0]))
+    least = 0.3 * config.min_picture_m**2
+    areas = [graph.areas[vertices].sum() for vertices in found]
+    order = sorted(range(len(found)), key=lambda k: (-areas[k], found[k][:1].sum()))
+    return [found[k] for k in order if areas[k] >= least]
 
 
 def _wall_texture(
-    graph: MeshGraph, wall: FittedPlane, taken: np.ndarray, posed: PosedFrames, depth: DepthMaps
+    graph: MeshGraph,
+    wall: FittedPlane,
+    taken: np.ndarray,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: InstancesConfig,
 ) -> _WallTexture | None:
     """Project the keyframes onto the wall: sharper than vertex colors, which are sparse where a wall is flat."""
     distance = wall.distance(graph.points)
@@ -78,7 +86,7 @@ def _wall_texture(
         ~taken & (distance < _DEPTH_M) & (distance > -0.03) & (graph.normals @ wall.plane[:3] > 0.5)
     )
     used = np.flatnonzero(near)
-    if len(used) < 100:
+    if graph.areas[used].sum() < 10 * config.min_picture_m**2:
         return None
     axis_u, axis_v = plane_axes(wall.plane)
     uv = np.column_stack([graph.points[used] @ axis_v, graph.points[used] @ axis_u])

@@ -3,6 +3,7 @@
 import numpy as np
 
 from reconstruction.instances.base import base_skirts
+from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.feet import merge_feet
@@ -79,8 +80,10 @@ def _without_base_crumbs(
         distances = np.stack([np.abs(plane.distance(points)) for plane in planes])
         nearest = distances.min(axis=0)
         spread = np.sort(np.ptp(points, axis=0))
-        thin = np.percentile(nearest, 90) < 0.035 or (spread[2] < 0.12 and np.median(nearest) < 0.025)
-        if (thin and spread[2] < 0.6) or (nearest < 0.05).mean() > 0.8:
+        middle, most = quantiles(nearest, graph.areas[thing.vertices], (0.5, 0.9))
+        thin = most < 0.035 or (spread[2] < 0.12 and middle < 0.025)
+        hugging = np.average(nearest < 0.05, weights=np.maximum(graph.areas[thing.vertices], 1e-12)) > 0.8
+        if (thin and spread[2] < 0.6) or hugging:
             crumbs.append((thing.vertices, first + int(np.argmin(np.median(distances, axis=1)))))
         else:
             kept.append(thing)
@@ -95,7 +98,8 @@ def _mark_attached(graph: MeshGraph, things: list[Thing], planes: list[FittedPla
         if thing.rests_on is not None or points[:, 2].min() < 0.15:
             continue
         for plane in planes:
-            if plane.label == "wall" and np.percentile(plane.distance(points), 5) < 0.06:
+            distance = quantiles(plane.distance(points), graph.areas[thing.vertices], (0.05,))[0]
+            if plane.label == "wall" and distance < 0.06:
                 thing.attached = True
     return things
 

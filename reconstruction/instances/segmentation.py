@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.bodies import find_bodies
+from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.candidates import candidates_on
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.neighbors import neighbors_of
@@ -14,6 +15,8 @@ from reconstruction.instances.supports import SupportRegion, find_supports
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _MAX_DEPTH = 4
+_CLEAR_M, _CONTACT_M = 0.015, 0.02
+_RIM_M = 0.04  # how far a plate's low rim may reach beyond what rises above it
 
 
 @dataclass
@@ -47,7 +50,7 @@ def _decompose(
 ) -> list[Thing]:
     """Split a connected body into itself and the things that stand on its supports."""
     own = Thing(body, rests_on, depth)
-    if len(body) < config.min_object_vertices or depth >= _MAX_DEPTH:
+    if graph.areas[body].sum() < config.min_piece_area_m2 or depth >= _MAX_DEPTH:
         return [own]
     remaining = body
     carried: list[np.ndarray] = []
@@ -74,10 +77,28 @@ def _decompose(
     carriers = list(out)
     for neighbor in beside:
         out.extend(_decompose(graph, neighbor, rests_on, depth, config))
-    for candidate in carried:
-        parent = _nearest_below(graph, candidate, carriers)
-        out.extend(_decompose(graph, candidate, parent, depth + 1, config))
+    lower: list[Thing] = []
+    for candidate in sorted(carried, key=lambda c: (graph.points[c, 2].min(), c[0])):
+        on = next((thing for thing in lower if _lies_on(graph, candidate, thing)), None)
+        parent = _nearest_below(graph, candidate, carriers) if on is None else on
+        found = _decompose(graph, candidate, parent, depth + 1, config)
+        out.extend(found)
+        lower.extend(found)
     return out
+
+
+def _lies_on(graph: MeshGraph, upper: np.ndarray, lower: Thing) -> bool:
+    """Tell whether most of a thing's foot is right above level surface of another one, clear of what carries both."""
+    bottom = quantiles(graph.points[upper, 2], graph.areas[upper], (0.02,))[0]
+    z = graph.points[lower.vertices, 2]
+    if bottom < z.min() + _CLEAR_M:
+        return False
+    level = lower.vertices[(np.abs(z - bottom) < _CONTACT_M) & (graph.normals[lower.vertices, 2] > 0.7)]
+    foot = upper[graph.points[upper, 2] < bottom + _CONTACT_M]
+    if graph.areas[level].sum() < 1e-4:
+        return False
+    gap, _ = cKDTree(graph.points[level, :2]).query(graph.points[foot, :2], distance_upper_bound=_CONTACT_M)
+    return float(np.average(np.isfinite(gap), weights=np.maximum(graph.areas[foot], 1e-12))) > 0.6
 
 
 def _flood_same_color(
@@ -86,7 +107,9 @@ def _flood_same_color(
     """Add the low rim of a thing that lies within the contact height (a plate's, say): its color, not the support's."""
     ground = np.linalg.norm(graph.lab - support.lab, axis=1)
     open_ = np.zeros(len(graph.points), bool)
-    open_[remaining] = True
+    low, high = graph.points[candidate, :2].min(0), graph.points[candidate, :2].max(0)
+    beside = graph.points[remaining, :2]
+    open_[remaining[((beside > low - _RIM_M) & (beside < high + _RIM_M)).all(axis=1)]] = True
     open_ &= (ground > 12.0) & (np.abs(graph.points[:, 2] - support.height_m) < 0.03)
     inside = np.zeros(len(graph.points), bool)
     inside[candidate] = True
@@ -96,13 +119,12 @@ def _flood_same_color(
     step = np.linalg.norm(graph.lab[edges[:, 0]] - graph.lab[edges[:, 1]], axis=1)
     edges = edges[step < np.maximum(4.0, 0.5 * ground[edges[:, 1]])]
     grown = inside.copy()
-    for _ in range(12):
+    while True:
         reached = edges[grown[edges[:, 0]] & ~grown[edges[:, 1]], 1]
         if len(reached) == 0:
             break
         grown[reached] = True
     added = grown & ~inside
-    low, high = graph.points[candidate, :2].min(0), graph.points[candidate, :2].max(0)
     limit = 0.6 * float(np.prod(high - low)) + 1e-3
     if graph.areas[added].sum() > limit:
         return candidate  # a pattern of the support, not a rim
@@ -111,12 +133,12 @@ def _flood_same_color(
 
 def _carrier(graph: MeshGraph, part: np.ndarray, main: Thing, rests_on: Thing | None) -> Thing | None:
     """A part split off its neighbor rests on it if it is over it, beside it on the same support otherwise."""
-    low = float(np.percentile(graph.points[part, 2], 3))
-    inside = graph.points[main.vertices]
-    span_low, span_high = np.percentile(inside[:, :2], [3, 97], axis=0)
+    low = quantiles(graph.points[part, 2], graph.areas[part], (0.03,))[0]
+    inside, areas = graph.points[main.vertices], graph.areas[main.vertices]
+    span_low, span_high = np.stack([quantiles(inside[:, k], areas, (0.03, 0.97)) for k in range(2)], axis=1)
     center = np.median(graph.points[part, :2], axis=0)
     within = bool(((center > span_low) & (center < span_high)).all())
-    return main if within and low > float(np.percentile(inside[:, 2], 3)) + 0.003 else rests_on
+    return main if within and low > quantiles(inside[:, 2], areas, (0.03,))[0] + 0.003 else rests_on
 
 
 def _nearest_below(graph: MeshGraph, candidate: np.ndarray, carriers: list[Thing]) -> Thing:
@@ -136,10 +158,12 @@ def _absorb_fragments(graph: MeshGraph, things: list[Thing], config: InstancesCo
         if len(thing.vertices) == 0:
             small.append(thing)
             continue
-        low, high = np.percentile(graph.points[thing.vertices], [2, 98], axis=0)
+        areas = graph.areas[thing.vertices]
+        low, high = np.stack(
+            [quantiles(graph.points[thing.vertices, k], areas, (0.02, 0.98)) for k in range(3)], axis=1
+        )
         large = (
-            np.sort(high - low)[1] >= 0.8 * config.min_object_m
-            and len(thing.vertices) >= config.min_object_vertices
+            np.sort(high - low)[1] >= 0.8 * config.min_object_m and areas.sum() >= config.min_piece_area_m2
         )
         raised = thing.rests_on is None or high[2] - low[2] > 0.012
         (kept if large and raised else small).append(thing)

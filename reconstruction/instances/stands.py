@@ -10,6 +10,8 @@ were not seen well. Two signs tell that from a thing put onto another:
 import cv2
 import numpy as np
 
+from reconstruction.instances.boxes import quantiles
+from reconstruction.instances.merging import merge_pairs
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -24,20 +26,7 @@ _MIN_INSIDE = 0.85
 
 def merge_stands(graph: MeshGraph, things: list[Thing], progress: Progress) -> list[Thing]:
     """Join tops with their stands; what rested on the top then rests on the whole."""
-    merged = 0
-    while True:
-        pair = next(((top, stand) for top in things if (stand := _stand_of(graph, top, things))), None)
-        if pair is None:
-            break
-        top, stand = pair
-        stand.vertices = np.union1d(stand.vertices, top.vertices)
-        if stand.rests_on is top:
-            stand.rests_on = top.rests_on
-        for other in things:
-            if other.rests_on is top and other is not stand:
-                other.rests_on = stand
-        things = [thing for thing in things if thing is not top]
-        merged += 1
+    things, merged = merge_pairs(things, lambda top, among: _stand_of(graph, top, among))
     if merged:
         progress.note(f"{merged} tops are joined with the stands below them")
     return things
@@ -50,11 +39,11 @@ def _stand_of(graph: MeshGraph, top: Thing, things: list[Thing]) -> Thing | None
     outline = _outline(graph, top)
     if cv2.contourArea(outline) < _MIN_AREA_M2:
         return None
-    low, high = np.percentile(graph.points[top.vertices, 2], [0.5, 98])  # one leg is a small part of a table
+    low, high = _heights(graph, top, 0.005)  # one leg is a small part of a table
     for stand in things:
         if stand is top or stand.attached:
             continue
-        stand_low, stand_high = np.percentile(graph.points[stand.vertices, 2], [2, 98])
+        stand_low, stand_high = _heights(graph, stand, 0.02)
         height = max(stand_high - stand_low, 1e-3)
         if height < _MIN_HEIGHT_M or stand_high > high or stand_low > low + _REACH_M:
             continue
@@ -63,12 +52,22 @@ def _stand_of(graph: MeshGraph, top: Thing, things: list[Thing]) -> Thing | None
         if not (reaches_down or slab):
             continue
         # Its upper half counts: feet may be spread, and scraps of the floor cling to them.
-        points = graph.points[stand.vertices]
-        flat = points[points[:, 2] > 0.5 * (stand_low + stand_high), :2][::3]
-        inside = [cv2.pointPolygonTest(outline, (float(x), float(y)), True) > -_REACH_M for x, y in flat]
-        if np.mean(inside) > _MIN_INSIDE:
+        upper = stand.vertices[graph.points[stand.vertices, 2] > 0.5 * (stand_low + stand_high)]
+        if len(upper) and _share_within(graph, upper, outline) > _MIN_INSIDE:
             return stand
     return None
+
+
+def _heights(graph: MeshGraph, thing: Thing, low: float) -> np.ndarray:
+    """Return the height above which all but `low` of a thing's area is, and that below which 98 % of it is."""
+    return quantiles(graph.points[thing.vertices, 2], graph.areas[thing.vertices], (low, 0.98))
+
+
+def _share_within(graph: MeshGraph, vertices: np.ndarray, outline: np.ndarray) -> float:
+    """Return the share of the vertices' area within an outline from above, grown by the reach."""
+    flat = graph.points[vertices, :2]
+    inside = [cv2.pointPolygonTest(outline, (float(x), float(y)), True) > -_REACH_M for x, y in flat]
+    return float(np.average(inside, weights=np.maximum(graph.areas[vertices], 1e-12)))
 
 
 def _outline(graph: MeshGraph, thing: Thing) -> np.ndarray:

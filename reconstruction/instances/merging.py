@@ -1,0 +1,34 @@
+"""Join things that turn out to be one."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from reconstruction.instances.segmentation import Thing
+
+
+def merge_pairs(
+    things: list[Thing], partner_of: Callable[[Thing, list[Thing]], Thing | None]
+) -> tuple[list[Thing], int]:
+    """Merge each thing into its partner, if it has one, until none has.
+
+    What rested on the merged thing then rests on the partner, and the partner on what the merged thing rested on, if it
+    rested on that one.
+
+    Returns:
+        The things that are left, and how many were merged away.
+    """
+    things, merged = list(things), 0
+    while True:
+        pair = next(((gone, kept) for gone in things if (kept := partner_of(gone, things)) is not None), None)
+        if pair is None:
+            return things, merged
+        gone, kept = pair
+        kept.vertices = np.union1d(kept.vertices, gone.vertices)
+        if kept.rests_on is gone:
+            kept.rests_on = gone.rests_on
+        things = [thing for thing in things if thing is not gone]
+        for other in things:
+            if other.rests_on is gone:
+                other.rests_on = kept
+        merged += 1
