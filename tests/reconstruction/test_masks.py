@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import tiny_models
@@ -120,6 +121,17 @@ def test_masks_of_which_a_model_is_not_sure_are_left_out(name, folders, monkeypa
     black = np.zeros((1, HEIGHT, WIDTH, 3), np.uint8)
     ids = check_promises(load_mask_backend(config_of(name, folders)), *capture(black))
     assert not ids.any()
+
+
+def test_masks_of_a_folder_keep_the_promises_of_the_seam(tmp_path) -> None:
+    posed, depth = capture(noise())
+    for number, index in enumerate(posed.indices.tolist()):
+        ids = np.zeros((HEIGHT // 2, WIDTH // 2), np.uint16)
+        ids[4:20, 6 : 10 + number] = 300 + number
+        cv2.imwrite(str(tmp_path / f"{index:05d}.png"), ids)
+    backend = load_mask_backend(InstancesConfig(masks="folder", masks_path=str(tmp_path)))
+    ids = check_promises(backend, posed, depth)
+    assert sorted(np.unique(ids)) == [0, 300, 301]
 
 
 def test_the_embedded_cut_needs_no_masks() -> None:
