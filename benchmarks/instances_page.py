@@ -38,7 +38,7 @@ class Measured:
     group: str  # the folder that the capture lies in
     variant: str
     meaning: str
-    figures: dict[str, Any]  # object_recall_25, ..., found, extra
+    figures: dict[str, Any]  # "found": how many objects
     records: list[dict[str, Any]]  # of the evaluated true objects
     surface_points: int | None
     wall_s: float  # of the instances stage

@@ -3,9 +3,16 @@
 import json
 from dataclasses import replace
 
+import numpy as np
+import pytest
+import trimesh
+from test_tables import failed
+
 from benchmarks.captures import find_captures
-from benchmarks.instances import main, stage_run
+from benchmarks.instances import main, scene_results, stage_run
 from benchmarks.instances_page import Measured, pooled, render
+from benchmarks.results import save_result
+from benchmarks.variants import choose_variants
 
 CODE = {"commit": "abc", "dirty": False, "sources": "now"}
 
@@ -37,7 +44,7 @@ def measured(capture: str, records: list[dict], found: int, **changed) -> Measur
         group="rooms",
         variant="default",
         meaning="the preset",
-        figures={"found": found, "extra": []},
+        figures={"found": found},
         records=records,
         surface_points=100_000,
         wall_s=12.0,
@@ -154,3 +161,22 @@ def test_what_would_be_done_is_said_and_not_done(tmp_path, capsys):
     assert "room / true-masks: to do" in said
     assert not page.exists()
     assert not out.exists()
+
+
+def test_a_scene_that_failed_missed_everything(tmp_path):
+    truth = tmp_path / "rooms" / "one" / "ground_truth"
+    truth.mkdir(parents=True)
+    (truth.parent / "video.mp4").write_bytes(b"x")
+    trimesh.creation.box((0.3, 0.2, 0.1)).export(truth / "box.ply")
+    box = {"id": 1, "name": "box", "label": "box", "base": False, "visible_pixels": 9000, "mesh": "box.ply"}
+    intrinsics = {"fx": 500, "fy": 500, "cx": 320, "cy": 240}
+    frames = [{"index": 0, "world_from_camera": np.eye(4).tolist()}]
+    scene = {"width": 640, "height": 480, "intrinsics": intrinsics, "frames": frames, "entities": [box]}
+    (truth / "scene.json").write_text(json.dumps(scene))
+    (capture,), out = find_captures([tmp_path / "rooms"]), tmp_path / "out"
+    save_result(failed("one"), out)
+    (missed,) = scene_results([capture], choose_variants(["default"], []), out)
+    assert [(r["name"], r["found_25"]) for r in missed.records] == [("box", False)]
+    assert missed.records[0]["longest_side_cm"] == pytest.approx(30)
+    recall, precision = pooled([missed], 25)
+    assert (recall.value, recall.count, precision.count) == (0, 1, 0)
