@@ -17,7 +17,7 @@ class AssetsConfig:
     """Objects with fewer depth pixels over all frames become boxes."""
     min_thickness_m: float = 0.004
     """Seen shells whose other side was not seen become at least this thick (and at least two voxels)."""
-    flat_thickness_m: float = 0.02
+    flat_thickness_m: float = 0.025
     """Thickness given to things that are flush with a wall: that of a framed picture."""
     symmetry: bool = True
     """Complete by rotation and mirror symmetry where what was seen agrees."""

@@ -8,7 +8,7 @@ from pairs that many frames witness to pairs that few do; a cluster is witnessed
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, triu
 from scipy.sparse.csgraph import connected_components
 
 from reconstruction.instances.lifting_views import MaskViews
@@ -17,6 +17,7 @@ _VISIBLE_SHARE = 0.3  # of a mask's surface must be seen in a frame for the fram
 _CONTAINED_SHARE = 0.8  # of what is seen of it must lie in one mask there
 _SPLIT_SHARE = 0.3  # of the frames that judge a mask may split it
 _CONSENSUS = 0.9
+_CHUNK = 200_000  # pairs at once
 _PURE_SHARE = 0.6  # of a superpoint's seen surface must lie in one mask
 
 
@@ -108,20 +109,15 @@ def _grown(agreement: Agreement, chosen: np.ndarray) -> np.ndarray:
     """Return a label for each chosen mask: merged round by round, with ever fewer witnesses asked for."""
     label = np.arange(len(chosen))
     judged, contained = agreement.judged[chosen], agreement.contained[chosen]
-    for least in _schedule(judged):
+    for least in _schedule(judged, contained):
         while True:
             count = int(label.max()) + 1
             gather = csr_matrix(
                 (np.ones(len(label)), (label, np.arange(len(label)))), shape=(count, len(label))
             )
-            own_judged, own_contained = (gather @ judged).sign(), (gather @ contained).sign()
-            observers = (own_judged @ own_judged.T).tocoo()
-            supporters = (own_contained @ own_contained.T).tocsr()
-            agreed = np.asarray(supporters[observers.row, observers.col]).ravel()
-            good = (observers.data >= least) & (agreed >= _CONSENSUS * observers.data)
-            links = csr_matrix(
-                (np.ones(good.sum()), (observers.row[good], observers.col[good])), shape=(count, count)
-            )
+            pairs, agreed, observers = _witnesses((gather @ judged).sign(), (gather @ contained).sign())
+            good = (observers >= least) & (agreed >= _CONSENSUS * observers)
+            links = csr_matrix((np.ones(good.sum()), pairs[:, good]), shape=(count, count))
             merged = connected_components(links, directed=False)[1]
             if merged.max() + 1 == count:
                 break
@@ -129,10 +125,24 @@ def _grown(agreement: Agreement, chosen: np.ndarray) -> np.ndarray:
     return label
 
 
-def _schedule(judged: csr_matrix) -> list[int]:
+def _witnesses(judged: csr_matrix, contained: csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pairs int (2, p) of rows that lie in one mask anywhere, in how many, and how many frames judge both.
+
+    All other pairs have nothing in common, and there are far too many of them.
+    """
+    shared = triu(contained @ contained.T, 1).tocoo()
+    pairs = np.stack([shared.row, shared.col])
+    dense = judged.toarray().astype(bool)
+    observers = np.zeros(len(shared.data), np.int64)
+    for start in range(0, len(observers), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        observers[part] = (dense[pairs[0, part]] & dense[pairs[1, part]]).sum(axis=1)
+    return pairs, shared.data, observers
+
+
+def _schedule(judged: csr_matrix, contained: csr_matrix) -> list[int]:
     """Return falling numbers of witnesses: quantiles of what pairs of masks have, the last one 1."""
-    pairs = (judged @ judged.T).tocoo()
-    counts = pairs.data[pairs.row < pairs.col]
+    counts = _witnesses(judged, contained)[2]
     if len(counts) == 0:
         return [1]
     levels = {int(np.percentile(counts, q)) for q in range(95, -1, -5)}

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from surfaces import floor_sheet, frames_of, looking_at, merged, sheet, solid_box, surface_from
 
+from reconstruction.config import PipelineConfig
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.lifting import lift_masks
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import FrameMasks
 from reconstruction.instances.superpoints import superpoints
+from reconstruction.pipeline import reconstruct
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -337,3 +339,13 @@ def test_folder_errors(room, tmp_path):
     (write_masks(room, tmp_path / "broken") / "00003.png").write_bytes(b"no image")
     with pytest.raises(UsageError, match="cannot be read"):
         find(room, tmp_path / "broken")
+
+
+def test_a_wrong_folder_is_said_before_any_work(tmp_path):
+    """Not even the video is opened, which is none here."""
+    video = tmp_path / "room.mp4"
+    video.write_bytes(b"no video")
+    config = PipelineConfig(instances=InstancesConfig(masks="folder", masks_path=str(tmp_path / "nowhere")))
+    with pytest.raises(UsageError, match="no such folder"):
+        reconstruct(video, registry_root=tmp_path / "registry", config=config)
+    assert not (tmp_path / "registry").exists()
