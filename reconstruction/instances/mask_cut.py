@@ -20,6 +20,7 @@ _BRIDGE_M = 0.03
 _FRAGMENT_SHARE, _FRAGMENT_FRAMES, _FRAGMENT_AGREED = 0.1, 2.0, 0.8
 _CRUMB_SHARE = 0.005  # and below this nothing helps.
 _SKIRT_RISE_M, _SKIRT_REACH_M = 0.01, 0.03  # above the foot of a thing, and around it
+_BARE_SHARE, _BARE_REACH_M = 0.08, 0.15  # what has less of its surface above the foot is bare around it
 _LEAST_AREA_SHARE = 0.5  # masks vouch for smaller things than shape alone does
 _FLAT_SHARE = 0.5  # of a cluster's surface on floor or walls: it is base, or lies flat on it
 _SEGMENT_SHARE = 0.25  # of a plane's surface: a part of the wall, no picture
@@ -139,7 +140,11 @@ def _drop_skirts(graph: MeshGraph, carrier: Thing, carried: list[Thing]) -> None
         points = graph.points[carrier.vertices]
         bottom = float(np.percentile(own[:, 2], 2))
         near = points[:, 2] > bottom + _SKIRT_RISE_M
-        near[near] = cKDTree(own).query(points[near], distance_upper_bound=_SKIRT_REACH_M)[0] < _SKIRT_REACH_M
+        areas = graph.areas[carrier.vertices]
+        # A table has next to nothing above its top; a tray has rims, a shelf has more boards.
+        bare = areas[near].sum() < _BARE_SHARE * areas.sum()
+        reach = _BARE_REACH_M if bare else _SKIRT_REACH_M
+        near[near] = cKDTree(own).query(points[near], distance_upper_bound=reach)[0] < reach
         if near.mean() < 0.5:
             carrier.vertices = carrier.vertices[~near]
 
