@@ -99,11 +99,12 @@ def _merge_levels(graph: MeshGraph, levels: list[np.ndarray]) -> list[np.ndarray
         (graph.points[p].min(axis=0)[:2], graph.points[p].max(axis=0)[:2], np.median(graph.points[p, 2]))
         for p in levels
     ]
+    colors = [np.median(graph.lab[p], axis=0) for p in levels]
 
     def of_one(i: int, j: int) -> bool:
         apart = np.maximum(boxes[i][0] - boxes[j][1], boxes[j][0] - boxes[i][1]).max()
         rise = abs(boxes[i][2] - boxes[j][2])
-        gap = np.abs(np.median(graph.lab[levels[i]], 0) - np.median(graph.lab[levels[j]], 0)).max()
+        gap = np.abs(colors[i] - colors[j]).max()
         alike = gap < (
             25 if rise < 0.006 else 12
         )  # the bottom of a tray is a little higher, and of another color
