@@ -7,6 +7,7 @@ from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.feet import merge_feet
+from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.scraps import without_fragments
 from reconstruction.instances.segmentation import Thing, segment
@@ -35,7 +36,8 @@ def cut_by_rules(
         owner[vertices] = number
     owner[hung] = 0
     things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
-    things = merge_stands(graph, merge_feet(graph, things, progress), progress)
+    things = merge_insides(graph, merge_feet(graph, things, progress), progress)
+    things = merge_stands(graph, things, progress)
     things = without_fragments(graph, things, shell.base[0].observed, config, progress)
     for thing in things:
         if thing.attached:

@@ -17,6 +17,7 @@ from reconstruction.surface.mesh_graph import MeshGraph
 _MAX_DEPTH = 4
 _CLEAR_M, _CONTACT_M = 0.015, 0.02
 _RIM_M = 0.04  # how far a plate's low rim may reach beyond what rises above it
+_SAME_GROUND_M = 0.006
 
 
 @dataclass
@@ -46,21 +47,31 @@ def segment(graph: MeshGraph, rest: np.ndarray, config: InstancesConfig) -> list
 
 
 def _decompose(
-    graph: MeshGraph, body: np.ndarray, rests_on: Thing | None, depth: int, config: InstancesConfig
+    graph: MeshGraph,
+    body: np.ndarray,
+    rests_on: Thing | None,
+    depth: int,
+    config: InstancesConfig,
+    ground_m: float = -np.inf,
 ) -> list[Thing]:
-    """Split a connected body into itself and the things that stand on its supports."""
+    """Split a connected body into itself and the things that stand on its supports.
+
+    What is level at the height of the ground that it stands on itself, `ground_m`, is a rest of that ground.
+    """
     own = Thing(body, rests_on, depth)
     if graph.areas[body].sum() < config.min_piece_area_m2 or depth >= _MAX_DEPTH:
         return [own]
     remaining = body
-    carried: list[np.ndarray] = []
+    carried: list[tuple[np.ndarray, float]] = []
     beside: list[np.ndarray] = []
     for support in find_supports(graph, body, config):
+        if abs(support.height_m - ground_m) < _SAME_GROUND_M:
+            continue
         if not np.isin(support.vertices, remaining, assume_unique=True).mean() > 0.5:
             continue  # it lies on something that was taken off already, whose own turn comes
         for candidate in candidates_on(graph, remaining, support, config):
             candidate = _flood_same_color(graph, candidate, remaining, support)
-            carried.append(candidate)
+            carried.append((candidate, support.height_m))
             remaining = np.setdiff1d(remaining, candidate, assume_unique=True)
         if depth > 0:
             for neighbor in neighbors_of(graph, remaining, support, config):
@@ -76,12 +87,12 @@ def _decompose(
         out.append(Thing(part, _carrier(graph, part, out[0], rests_on), depth))
     carriers = list(out)
     for neighbor in beside:
-        out.extend(_decompose(graph, neighbor, rests_on, depth, config))
+        out.extend(_decompose(graph, neighbor, rests_on, depth, config, ground_m))
     lower: list[Thing] = []
-    for candidate in sorted(carried, key=lambda c: (graph.points[c, 2].min(), c[0])):
+    for candidate, height in sorted(carried, key=lambda c: (graph.points[c[0], 2].min(), c[0][0])):
         on = next((thing for thing in lower if _lies_on(graph, candidate, thing)), None)
         parent = _nearest_below(graph, candidate, carriers) if on is None else on
-        found = _decompose(graph, candidate, parent, depth + 1, config)
+        found = _decompose(graph, candidate, parent, depth + 1, config, height)
         out.extend(found)
         lower.extend(found)
     return out
@@ -110,7 +121,8 @@ def _flood_same_color(
     low, high = graph.points[candidate, :2].min(0), graph.points[candidate, :2].max(0)
     beside = graph.points[remaining, :2]
     open_[remaining[((beside > low - _RIM_M) & (beside < high + _RIM_M)).all(axis=1)]] = True
-    open_ &= (ground > 12.0) & (np.abs(graph.points[:, 2] - support.height_m) < 0.03)
+    rise = graph.points[:, 2] - support.height_m
+    open_ &= (ground > 12.0) & (rise < 0.03) & (rise > max(0.003, 1.5 * support.noise_m))
     inside = np.zeros(len(graph.points), bool)
     inside[candidate] = True
     open_ &= ~inside
@@ -182,7 +194,6 @@ def _absorb_fragments(graph: MeshGraph, things: list[Thing], config: InstancesCo
                 heir.vertices = np.sort(np.concatenate([heir.vertices, thing.vertices]))
     for thing in kept:
         while thing.rests_on is not None and id(thing.rests_on) in heirs:
-            thing.rests_on = heirs[id(thing.rests_on)]
-        if thing.rests_on is thing:
-            thing.rests_on = None
+            heir = heirs[id(thing.rests_on)]
+            thing.rests_on = thing.rests_on.rests_on if heir is thing else heir
     return kept

@@ -8,6 +8,7 @@ from heapq import heappop, heappush
 import numpy as np
 
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.convexity import MIN_BULGE, bulge, is_within
 from reconstruction.instances.patches import LIGHTNESS_WEIGHT, Contacts, contacts_of, crease_patches, palette
 from reconstruction.surface.mesh_graph import MeshGraph
 
@@ -151,10 +152,13 @@ class Regions:
             return False
         if np.sort(np.ptp(points, axis=0))[1] < self.config.min_object_m:
             return False
-        if points[:, 2].min() < self.graph.points[self.body, 2].min() + _GROUND_M:
-            return True
+        chosen = self.body[self.label == region]
+        around = [self.body[self.label == k] for k in sorted(self.neighbors[region])]
+        if bulge(self.graph, chosen) < MIN_BULGE and any(is_within(self.graph, chosen, k) for k in around):
+            return False  # the bottom or the inside of a container
         level = sum(
             self.border[region, k][4] if region < k else self.border[k, region][3]
             for k in sorted(self.neighbors[region])
         )
-        return bool(level > _LIES_SHARE * self.perimeter[region])
+        low = points[:, 2].min() < self.graph.points[self.body, 2].min() + _GROUND_M
+        return low or bool(level > _LIES_SHARE * self.perimeter[region])

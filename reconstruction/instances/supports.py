@@ -185,7 +185,8 @@ def _belongs_to_body(
     core = binary_erosion(support.footprint.filled, iterations=edge_cells)
     inner_print = Footprint(support.footprint.origin, cell, core, core)
     rests, goes_on = contact_shares(graph, body, support, candidate)
-    if goes_on > _MAX_GOES_ON * (rests + goes_on) and goes_on > 0.15 and color_gap < 30.0:
+    surrounds = goes_on > 0.5 and rests < 0.1  # a rim around what lies in it, whatever the colors
+    if surrounds or (goes_on > max(_MAX_GOES_ON * (rests + goes_on), 0.15) and color_gap < 30.0):
         return True  # along much of its foot the same side goes on downwards, past the support
     if rests > 0.5 and rests > 8.0 * goes_on and not _is_post(graph, candidate):
         return False

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 from fused_surfaces import box, can, fused, tray
-from surfaces import frames_of
+from surfaces import Patchwork, frames_of, sheet, surface_from
 
 from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.instances.convexity import bulge
+from reconstruction.instances.insides import merge_insides
+from reconstruction.instances.segmentation import Thing, _absorb_fragments
 from reconstruction.instances.splitting import split_touching
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -108,3 +111,60 @@ def test_the_back_of_a_seat_stays_with_it():
     )
     (seat, back), _ = ids_at(surface, (0, -0.1, 0.25), (0, 0.15, 0.4))
     assert seat == back
+
+
+def hollow(depth_m: float):
+    """Return a graph of a sheet, 20 x 20 cm, bent upwards at its rim (depth > 0) or downwards."""
+    steps = np.linspace(-0.1, 0.1, 21)
+    x, y = np.meshgrid(steps, steps, indexing="ij")
+    z = depth_m * (x**2 + y**2) / 0.02
+    flat = sheet((-0.1, -0.1, 0), (0.2, 0, 0), (0, 0.2, 0), WOOD)
+    slope = np.stack([-2 * depth_m * x / 0.02, -2 * depth_m * y / 0.02, np.ones_like(x)], axis=-1).reshape(
+        -1, 3
+    )
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    normals = slope / np.linalg.norm(slope, axis=1, keepdims=True)
+    return MeshGraph.from_surface(surface_from(Patchwork(points, flat.faces, normals, flat.colors)))
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "low", "high"), [(0.08, -1.0, -0.2), (0.0, -0.02, 0.02), (-0.08, 0.2, 1.0)]
+)
+def test_bulge_tells_a_hollow_from_a_sheet_from_a_thing(depth_m, low, high):
+    graph = hollow(depth_m)
+    assert low < bulge(graph, np.arange(len(graph.points))) < high
+
+
+def test_the_bottom_of_a_tray_is_joined_with_its_sides_and_what_lies_in_it_is_not():
+    """Both lie within the outline of the sides; only the thing bulges."""
+    can_in_tray = [
+        can((0.0, 0.0), 0.035, 0.0, 0.1, RED),
+        *tray((-0.2, -0.15, 0.0), (0.2, 0.15, 0.07), 0.014, WOOD),
+    ]
+    graph = MeshGraph.from_surface(fused(can_in_tray, half_m=0.25, top_m=0.15))
+    points = graph.points
+    in_can = np.linalg.norm(points[:, :2], axis=1) < 0.042
+    in_bottom = (np.abs(points[:, 0]) < 0.18) & (np.abs(points[:, 1]) < 0.13) & ~in_can
+    in_sides = ~in_bottom & ~in_can & (points[:, 2] > 0.01)
+    sides, bottom = (Thing(np.flatnonzero(chosen)) for chosen in (in_sides, in_bottom))
+    inner = Thing(np.flatnonzero(in_can), rests_on=bottom)
+    left = merge_insides(graph, [sides, bottom, inner], NO_PROGRESS)
+    assert len(left) == 2
+    assert any(thing is inner for thing in left)
+    assert inner.rests_on is sides
+    assert np.isin(bottom.vertices, sides.vertices).all()
+
+
+def test_what_rested_on_a_scrap_that_it_takes_in_rests_on_what_carried_the_scrap():
+    """The scrap is a sheet around the thing's foot, nearer to the thing than to anything else."""
+    solids = [TABLE, box((-0.05, -0.04, 0.4), (0.05, 0.04, 0.55), GREEN)]
+    graph = MeshGraph.from_surface(fused(solids, top_m=0.65))
+    points = graph.points
+    around = np.abs(points[:, :2]).max(axis=1)
+    near_top = np.abs(points[:, 2] - 0.4) < 0.02
+    table = Thing(np.flatnonzero((points[:, 2] > 0.05) & (points[:, 2] < 0.42) & (around > 0.12)))
+    scrap = Thing(np.flatnonzero(near_top & (around < 0.1) & (around > 0.06)), rests_on=table)
+    thing = Thing(np.flatnonzero((points[:, 2] > 0.41) & (around < 0.06)), rests_on=scrap)
+    kept = _absorb_fragments(graph, [table, scrap, thing], InstancesConfig())
+    assert [id(one) for one in kept] == [id(table), id(thing)]
+    assert thing.rests_on is table
