@@ -6,6 +6,7 @@ from reconstruction.instances.describe import describe
 from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
+from reconstruction.instances.refine import refine_by_views
 from reconstruction.instances.rules import cut_by_rules
 from reconstruction.instances.scraps import without_unseen
 from reconstruction.progress import Progress
@@ -38,6 +39,7 @@ def find_instances(
     progress.advance()
     if masks is None:
         cut = cut_by_rules(shell, posed, depth, config, progress)
+        cut = refine_by_views(shell, cut, surface, posed, depth, config, progress)
     else:
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     progress.advance()

@@ -1,0 +1,84 @@
+"""A cut seen anew: its things are drawn into keyframes, borders moved to image edges, and voted back.
+
+Depth is fat at outlines, so that a thing drags a skirt of its carrier's or its background's surface along. Drawn into
+a frame that looks from elsewhere, the skirt lies where the image shows something else; the borders of the id maps snap
+to the edges of color there, and most frames then put the skirt where it belongs.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.cut import Cut, Shell
+from reconstruction.instances.id_maps import render_id_map
+from reconstruction.instances.lifting import vote
+from reconstruction.instances.lifting_views import view_masks
+from reconstruction.instances.masks.base import FrameMasks
+from reconstruction.progress import Progress
+from reconstruction.types import DepthMaps, PosedFrames, Surface
+
+_MAX_FRAMES = 36
+_MIN_FRAMES = 2  # that see a vertex
+_SURE_SHARE = 0.6  # of them must put it elsewhere
+_LEAST_KEPT = 0.5  # of a thing's area: votes that take more are not trusted
+
+
+def refine_by_views(
+    shell: Shell, cut: Cut, surface: Surface, posed: PosedFrames, depth: DepthMaps, config: InstancesConfig,
+    progress: Progress,
+) -> Cut:  # fmt: skip
+    """Give the vertices of things that most keyframes see on something else to that.
+
+    Args:
+        shell: the surface and its base.
+        cut: the things to refine.
+        surface: what was cut.
+        posed: keyframes in world space.
+        depth: their depth in metres.
+        config: how far borders may snap.
+        progress: told of every frame.
+
+    Returns:
+        The same things, none without more than half of its area; vertices that base entities win have their ids.
+    """
+    if not cut.things or config.snap_radius_px <= 0:
+        return cut
+    first = len(shell.base) + 1
+    label = cut.owner.astype(np.int32)
+    for number, thing in enumerate(cut.things, start=first):
+        label[thing.vertices] = number
+    masks = _drawn(label, surface, posed, depth, config)
+    views = view_masks(shell.graph, surface, posed, depth, masks, progress)
+    winner, votes, seen = vote(np.ascontiguousarray(views.seen.T), views.mask_id)
+    sure = (seen >= _MIN_FRAMES) & (votes >= _SURE_SHARE * seen) & (winner > 0)
+    refined = np.where(sure & (label >= first), winner, label).astype(np.int32)
+    areas = shell.graph.areas
+    for number, thing in enumerate(cut.things, start=first):
+        kept = areas[thing.vertices[refined[thing.vertices] == number]].sum()
+        if kept < _LEAST_KEPT * areas[thing.vertices].sum():
+            refined[thing.vertices] = number
+    things = [
+        replace(thing, vertices=np.flatnonzero(refined == number))
+        for number, thing in enumerate(cut.things, start=first)
+    ]
+    renewed = {id(old): new for old, new in zip(cut.things, things)}
+    for thing in things:
+        thing.rests_on = renewed.get(id(thing.rests_on))
+    return Cut(things, np.where(refined < first, refined, 0).astype(np.int32))
+
+
+def _drawn(
+    label: np.ndarray, surface: Surface, posed: PosedFrames, depth: DepthMaps, config: InstancesConfig
+) -> FrameMasks:
+    """Return the labeled surface as masks of keyframes spread over the film."""
+    camera, count = depth.camera, len(posed.images)
+    rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int))
+    ids = np.zeros((len(rows), camera.height, camera.width), np.uint16)
+    for k, row in enumerate(rows):
+        image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        measured = np.where(depth.confidence[row] > 0, depth.depth[row], 0).astype(np.float32)
+        pose = np.asarray(posed.world_from_camera[row])
+        ids[k] = render_id_map(surface, label, depth, image, measured, pose, config)
+    return FrameMasks(camera, posed.indices[rows], posed.world_from_camera[rows], ids)
