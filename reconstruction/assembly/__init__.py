@@ -19,7 +19,7 @@ from reconstruction.types import AssembledScene, AssetSet, PlacedObject, SceneGr
 from registry.errors import SimReconError
 from registry.simulation import TIMESTEP_S, BodySpec, build_physics, physics_report, pose_change
 
-VERSION = 3
+VERSION = 4
 
 
 def assemble(

@@ -7,6 +7,9 @@ from reconstruction.assembly.base import convex_part
 from reconstruction.types import ConvexPart
 
 _MIN_THICKNESS_M = 5e-4
+_LEG_M = 0.008
+_LEG_REACH_M = 0.02  # a leg ends at the lowest piece this near
+_MIN_LEG_M = 0.01
 
 
 def cut(parts: tuple[ConvexPart, ...], normal: np.ndarray, offset: float) -> tuple[ConvexPart, ...]:
@@ -59,6 +62,28 @@ def flatten_foot(parts: tuple[ConvexPart, ...], up: np.ndarray, band_m: float) -
         made = _hull(np.concatenate([points, points[low] - height[low, None] * up]))
         out.append(part if made is None else made)
     return tuple(out)
+
+
+def with_legs(parts: tuple[ConvexPart, ...]) -> tuple[ConvexPart, ...]:
+    """Add slim legs below the four corners of a shape that stand in the air, object space (+z up).
+
+    They reach from the shape's lowest height to its underside at the corner, and stay within its outline. A shape
+    whose corners all reach down is returned as it is.
+    """
+    points = np.concatenate([np.asarray(part.vertices, np.float64) for part in parts])
+    low, middle = points[:, 2].min(), 0.5 * (points.min(axis=0) + points.max(axis=0))[:2]
+    legs = []
+    for toward in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        corner = points[np.argmax(points[:, :2] @ np.array(toward)), :2]
+        inward = np.sign(middle - corner)
+        center = corner + 0.5 * _LEG_M * inward
+        near = np.abs(points[:, :2] - center).max(axis=1) < _LEG_REACH_M
+        underside = points[near, 2].min()
+        if underside - low < _MIN_LEG_M:
+            continue
+        x, y = (center[axis] + 0.5 * _LEG_M * np.array([-1, 1]) for axis in range(2))
+        legs.append(convex_part(np.array([(a, b, c) for a in x for b in y for c in (low, underside)])))
+    return (*parts, *legs) if legs else parts
 
 
 def _hull(points: np.ndarray) -> ConvexPart | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.assembly.base import base_slabs
-from reconstruction.assembly.collision import cut, flatten_foot
+from reconstruction.assembly.collision import cut, flatten_foot, with_legs
 from reconstruction.assembly.config import AssemblyConfig
 from reconstruction.assembly.tops import level_tops
 from reconstruction.assembly.workbench import Settled, Workbench, make_clear, object_spec
@@ -274,6 +274,9 @@ class Placer:
             if best[0] < 1.0:
                 return best[1]
             best = min(best, self._try(_flattened(item, band), item.pose), key=lambda found: found[0])
+        legged = _on_legs(item)
+        if best[0] >= 5.0 and legged is not item:
+            best = min(best, self._try(legged, item.pose), key=lambda found: found[0])
         for moved in self._shifted(item):
             # Moving an object away from where it was seen is worth it only where it would fall otherwise.
             if best[0] < 5.0:
@@ -355,6 +358,17 @@ def _flattened(item: Placement, band_mm: float) -> Placement:
     parts = flatten_foot(item.unflattened, up, band_mm * 1e-3)
     kept = tuple(n for n in item.notes if not n.startswith("foot flattened"))
     return replace(item, parts=parts, band_mm=band_mm, notes=(*kept, f"foot flattened by {band_mm:g} mm"))
+
+
+def _on_legs(item: Placement) -> Placement:
+    """Give an upright thing that tips the legs that it must have had, since it stood; slim ones escape the depth."""
+    if item.pose[2, 2] < 1 - 1e-6:
+        return item
+    unflattened = with_legs(item.unflattened)
+    if unflattened is item.unflattened:
+        return item
+    item = item.noted("tips as it was seen: it got legs at its corners, in its collision shape only")
+    return replace(item, parts=unflattened, unflattened=unflattened)
 
 
 def _moved(item: Placement, shift: np.ndarray) -> Placement:

@@ -2,7 +2,7 @@
 
 Convex pieces span the bumps, the raised edge and the tilt of a reconstructed table top, so that things would
 float above it by as much. Under each child the pieces that stick out are cut off at the plane of the visible
-surface.
+surface, or hollowed out where it stands, if they belong to what rises around it.
 """
 
 import numpy as np
@@ -14,6 +14,8 @@ from reconstruction.types import ConvexPart
 
 _REACH_M = 0.04  # how far a child's underside may be from the surface that carries it
 _MIN_OVERSHOOT_M = 0.002
+_MIN_HOLLOW_M = 0.004
+_HOLLOW_MARGIN_M = 0.008  # an underside is known as the centers of its cells
 _MAX_CUT_M = 0.04
 _MAX_SHARE_LOST = 0.15  # of the visible surface; more means that the piece is a wall, not a bump
 _FIT_BAND_M = 0.015
@@ -43,20 +45,49 @@ def level_tops(
     tree = cKDTree(surface.up[:, :2])
     resting = [under for child in children if len(under := _surface_under(child, surface, tree)) >= 5]
     pieces, deepest = list(parts), 0.0
-    for number in range(len(pieces)):
-        for under in resting:
-            world = np.asarray(pieces[number].vertices, np.float64) @ rotation.T + origin
-            if _overshoot(world, under) < _MIN_OVERSHOOT_M:
-                continue
-            plane = _visible_plane(world, surface.up, float(np.median(under[:, 2])))
-            if plane is None:
-                continue
-            normal, offset = plane
-            depth = float((world @ normal + offset).max())
-            made = cut((pieces[number],), -normal @ rotation, -(normal @ origin + offset))
-            if 0 < depth <= _MAX_CUT_M and made:
-                pieces[number], deepest = made[0], max(deepest, depth)
+    for under in resting:
+        made: list[ConvexPart] = []
+        for piece in pieces:
+            lowered, depth = _lowered(piece, under, surface.up, rotation, origin)
+            made += lowered
+            deepest = max(deepest, depth)
+        pieces = made
     return (tuple(pieces), deepest) if deepest > 0 else (parts, 0.0)
+
+
+def _lowered(
+    piece: ConvexPart, under: np.ndarray, up: np.ndarray, rotation: np.ndarray, origin: np.ndarray
+) -> tuple[tuple[ConvexPart, ...], float]:
+    """Bring a piece down to the visible surface under one child: what is left of it, and the depth of the cut."""
+    world = np.asarray(piece.vertices, np.float64) @ rotation.T + origin
+    rise = _overshoot(world, under)
+    if rise < _MIN_OVERSHOOT_M:
+        return (piece,), 0.0
+    level = float(np.median(under[:, 2]))
+    plane = _visible_plane(world, up, level)
+    if plane is not None:
+        normal, offset = plane
+        depth = float((world @ normal + offset).max())
+        made = cut((piece,), -normal @ rotation, -(normal @ origin + offset))
+        if 0 < depth <= _MAX_CUT_M and made:
+            return made, depth
+    # What rises around the child is there (a plate's rim): only the place where it stands is cut free.
+    made = _hollowed(piece, under[:, :2], level, rotation, origin) if rise >= _MIN_HOLLOW_M else ()
+    return (made, rise) if made else ((piece,), 0.0)
+
+
+def _hollowed(
+    piece: ConvexPart, place: np.ndarray, level: float, rotation: np.ndarray, origin: np.ndarray
+) -> tuple[ConvexPart, ...]:
+    """Split a piece around the octagon about a place (n, 2), world, and cut it at a level within."""
+    out: tuple[ConvexPart, ...] = ()
+    rest: tuple[ConvexPart, ...] = (piece,)
+    for angle in np.arange(8) * np.pi / 4:
+        outward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        offset = float(outward @ origin - (place @ outward[:2]).max()) - _HOLLOW_MARGIN_M
+        out += cut(rest, outward @ rotation, offset)
+        rest = cut(rest, -outward @ rotation, -offset)
+    return out + cut(rest, -rotation[2], level - float(origin[2]))
 
 
 def _surface_under(child: SampledObject, surface: SampledObject, tree: cKDTree) -> np.ndarray:

@@ -6,7 +6,7 @@ from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, 
 
 __all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets")
 
-VERSION = 6
+VERSION = 7
 
 
 def build_assets(

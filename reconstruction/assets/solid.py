@@ -168,8 +168,13 @@ def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Soli
     body = manifold3d.Manifold(mesh)
     if body.status() != manifold3d.Error.NoError:
         return solid
+    light = body
     for factor in (0.3, 0.6, 1.0, 2.0, 4.0):
-        light = body.simplify(tolerance_m * factor)
+        made = body.simplify(tolerance_m * factor)
+        # A tolerance above a body's thickness takes all of it.
+        if made.is_empty():
+            break
+        light = made
         if light.num_tri() <= max_faces:
             break
     return from_manifold(light)

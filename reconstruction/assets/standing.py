@@ -17,6 +17,9 @@ _SAME_LEVEL_M = 0.015
 # No camera sees the board below a thing, but something carries it: at least this much is there.
 _BOARD_M = 0.02
 _FOOTPRINT_SHRINK_M = 0.006
+_SMEAR_REACH_M = 0.06  # depth of a thing smears as far onto what is around it
+_RISE_M = 0.004
+_LEVEL_AROUND = 0.8  # of a rise's outline, where its carrier is at the level of what stands beside it
 
 
 @dataclass(frozen=True)
@@ -102,8 +105,9 @@ def without_children(
 ) -> ObjectVolume:
     """Free the space that children fill, and fill in what they stand on.
 
-    Free is what lies above their contact, within their footprint grown by `grow_m`. Solid is a board right below the
-    contact, within the footprint: it was hidden by the child.
+    Free is what lies above their contact, within their footprint grown by `grow_m` and where their smeared depth
+    raises the carrier (`_smeared`). Solid is a board right below the contact, within the footprint: it was hidden by
+    the child.
     """
     if not standing:
         return volume
@@ -112,11 +116,17 @@ def without_children(
     grid_from_world = invert_rigid(frame.world_from_grid)
     x, y, z = (volume.centers(axis) for axis in range(3))
     plane = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    for s in standing:
-        corners = transform_points(
-            grid_from_world, np.column_stack([s.outline, np.full(len(s.outline), s.level_m)])
-        )
-        inside = _within(plane, corners[:, :2], grow_m).reshape(len(x), len(y))
+    corners_of = [
+        transform_points(grid_from_world, np.column_stack([s.outline, np.full(len(s.outline), s.level_m)]))
+        for s in standing
+    ]
+    shape = (len(x), len(y))
+    filled = [_within(plane, corners[:, :2], grow_m).reshape(shape) for corners in corners_of]
+    every = np.any(filled, axis=0)
+    for s, corners, own in zip(standing, corners_of, filled):
+        near = _within(plane, corners[:, :2], _SMEAR_REACH_M).reshape(shape)
+        top = corners[0, 2] + s.top_m - s.level_m
+        inside = own | _smeared(volume, near, every, float(corners[0, 2]), float(top)) if s.known else own
         above = z - corners[0, 2]
         # Exactly at the contact the carrier's surface comes out, so that the field stays smooth there.
         wanted = np.clip(above, 0.0, volume.trunc_m).astype(np.float32)
@@ -137,6 +147,43 @@ def without_children(
             known[:, :, k][core] = True
             free[:, :, k][core] = False
     return replace(volume, distance=distance, known=known, free=free, seen=seen)
+
+
+def _smeared(
+    volume: ObjectVolume, near: np.ndarray, filled: np.ndarray, level: float, top: float
+) -> np.ndarray:
+    """Tell which columns (nx, ny) of a carrier only seem raised, by the depth of a thing that stands beside them.
+
+    Args:
+        volume: the carrier.
+        near: bool (nx, ny) columns within reach of the thing's smear.
+        filled: bool (nx, ny) columns below the things on the carrier.
+        level: height at which the thing stands, grid frame.
+        top: its top, grid frame.
+
+    A rise is smear where all of it is near the thing and lower than it, and the carrier is at the thing's level all
+    around the rise. A rim goes on farther than that, or there is nothing beyond it.
+    """
+    from scipy.ndimage import binary_dilation, label
+
+    z = volume.centers(2)
+    solid = volume.known & (volume.distance < 0)
+    least = level + max(_RISE_M, 0.5 * volume.voxel_m)
+    raised = solid[:, :, z > least].any(axis=2) & ~filled
+    tall = solid[:, :, z > top + volume.voxel_m].any(axis=2)
+    at_level = (
+        solid[:, :, (z < least) & (z > level - _BOARD_M - volume.voxel_m)].any(axis=2) & ~raised & ~filled
+    )
+    out = np.zeros(raised.shape, bool)
+    rises, _ = label(raised, np.ones((3, 3)))
+    for number in np.unique(rises[near & raised]):
+        own = rises == number
+        around = binary_dilation(own, np.ones((3, 3))) & ~own & ~filled
+        if (own & ~near).any() or (own & tall).any() or not around.any():
+            continue
+        if at_level[around].mean() >= _LEVEL_AROUND:
+            out |= own
+    return out
 
 
 def _within(points: np.ndarray, outline: np.ndarray, grow_m: float) -> np.ndarray:

@@ -215,3 +215,30 @@ def test_a_small_thing_frozen_inside_furniture_is_cut_clear_of_it():
     assert held.moved_m < 0.1
     assert "inside a neighbor" in held.repair
     assert scene.physics_report["spawn_penetration_mm"] < 1.0
+
+
+def test_what_tips_as_it_was_seen_gets_the_legs_that_were_not():
+    # A rack of which depth found the board and one of its four wire legs.
+    board, leg = box_part((0.3, 0.4, 0.04), (0, 0, 0.16)), box_part((0.03, 0.03, 0.15), (-0.13, -0.18, 0.075))
+    scene, placed = build(room(thing(10, [board, leg], (0, 0, 0)), box(11, (0.1, 0.1, 0.1), (0.6, 0, 0))))
+    assert_at_rest(scene)
+    assert placed[10].moved_m < 2e-3
+    assert placed[10].turned_deg < 1
+    assert placed[10].dynamic
+    assert "legs" in placed[10].repair
+    assert len(placed[10].collision) == 5
+    assert "legs" not in placed[11].repair
+
+
+def test_a_bowl_stands_in_the_plate_whose_collision_shape_has_no_hollow():
+    bottom = box_part((0.26, 0.26, 0.01), (0, 0, 0.005))
+    rims = [box_part((0.26, 0.03, 0.03), (0, y, 0.015)) for y in (-0.115, 0.115)]
+    rims += [box_part((0.03, 0.26, 0.03), (x, 0, 0.015)) for x in (-0.115, 0.115)]
+    plate = thing(10, [bottom, *rims], (0, 0, 0), label="plate")
+    plate = replace(plate, collision=(box_part((0.26, 0.26, 0.03), (0, 0, 0.015)),))
+    scene, placed = build(room(plate, box(11, (0.12, 0.12, 0.08), (0, 0, 0.01))))
+    assert_at_rest(scene)
+    assert placed[11].moved_m < 3e-3
+    # The rim still stops what slides on the plate.
+    high = [p for p in placed[10].collision if p.vertices[:, 2].max() > 0.029]
+    assert min(np.abs(p.vertices[:, :2]).max(axis=1).min() for p in high) > 0.05

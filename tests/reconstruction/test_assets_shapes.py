@@ -7,7 +7,7 @@ from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.mass import mass_properties, physical_attributes
 from reconstruction.assets.materials import MATERIALS, choose_material
-from reconstruction.assets.solid import box_solid, from_manifold, lighten, to_manifold
+from reconstruction.assets.solid import _simplify_manifold, box_solid, from_manifold, lighten, to_manifold
 
 
 def bowl(outer=0.08, wall=0.006, height=0.06):
@@ -77,6 +77,13 @@ def test_decimation_keeps_the_solid_closed():
     assert len(light.faces) <= 500
     assert to_manifold(light) is not None
     assert light.volume == pytest.approx(ball.volume, rel=0.03)
+
+
+def test_a_sliver_thinner_than_the_tolerance_does_not_vanish():
+    manifold3d = pytest.importorskip("manifold3d")
+    ball = from_manifold(manifold3d.Manifold.sphere(0.002, 128))
+    light = _simplify_manifold(ball, 100, 0.01)
+    assert (light.extents > 0.5 * ball.extents).all()
 
 
 @pytest.mark.slow

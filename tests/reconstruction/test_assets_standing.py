@@ -1,0 +1,103 @@
+"""Things on a carrier: at which height they stand, and what of the carrier is only their smeared depth."""
+
+import numpy as np
+import pytest
+
+from reconstruction.assets.standing import Standing, without_children
+from reconstruction.assets.views import SeenPoints
+from reconstruction.assets.volume import ObjectFrame, ObjectVolume, support_height
+from reconstruction.types import Instance, InstanceSet
+
+PLATE = Instance(5, "plate", 0.5, np.array([0, 0, 0.415]), 0.0, np.array([0.22, 0.22, 0.02]), 4, False)
+NOTHING = InstanceSet(np.zeros(0, np.int32), (), (PLATE,), np.zeros((1, 2, 2), np.uint16))
+TOP_M = 0.40
+VOXEL_M = 0.01
+
+
+def seen(points: np.ndarray) -> SeenPoints:
+    up = np.tile([0, 0, 1.0], (len(points), 1))
+    return SeenPoints(points, up, np.zeros(len(points), np.int32), np.full(len(points), 0.002))
+
+
+def disc(radius: float, height: float) -> np.ndarray:
+    x, y = np.meshgrid(*(np.arange(-radius, radius, 0.004),) * 2)
+    inside = np.hypot(x, y) < radius
+    return np.column_stack([x[inside], y[inside], np.full(inside.sum(), height)])
+
+
+def carrier(height_at) -> SeenPoints:
+    """A top 60 cm wide whose height is a function of the distance from the plate's outline (r = 11 cm)."""
+    x, y = np.meshgrid(*(np.arange(-0.3, 0.3, 0.004),) * 2)
+    away = np.hypot(x, y) - 0.11
+    points = np.column_stack([x.ravel(), y.ravel(), height_at(away).ravel()])
+    return seen(points[away.ravel() > 0])
+
+
+def test_a_plate_stands_at_the_foot_of_the_slope_that_its_depth_smears_onto_the_table():
+    table = carrier(lambda away: TOP_M + np.clip(0.016 - 0.6 * away, 0, None))
+    level = support_height(PLATE, disc(0.11, TOP_M + 0.02), table, NOTHING)
+    assert level == pytest.approx(TOP_M, abs=1e-3)
+
+
+def test_a_thing_on_a_tray_stands_on_it_and_not_on_what_is_around_the_tray():
+    # The rim rises from 2 cm off the thing on; the tray's bottom beside it counts.
+    tray = carrier(lambda away: np.where(away < 0.02, TOP_M, TOP_M + 0.04))
+    level = support_height(PLATE, disc(0.11, TOP_M + 0.003), tray, NOTHING)
+    assert level == pytest.approx(TOP_M, abs=1e-3)
+
+
+def test_a_thing_on_a_narrow_step_stays_on_the_step():
+    # Two boards of one carrier, 6 cm apart in height: the lower one shows all around.
+    steps = carrier(lambda away: np.where(away < 0.024, TOP_M, TOP_M - 0.06))
+    level = support_height(PLATE, disc(0.11, TOP_M + 0.003), steps, NOTHING)
+    assert level == pytest.approx(TOP_M, abs=1e-3)
+
+
+def slab_with(ring) -> ObjectVolume:
+    """A board 60 x 60 x 10 cm, z = 0 at its top, raised by 3 cm where `ring` of the distance from the center says."""
+    x = -0.4 + (np.arange(80) + 0.5) * VOXEL_M
+    z = -0.15 + (np.arange(30) + 0.5) * VOXEL_M
+    a, b = np.meshgrid(x, x, indexing="ij")
+    height = np.where(ring(np.hypot(a, b)), 0.03, 0.0)
+    board = np.maximum(np.abs(a), np.abs(b)) < 0.3
+    distance = np.where(
+        board[..., None], np.abs(z - (height[..., None] - 0.1) / 2) - (height[..., None] + 0.1) / 2, 0.05
+    )
+    every = np.ones(distance.shape, bool)
+    free = distance > 0
+    return ObjectVolume(
+        np.array([-0.4, -0.4, -0.15]),
+        VOXEL_M,
+        0.05,
+        0.002,
+        distance.astype(np.float32),
+        every,
+        free,
+        every & ~free,
+    )
+
+
+def raised_columns(volume: ObjectVolume) -> int:
+    return int((volume.distance[:, :, volume.centers(2) > 0.01] < 0).any(axis=2).sum())
+
+
+def stand(volume: ObjectVolume) -> ObjectVolume:
+    frame = ObjectFrame(np.eye(4), np.zeros((0, 3)), np.zeros((0, 3)), True, None)
+    angle = np.arange(24) * np.pi / 12
+    outline = 0.08 * np.column_stack([np.cos(angle), np.sin(angle)])
+    return without_children(volume, frame, (Standing(5, 4, 0.0, True, outline, 0.1),), 0.01)
+
+
+def test_a_rise_that_is_only_around_a_thing_is_not_its_carrier():
+    smeared = slab_with(lambda r: r < 0.12)
+    made = stand(smeared)
+    assert raised_columns(smeared) > 400
+    assert raised_columns(made) == 0
+    # The board below it is whole.
+    assert (made.distance[20:60, 20:60, 10] < 0).all()
+
+
+def test_a_rim_that_goes_on_and_a_rim_with_nothing_beyond_it_stay():
+    for ring in (lambda r: (r > 0.11) & (r < 0.2), lambda r: r > 0.11):
+        rimmed = slab_with(ring)
+        assert raised_columns(stand(rimmed)) == raised_columns(rimmed)
