@@ -49,12 +49,6 @@ VARIANTS: tuple[Variant, ...] = (
     _oracle("depth", "scene", "depth"),
     _oracle("world", "scene", "world"),
     _oracle("instances", "scene", "instances"),
-    Variant(
-        "true-masks",
-        ("--set", "instances.masks=folder", "--set", f"instances.masks_path={GROUND_TRUTH}/instances"),
-        "the true masks of every tenth frame, lifted as any other tool's would be",
-        "scene",
-    ),
     _oracle("all", "scene", "poses", "depth", "world", "instances"),
 )
 BASELINE = "default"  # what the tables compare the other variants with

@@ -84,6 +84,7 @@ def test_the_digest_covers_input_and_truth(shelf):
 def test_an_oracle_needs_the_truth_that_it_gives(shelf):
     room, kitchen, photos, _ = find_captures([shelf])
     by_name = {variant.name: variant for variant in VARIANTS}
+    assert len(by_name) == len(VARIANTS)
     assert by_name["oracle-instances"].applies_to(room)
     assert not by_name["oracle-instances"].applies_to(kitchen)
     assert by_name["oracle-poses"].applies_to(kitchen)
