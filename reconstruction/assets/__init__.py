@@ -6,7 +6,7 @@ from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, 
 
 __all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets")
 
-VERSION = 7
+VERSION = 8
 
 
 def build_assets(

@@ -8,6 +8,7 @@ from reconstruction.assets.completion import CompletedField
 
 _LEG_SHARE, _LEG_HEIGHT_SHARE = 0.003, 0.4  # of the largest body's volume, of the thing's height
 _LEG_GAP_M, _LEG_OVERLAP_M = 0.06, 0.003
+_MAX_VOLUME_CHANGE = 0.1  # by decimation
 
 
 @dataclass(frozen=True)
@@ -171,8 +172,8 @@ def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Soli
     light = body
     for factor in (0.3, 0.6, 1.0, 2.0, 4.0):
         made = body.simplify(tolerance_m * factor)
-        # A tolerance above a body's thickness takes all of it.
-        if made.is_empty():
+        # A tolerance near a body's thickness eats it: a table's top layer is a few millimetres thin.
+        if abs(made.volume() - body.volume()) > _MAX_VOLUME_CHANGE * body.volume():
             break
         light = made
         if light.num_tri() <= max_faces:

@@ -79,11 +79,11 @@ def test_decimation_keeps_the_solid_closed():
     assert light.volume == pytest.approx(ball.volume, rel=0.03)
 
 
-def test_a_sliver_thinner_than_the_tolerance_does_not_vanish():
+def test_decimation_does_not_eat_what_is_thinner_than_its_tolerance():
     manifold3d = pytest.importorskip("manifold3d")
     ball = from_manifold(manifold3d.Manifold.sphere(0.002, 128))
     light = _simplify_manifold(ball, 100, 0.01)
-    assert (light.extents > 0.5 * ball.extents).all()
+    assert light.volume == pytest.approx(ball.volume, rel=0.11)
 
 
 @pytest.mark.slow
