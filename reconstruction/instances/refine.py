@@ -23,6 +23,8 @@ _MAX_FRAMES = 36
 _MIN_FRAMES = 2  # that see a vertex
 _SURE_SHARE = 0.6  # of them must put it elsewhere
 _LEAST_KEPT = 0.5  # of a thing's area: votes that take more are not trusted
+_LEAST_LOST = 0.03  # and what is less is the rim that every cut has, no skirt
+_LEAST_DRAWN = 0.75  # of a thing's pixels: a frame whose snapping takes more draws it too small to tell
 
 
 def refine_by_views(
@@ -56,8 +58,8 @@ def refine_by_views(
     refined = np.where(sure & (label >= first), winner, label).astype(np.int32)
     areas = shell.graph.areas
     for number, thing in enumerate(cut.things, start=first):
-        kept = areas[thing.vertices[refined[thing.vertices] == number]].sum()
-        if kept < _LEAST_KEPT * areas[thing.vertices].sum():
+        kept = areas[thing.vertices[refined[thing.vertices] == number]].sum() / areas[thing.vertices].sum()
+        if not _LEAST_KEPT <= kept < 1.0 - _LEAST_LOST:
             refined[thing.vertices] = number
     things = [
         replace(thing, vertices=np.flatnonzero(refined == number))
@@ -80,5 +82,17 @@ def _drawn(
         image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         measured = np.where(depth.confidence[row] > 0, depth.depth[row], 0).astype(np.float32)
         pose = np.asarray(posed.world_from_camera[row])
-        ids[k] = render_id_map(surface, label, depth, image, measured, pose, config)
+        drawn = render_id_map(surface, label, depth, image, measured, pose, replace(config, snap_radius_px=0))
+        snapped = render_id_map(surface, label, depth, image, measured, pose, config)
+        ids[k] = _without_eaten(drawn, snapped)
     return FrameMasks(camera, posed.indices[rows], posed.world_from_camera[rows], ids)
+
+
+def _without_eaten(drawn: np.ndarray, snapped: np.ndarray) -> np.ndarray:
+    """Return snapped ids (h, w), 0 around what is so small in this frame that snapping took much of it."""
+    count = int(max(drawn.max(), snapped.max())) + 1
+    whole = np.bincount(drawn.ravel(), minlength=count)
+    kept = np.bincount(drawn[drawn == snapped], minlength=count)
+    eaten = (kept < _LEAST_DRAWN * whole) & (whole > 0)
+    eaten[0] = False
+    return np.where(eaten[drawn] | eaten[snapped], 0, snapped).astype(np.uint16)
