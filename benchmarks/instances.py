@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.captures import Capture, find_captures
+from benchmarks.command import KEPT_RESULTS, guarded
 from benchmarks.instances_page import GROWTH_FILE, Measured, write_instances_page
 from benchmarks.machine import ROOT, describe_code, describe_machine
 from benchmarks.results import load_result, result_path
@@ -38,7 +39,6 @@ GROWTH_VOXELS_M = (0.028, 0.022, 0.018, 0.014, 0.011)  # about 30,000 to 230,000
 _GROWTH_VERTICES = (
     600_000  # more than the smallest voxels give: the bound on the mesh must not hide the growth
 )
-_KEPT_RESULTS = 64
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def stage_run(source: Path, work_dir: Path, words: Sequence[str]) -> Run:
     from reconstruction.commands.reconstruct import config_of, oracle_of
 
     arguments = build_parser().parse_args(["reconstruct", str(source), *words])
-    store = StageStore(work_dir, _KEPT_RESULTS)
+    store = StageStore(work_dir, KEPT_RESULTS)
     return Run(source, config_of(arguments), store, oracle=oracle_of(arguments))
 
 
@@ -283,14 +283,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 if everything has figures, 1 if something failed, 130 if interrupted."""
     arguments = build_parser().parse_args(argv)
-    try:
-        return _run(arguments)
-    except SimReconError as error:
-        print(f"benchmarks.instances: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("\ninterrupted; what is done is kept, the same command goes on from there", file=sys.stderr)
-        return 130
+    return guarded("benchmarks.instances", lambda: _run(arguments))
 
 
 def _run(arguments: argparse.Namespace) -> int:

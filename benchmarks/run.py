@@ -22,13 +22,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from benchmarks.captures import Capture, find_captures
+from benchmarks.command import KEPT_RESULTS, guarded
 from benchmarks.machine import ROOT, describe_code, describe_machine
 from benchmarks.results import Result, Status, last_line, load_result, load_results, result_path, save_result
 from benchmarks.table import DEFAULT_OUT, DEFAULT_PAGE, write_page
 from benchmarks.variants import VARIANTS, Variant, choose_variants, home_of, scene_id
-from registry.errors import SimReconError
 
-_KEPT_RESULTS = 64  # of each stage: no variant drops what another one shares
 _ERROR_LINES = 20
 _GRACE_S = 60.0  # for a command to stop after Ctrl-C
 
@@ -80,14 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 if everything has figures, 1 if something failed, 130 if interrupted."""
     arguments = build_parser().parse_args(argv)
-    try:
-        return _run(arguments)
-    except SimReconError as error:
-        print(f"benchmarks: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("\ninterrupted; what is done is kept, the same command goes on from there", file=sys.stderr)
-        return 130
+    return guarded("benchmarks", lambda: _run(arguments))
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -198,7 +190,7 @@ def run_variant(
 
     log.write_text("")
     _forget(registry, scene)
-    words = [str(capture.source), "--scene", scene, "--keep-results", str(_KEPT_RESULTS)]
+    words = [str(capture.source), "--scene", scene, "--keep-results", str(KEPT_RESULTS)]
     exit_code, error = command("reconstruct", *words, *variant.arguments_for(capture))
     if exit_code != 0:
         return result("reconstruct failed", exit_code, error)

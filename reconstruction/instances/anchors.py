@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from reconstruction.instances.addresses import Address
+from reconstruction.instances.id_maps import seen_vertices
 from reconstruction.instances.lens import Lens
 from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 from registry.errors import UsageError
@@ -72,15 +73,7 @@ class Footage:
 
     def seen_vertices(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Return int32 (h, w) at depth resolution: the surface vertex that each pixel shows, -1 = none."""
-        from reconstruction.rasterize import rasterize_mesh
-
-        surface = self.surface
-        raster = rasterize_mesh(surface.vertices, surface.faces, self.depth.camera, world_from_camera)
-        out = np.full(raster.face.shape, -1, np.int32)
-        hit = raster.face >= 0
-        corner = np.argmax(raster.barycentric[hit], axis=1)
-        out[hit] = np.asarray(surface.faces)[raster.face[hit], corner]
-        return out
+        return seen_vertices(self.surface, self.depth.camera, world_from_camera)[0]
 
 
 def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:

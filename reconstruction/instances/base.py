@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.progress import Progress
 from reconstruction.surface.base_planes import FittedPlane, plane_axes
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
@@ -13,7 +14,6 @@ _SKIRT_M = 0.05  # how far from a base plane its noise reaches
 _SKIRT_BESIDE_M = 0.06  # what is nearer than this to a part that stands out may be its foot
 _SKIRT_COLOR = 12.0
 _MIN_STANDING_M2 = 0.003
-_LIGHTNESS = np.array([0.5, 1.0, 1.0])
 
 
 def base_planes(surface: Surface) -> list[FittedPlane]:
@@ -95,5 +95,5 @@ def _skirt(graph: MeshGraph, piece: np.ndarray, plane: FittedPlane) -> np.ndarra
     if len(low) == 0 or len(members) == 0:
         return low
     nearest = members[cKDTree(graph.points[members]).query(graph.points[low])[1]]
-    contrast = np.linalg.norm((graph.lab[low] - graph.lab[nearest]) * _LIGHTNESS, axis=1)
+    contrast = np.linalg.norm((graph.lab[low] - graph.lab[nearest]) * LIGHTNESS_WEIGHT, axis=1)
     return low[contrast < _SKIRT_COLOR]

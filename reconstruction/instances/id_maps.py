@@ -6,7 +6,7 @@ import numpy as np
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import lab_from_rgb
-from reconstruction.types import DepthMaps, PosedFrames, Surface
+from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
 
 
 def render_id_maps(
@@ -22,36 +22,46 @@ def render_id_maps(
     camera = depth.camera
     maps = np.zeros((len(posed.images), camera.height, camera.width), np.uint16)
     progress.start(len(maps), "instance maps")
-    for i in range(len(maps)):
-        image = cv2.resize(posed.images[i], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        measured = np.where(depth.confidence[i] > 0, depth.depth[i], 0).astype(np.float32)
-        maps[i] = render_id_map(
-            surface, vertex_instance, depth, image, measured, np.asarray(posed.world_from_camera[i]), config
+    for row in range(len(maps)):
+        maps[row] = snapped_ids(
+            draw_ids(surface, vertex_instance, posed, depth, row), posed, depth, row, config
         )
         progress.advance()
     return maps
 
 
-def render_id_map(
-    surface: Surface,
-    vertex_instance: np.ndarray,
-    depth: DepthMaps,
-    image: np.ndarray,
-    measured: np.ndarray,
-    world_from_camera: np.ndarray,
-    config: InstancesConfig,
-) -> np.ndarray:
-    """Return uint16 (h, w) ids of one frame; `image` and `measured` depth are at depth resolution."""
+def seen_vertices(
+    surface: Surface, camera: Camera, world_from_camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface vertex that each pixel shows, int32 (h, w), -1 = none, and its z-depth, float32 (h, w)."""
     from reconstruction.rasterize import rasterize_mesh
 
-    raster = rasterize_mesh(surface.vertices, surface.faces, depth.camera, world_from_camera)
-    ids = np.zeros(raster.face.shape, np.uint16)
+    raster = rasterize_mesh(surface.vertices, surface.faces, camera, world_from_camera)
+    out = np.full(raster.face.shape, -1, np.int32)
     hit = raster.face >= 0
     corner = np.argmax(raster.barycentric[hit], axis=1)
-    ids[hit] = vertex_instance[np.asarray(surface.faces)[raster.face[hit], corner]]
+    out[hit] = np.asarray(surface.faces)[raster.face[hit], corner]
+    return out, raster.depth
+
+
+def draw_ids(
+    surface: Surface, vertex_instance: np.ndarray, posed: PosedFrames, depth: DepthMaps, row: int
+) -> np.ndarray:
+    """Return uint16 (h, w): the id of the surface that each pixel of a keyframe shows, borders as drawn."""
+    seen, drawn = seen_vertices(surface, depth.camera, np.asarray(posed.world_from_camera[row]))
+    measured = _measured(depth, row)
     # Where the measured depth is far in front of the drawn surface, something unmodelled is seen: no id.
-    contradicted = hit & (measured > 0) & (measured < 0.9 * raster.depth)
-    ids[contradicted] = 0
+    contradicted = (measured > 0) & (measured < 0.9 * drawn)
+    shown = (seen >= 0) & ~contradicted
+    ids = np.zeros(seen.shape, np.uint16)
+    ids[shown] = np.asarray(vertex_instance)[seen[shown]]
+    return ids
+
+
+def snapped_ids(
+    ids: np.ndarray, posed: PosedFrames, depth: DepthMaps, row: int, config: InstancesConfig
+) -> np.ndarray:
+    """Return the drawn ids (h, w) of a keyframe, their borders moved to edges of its image and its depth."""
     if config.snap_radius_px <= 0:
         return ids
     from reconstruction.instances._pixel_kernels import snap_borders
@@ -60,6 +70,10 @@ def render_id_map(
     kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
     signed = ids.astype(np.float32)
     band = cv2.dilate(signed, kernel) != cv2.erode(signed, kernel)
-    lab = lab_from_rgb(image)
-    ids = snap_borders(ids, band, lab, measured, radius, 2 * radius + 2)
-    return cv2.medianBlur(ids, 3)
+    size = (depth.camera.width, depth.camera.height)
+    lab = lab_from_rgb(cv2.resize(posed.images[row], size, interpolation=cv2.INTER_AREA))
+    return cv2.medianBlur(snap_borders(ids, band, lab, _measured(depth, row), radius, 2 * radius + 2), 3)
+
+
+def _measured(depth: DepthMaps, row: int) -> np.ndarray:
+    return np.where(depth.confidence[row] > 0, depth.depth[row], 0).astype(np.float32)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.convexity import MIN_BULGE, bulge, is_within
+from reconstruction.instances.merging import join
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -26,13 +27,7 @@ def merge_insides(graph: MeshGraph, things: list[Thing], progress: Progress) -> 
         container = next((t for t in things if t is not inner and _holds(graph, t, inner)), None)
         if container is None:
             continue
-        container.vertices = np.union1d(container.vertices, inner.vertices)
-        if container.rests_on is inner:
-            container.rests_on = inner.rests_on
-        for other in things:
-            if other.rests_on is inner and other is not container:
-                other.rests_on = container
-        things = [t for t in things if t is not inner]
+        things = join(things, inner, container)
         merged += 1
     if merged:
         progress.note(f"{merged} bottoms and inner sides are joined with the containers around them")

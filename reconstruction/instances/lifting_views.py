@@ -114,23 +114,30 @@ def _numbered(ids: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray]:
     return numbers, table
 
 
+@njit(cache=True, inline="always")
+def _project(point, camera_from_world, fx, fy, cx, cy):  # pragma: no cover - compiled
+    """Return a point's pixel (u, v) and z-depth; depth 0 where it is behind the camera or too near."""
+    m = camera_from_world
+    x, y, z = point
+    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    if depth < 0.05:
+        return 0.0, 0.0, 0.0
+    u = fx * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + cx
+    v = fy * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + cy
+    return u, v, depth
+
+
 @njit(cache=True)
 def _confirm(
     points, camera_from_world, fx, fy, cx, cy, measured, agrees, confirmed
 ):  # pragma: no cover - compiled
     """Set `confirmed` for vertices at which a keyframe measured depth."""
     height, width = measured.shape
-    m = camera_from_world
     for i in range(points.shape[0]):
         if confirmed[i]:
             continue
-        x, y, z = points[i]
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if depth < 0.05:
-            continue
-        u = fx * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + cx
-        v = fy * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + cy
-        if 0.0 <= u < width and 0.0 <= v < height:
+        u, v, depth = _project(points[i], camera_from_world, fx, fy, cx, cy)
+        if depth > 0.0 and 0.0 <= u < width and 0.0 <= v < height:
             found = measured[int(v), int(u)]
             confirmed[i] = found > 0.0 and abs(found - depth) < agrees * depth
 
@@ -141,22 +148,16 @@ def _look_up(
 ):  # pragma: no cover - compiled
     """Write the mask at each vertex that is seen into `out`."""
     height, width = drawn.shape
-    m = camera_from_world
     for i in range(points.shape[0]):
         if not confirmed[i]:
             continue
-        x, y, z = points[i]
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if depth < 0.05:
-            continue
-        u = fx * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + cx
-        v = fy * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + cy
-        if not (0.0 <= u < width and 0.0 <= v < height):
+        u, v, depth = _project(points[i], camera_from_world, fx, fy, cx, cy)
+        if not (depth > 0.0 and 0.0 <= u < width and 0.0 <= v < height):
             continue
         column, row = int(u), int(v)
         if drawn[row, column] <= 0.0 or depth > drawn[row, column] * (1.0 + slack):
             continue
-        dx, dy, dz = eye[0] - x, eye[1] - y, eye[2] - z
+        dx, dy, dz = eye[0] - points[i, 0], eye[1] - points[i, 1], eye[2] - points[i, 2]
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
         if dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2] < facing * distance:
             continue

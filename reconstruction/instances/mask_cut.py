@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell
@@ -26,7 +27,6 @@ _FLAT_SHARE = 0.5  # of a cluster's surface on floor or walls: it is base, or li
 _SEGMENT_SHARE = 0.25  # of a plane's surface: a part of the wall, no picture
 # A thing that lies flat on a plane shows in this share of it another color than the plane's; a shadow does not.
 _COLORED_SHARE, _OTHER_COLOR = 0.08, 8.0
-_LIGHTNESS_WEIGHT = np.array([0.5, 1.0, 1.0])  # of CIELAB: shading changes lightness
 _ON_WALL_M = 0.06
 _MIN_ATTACHED_M = 0.15
 
@@ -85,14 +85,14 @@ def _base_clusters(shell: Shell, label: np.ndarray, count: int) -> np.ndarray:
         ground = _color(graph, (label == main) & (shell.owner == number))
         for other in np.flatnonzero((area > 0.5 * on_base) & (area > 0)):
             large = area[other] > _SEGMENT_SHARE * table[:, number].sum()
-            colors = graph.lab[label == other] * _LIGHTNESS_WEIGHT
+            colors = graph.lab[label == other] * LIGHTNESS_WEIGHT
             differs = np.linalg.norm(colors - ground, axis=1) > _OTHER_COLOR
             base[other] |= bool(large or differs.mean() < _COLORED_SHARE)
     return base
 
 
 def _color(graph: MeshGraph, chosen: np.ndarray) -> np.ndarray:
-    return np.median(graph.lab[chosen] * _LIGHTNESS_WEIGHT, axis=0)
+    return np.median(graph.lab[chosen] * LIGHTNESS_WEIGHT, axis=0)
 
 
 def _without_fragments(

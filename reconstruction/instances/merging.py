@@ -24,11 +24,17 @@ def merge_pairs(
         if pair is None:
             return things, merged
         gone, kept = pair
-        kept.vertices = np.union1d(kept.vertices, gone.vertices)
-        if kept.rests_on is gone:
-            kept.rests_on = gone.rests_on
-        things = [thing for thing in things if thing is not gone]
-        for other in things:
-            if other.rests_on is gone:
-                other.rests_on = kept
+        things = join(things, gone, kept)
         merged += 1
+
+
+def join(things: list[Thing], gone: Thing, kept: Thing) -> list[Thing]:
+    """Merge one thing into another and return those that are left; what rested on it rests on the other then."""
+    kept.vertices = np.union1d(kept.vertices, gone.vertices)
+    if kept.rests_on is gone:
+        kept.rests_on = gone.rests_on
+    things = [thing for thing in things if thing is not gone]
+    for other in things:
+        if other.rests_on is gone:
+            other.rests_on = kept
+    return things

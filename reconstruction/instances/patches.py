@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _MAX_BEND_PER_M = 12.0  # a fillet of 8 cm radius: no crease
@@ -25,8 +26,6 @@ _SIDE_M = 0.03  # how far beside a contact its two sides are looked at
 _BEND_M = 0.022  # and how far for the crease
 _BLUR_M = 0.010  # color this close to a contact is mixed with the other side's
 _LEVEL = 0.6  # of a mean normal's z: a side that something can lie on
-# Shading changes lightness within one thing; two things mostly differ in hue or strongly in lightness.
-LIGHTNESS_WEIGHT = np.array([0.5, 1.0, 1.0], np.float32)
 
 
 @dataclass(frozen=True)

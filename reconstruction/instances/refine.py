@@ -7,12 +7,11 @@ to the edges of color there, and most frames then put the skirt where it belongs
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
-from reconstruction.instances.id_maps import render_id_map
+from reconstruction.instances.id_maps import draw_ids, snapped_ids
 from reconstruction.instances.lifting import vote
 from reconstruction.instances.lifting_views import view_masks
 from reconstruction.instances.masks.base import FrameMasks
@@ -75,17 +74,13 @@ def _drawn(
     label: np.ndarray, surface: Surface, posed: PosedFrames, depth: DepthMaps, config: InstancesConfig
 ) -> FrameMasks:
     """Return the labeled surface as masks of keyframes spread over the film."""
-    camera, count = depth.camera, len(posed.images)
+    count = len(posed.images)
     rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int))
-    ids = np.zeros((len(rows), camera.height, camera.width), np.uint16)
+    ids = np.zeros((len(rows), depth.camera.height, depth.camera.width), np.uint16)
     for k, row in enumerate(rows):
-        image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        measured = np.where(depth.confidence[row] > 0, depth.depth[row], 0).astype(np.float32)
-        pose = np.asarray(posed.world_from_camera[row])
-        drawn = render_id_map(surface, label, depth, image, measured, pose, replace(config, snap_radius_px=0))
-        snapped = render_id_map(surface, label, depth, image, measured, pose, config)
-        ids[k] = _without_eaten(drawn, snapped)
-    return FrameMasks(camera, posed.indices[rows], posed.world_from_camera[rows], ids)
+        drawn = draw_ids(surface, label, posed, depth, row)
+        ids[k] = _without_eaten(drawn, snapped_ids(drawn, posed, depth, row, config))
+    return FrameMasks(depth.camera, posed.indices[rows], posed.world_from_camera[rows], ids)
 
 
 def _without_eaten(drawn: np.ndarray, snapped: np.ndarray) -> np.ndarray:

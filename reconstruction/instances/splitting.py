@@ -7,9 +7,10 @@ from heapq import heappop, heappush
 
 import numpy as np
 
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.convexity import MIN_BULGE, bulge, is_within
-from reconstruction.instances.patches import LIGHTNESS_WEIGHT, Contacts, contacts_of, crease_patches, palette
+from reconstruction.instances.patches import Contacts, contacts_of, crease_patches, palette
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _SHORT_M = 0.03  # borders shorter than this count for less

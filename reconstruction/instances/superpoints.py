@@ -9,14 +9,13 @@ edges.
 import numpy as np
 from numba import njit
 
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.surface.mesh_graph import MeshGraph
 
 MAX_SIZE_M = 0.06  # diagonal of a patch's box
 _STRONG_ANGLE_DEG, _STRONG_COLOR = 35.0, 14.0  # between neighbors: never joined
 _MEAN_ANGLE_DEG, _MEAN_COLOR = 25.0, 10.0  # between patches
 _CRUMB_M2 = 6e-5  # a patch below this has no direction of its own: only edges keep it apart
-# Shading changes lightness within one thing.
-_LIGHTNESS_WEIGHT = np.array([0.5, 1.0, 1.0])
 
 
 def superpoints(graph: MeshGraph, max_size_m: float = MAX_SIZE_M) -> np.ndarray:
@@ -24,7 +23,7 @@ def superpoints(graph: MeshGraph, max_size_m: float = MAX_SIZE_M) -> np.ndarray:
     count = len(graph.points)
     if count == 0:
         return np.zeros(0, np.int32)
-    lab = np.ascontiguousarray(graph.lab, np.float64) * _LIGHTNESS_WEIGHT
+    lab = np.ascontiguousarray(graph.lab, np.float64) * LIGHTNESS_WEIGHT
     normals = np.ascontiguousarray(graph.normals, np.float64)
     a, b = graph.edges[:, 0], graph.edges[:, 1]
     cosine = np.clip(np.einsum("ij,ij->i", normals[a], normals[b]), -1.0, 1.0)
