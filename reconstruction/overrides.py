@@ -172,28 +172,37 @@ def _addressed(entry: dict, objects: dict[int, "ObjectAsset"], pointer: "Pointer
 def _with_physics(item: "ObjectAsset", entry: dict) -> "ObjectAsset":
     physics = item.physics
     if "material" in entry:
-        from reconstruction.assets.materials import MATERIALS
+        from reconstruction.assets.physics.materials import MATERIALS
+        from reconstruction.types import PhysicalRanges
 
         if entry["material"] not in MATERIALS:
             raise UsageError(
                 f"overrides: no material {entry['material']!r}; there are {', '.join(sorted(MATERIALS))}"
             )
         chosen = MATERIALS[entry["material"]]
-        factor = chosen.density_kg_m3 / physics.density_kg_m3
+        density = chosen.density_kg_m3
+        factor = density.value / physics.density_kg_m3
+        mass = physics.mass_kg * factor
+        spread = (mass * density.low / density.value, mass * density.high / density.value)
         physics = replace(
             physics,
             material=entry["material"],
-            density_kg_m3=chosen.density_kg_m3,
-            friction=chosen.friction,
-            restitution=chosen.restitution,
-            mass_kg=physics.mass_kg * factor,
+            density_kg_m3=density.value,
+            friction=chosen.friction.value,
+            restitution=chosen.restitution.value,
+            mass_kg=mass,
             inertia=physics.inertia * factor,
+            ranges=PhysicalRanges(spread, chosen.friction[1:], chosen.restitution[1:]),
         )
-    if "mass_kg" in entry:
-        factor = entry["mass_kg"] / physics.mass_kg
-        physics = replace(physics, mass_kg=float(entry["mass_kg"]), inertia=physics.inertia * factor)
+    if "mass_kg" in entry:  # what the user says is so, not about so
+        mass = float(entry["mass_kg"])
+        inertia = physics.inertia * (mass / physics.mass_kg)
+        ranges = replace(physics.ranges, mass_kg=(mass, mass))
+        physics = replace(physics, mass_kg=mass, inertia=inertia, ranges=ranges)
     if "friction" in entry:
-        physics = replace(physics, friction=float(entry["friction"]))
+        friction = float(entry["friction"])
+        ranges = replace(physics.ranges, friction=(friction, friction))
+        physics = replace(physics, friction=friction, ranges=ranges)
     if physics is item.physics:
         return item
     return replace(item, physics=physics, provenance=replace(item.provenance, physics="user"))

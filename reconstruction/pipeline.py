@@ -114,8 +114,9 @@ class Run:
         options = ()
         if stage.name == "poses" and config.import_path and Path(config.import_path).exists():
             options += (digest_input(Path(config.import_path)),)
-        if stage.name == "instances":
-            options += importlib.import_module(stage.module).outside_inputs(config)
+        outside = getattr(importlib.import_module(stage.module), "outside_inputs", None)
+        if outside is not None:
+            options += outside(config)
         if self.oracle is not None and self.oracle.of_stage(stage.name):
             options += (self.oracle.of_stage(stage.name),)
 
@@ -314,10 +315,8 @@ def reconstruct(
     video = Path(video)
     if not video.exists():
         raise UsageError(f"{video}: no such file or folder")
-    if config is not None and config.instances.masks == "folder":
-        from reconstruction.instances.masks import load_mask_backend
-
-        load_mask_backend(config.instances)  # a wrong folder is said now, not minutes later
+    config = config or PipelineConfig()
+    _refuse_missing(config)
     registry = SceneRegistry(registry_root, create=True)
     holder = registry.hold(scene_id) if scene_id is not None else registry.reserve_next_id()
     with holder as held_id:
@@ -326,7 +325,7 @@ def reconstruct(
         folder = Path(work_dir) if work_dir else registry.root.parent / "work" / digest[:16]
         run = Run(
             video,
-            config or PipelineConfig(),
+            config,
             StageStore(folder, keep_results),
             overrides or Overrides(),
             oracle,
@@ -339,6 +338,22 @@ def reconstruct(
         record = publish_scene(run, registry, scene_id, require_stable=require_stable)
         run.store.note_published(scene_id, record.revision, run.keys)
     return Reconstruction(record, run)
+
+
+def _refuse_missing(config: PipelineConfig) -> None:
+    """Raise what a backend lacks now, not minutes later: a folder, an endpoint."""
+    if config.instances.masks == "folder":
+        from reconstruction.instances.masks import load_mask_backend
+
+        load_mask_backend(config.instances)
+    if config.instances.labels == "vlm":
+        from reconstruction.instances import load_namer
+
+        load_namer(config.instances)
+    if config.assets.physics != "table":
+        from reconstruction.assets.physics.load import load_physicist
+
+        load_physicist(config.assets)
 
 
 def _with_object_scale(run: Run) -> Run:

@@ -14,6 +14,7 @@ import numpy as np
 
 from reconstruction.assembly import base_slabs
 from reconstruction.assets.gltf import write_glb, write_obj
+from reconstruction.assets.physics.load import physics_backend
 from reconstruction.cache import canonical_json
 from reconstruction.gaussians import write_ply
 from reconstruction.instance_views import write_views
@@ -205,6 +206,7 @@ def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Pat
         "inertia": [[float(x) for x in row] for row in physics.inertia],
         "friction": float(physics.friction),
         "restitution": float(physics.restitution),
+        "ranges": {name: list(span) for name, span in dataclasses.asdict(physics.ranges).items()},
         "dynamic": bool(placed.dynamic),
         "relation_fixed": attached,
         "provenance": dataclasses.asdict(item.provenance),
@@ -271,6 +273,7 @@ def _backends(run: "Run") -> dict[str, str]:
         "gaussians": run.config.gaussians.backend,
         **instance_backends(run.config.instances),
         "assets": "embedded",
+        "physics": physics_backend(run.config.assets),
         "relations": "geometry",
     }
     if run.oracle is not None:

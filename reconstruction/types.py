@@ -256,6 +256,15 @@ class ConvexPart:
 
 
 @dataclass(frozen=True)
+class PhysicalRanges:
+    """Between what values a simulation may draw: (low, high), the value itself within."""
+
+    mass_kg: tuple[float, float]
+    friction: tuple[float, float]
+    restitution: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class PhysicalAttributes:
     """What the simulator needs besides shape; provenance is `AssetProvenance.physics`."""
 
@@ -266,6 +275,7 @@ class PhysicalAttributes:
     inertia: np.ndarray  # float64 (3, 3) about the centre of mass, object axes, kg m^2
     friction: float
     restitution: float
+    ranges: PhysicalRanges
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,9 @@ class BundleObject:
     )  # float64 (3, 3) about the centre of mass, object axes; None where the bundle has none
     friction: float
     restitution: float
+    ranges: dict[
+        str, tuple[float, float]
+    ]  # (low, high) of mass_kg, friction, restitution; {} where it has none
     dynamic: bool
     relation_fixed: bool  # attached to its parent rather than resting on it
     provenance: dict
@@ -195,6 +198,7 @@ class SceneBundle:
                 **{key: o[key] for key in plain},
                 collision=tuple(o["collision"]),
                 inertia=np.array(o["inertia"], np.float64) if "inertia" in o else None,
+                ranges={name: tuple(span) for name, span in o.get("ranges", {}).items()},
                 relation_fixed=o.get("relation_fixed", False),
                 views=tuple(o["views"]),
             )

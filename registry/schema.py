@@ -199,6 +199,8 @@ def _physics(item: dict, where: str) -> None:
     _vector(item, "center_of_mass", where, (3,), high=_MAX_METRES)
     _number(item, "friction", where, low=0, high=100)
     _number(item, "restitution", where, low=0, high=1)
+    if "ranges" in item:
+        _ranges(_mapping(item["ranges"], f"{where}.ranges"), item, f"{where}.ranges")
     if "relation_fixed" in item:
         _boolean(item, "relation_fixed", where)
     if "inertia" in item:
@@ -206,6 +208,15 @@ def _physics(item: dict, where: str) -> None:
         symmetric = np.allclose(inertia, inertia.T, rtol=1e-6, atol=1e-12)
         if not symmetric or np.linalg.eigvalsh(inertia).min() <= 0:
             _fail(f"{where}.inertia", "a symmetric positive definite 3x3 matrix", item["inertia"])
+
+
+def _ranges(spans: dict, item: dict, where: str) -> None:
+    for name, span in spans.items():
+        if name not in ("mass_kg", "friction", "restitution"):
+            _fail(f"{where}.{name}", "one of mass_kg, friction, restitution", name)
+        low, high = _vector(spans, name, where, (2,), high=1e7)
+        if not 0 <= low <= item[name] <= high:
+            _fail(f"{where}.{name}", f"low and high around {name} {item[name]}", span)
 
 
 def _edges(items: list, base_ids: set[int], object_ids: set[int]) -> None:

@@ -54,3 +54,16 @@ def test_the_overrides_that_are_shown_are_legal(tmp_path):
         path.write_text(text)
         assert len(Overrides.load(path).entries) >= 10
     assert Overrides.load(ROOT / "examples" / "data" / "demo_fixes.yaml").entries
+
+
+def test_the_table_of_materials_is_that_of_the_code():
+    from reconstruction.assets.physics.materials import MATERIALS
+
+    page = (ROOT / "docs" / "physics.md").read_text()
+    rows = {line.split("|")[1].strip(): line.split("|")[2:6] for line in page.splitlines() if "|" in line}
+    for name, material in MATERIALS.items():
+        cells = (material.density_kg_m3, material.friction, material.restitution, material.wall_m)
+        for cell, spread, unit in zip(rows[name], cells, (1, 1, 1, 1000), strict=True):
+            assert (
+                cell.strip() == f"{spread.value * unit:g} ({spread.low * unit:g} to {spread.high * unit:g})"
+            )

@@ -1,12 +1,13 @@
 """Stage 7, assets: complete, textured, simulation-ready objects, and floor and walls with their looks."""
 
 from reconstruction.assets.config import ASSETS_PRESETS, AssetsConfig
+from reconstruction.assets.physics.load import outside_inputs
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, Surface
 
-__all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets")
+__all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets", "outside_inputs")
 
-VERSION = 8
+VERSION = 9
 
 
 def build_assets(

@@ -9,8 +9,9 @@ from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.hanging import hanging_slab
-from reconstruction.assets.mass import physical_attributes
-from reconstruction.assets.materials import choose_material
+from reconstruction.assets.physics import MaterialChoice, physical_attributes
+from reconstruction.assets.physics.base import choice_for
+from reconstruction.assets.physics.load import load_physicist
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
@@ -55,9 +56,11 @@ def build_assets(
     pixels = prepare_pixels(posed, depth, instances.id_maps)
     stands = find_stands(posed, depth, pixels, instances)
     progress.advance()
+    physicist = load_physicist(config)
+    said = physicist.choose(instances, posed, progress=progress) if physicist else {}
     objects = []
     for item in instances.objects:
-        objects.append(build_object(item, posed, depth, pixels, instances, stands, config, progress))
+        objects.append(build_object(item, posed, depth, pixels, instances, stands, said, config, progress))
         progress.advance()
     base = build_base(posed, depth, instances, tuple(objects), pixels, config)
     progress.advance(len(instances.base))
@@ -66,7 +69,7 @@ def build_assets(
 
 def build_object(
     item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet,
-    stands: Stands, config: AssetsConfig, progress: Progress,
+    stands: Stands, said: dict[int, MaterialChoice], config: AssetsConfig, progress: Progress,
 ) -> ObjectAsset:  # fmt: skip
     """Build one asset: shape, looks, collision, physics. What fails on one shape is done again with a box."""
     name = f"object {item.id} ({item.label})"
@@ -74,7 +77,7 @@ def build_object(
         body, frame, how = object_solid(item, posed, depth, pixels, found, stands, config)
         if how == "box-fallback":
             progress.note(f"{name}: too little was seen of it, it became a box")
-        return _finish_object(item, body, frame, how, posed, depth, pixels, stands, config)
+        return _finish_object(item, body, frame, how, posed, depth, pixels, stands, said, config)
     # Compiled geometry libraries raise whatever they like on a degenerate shape, and one object must not cost the
     # scene; running out of memory is no property of the object.
     except MemoryError:
@@ -82,12 +85,12 @@ def build_object(
     except Exception as error:
         progress.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
     body, frame = box_fallback(item, np.zeros((0, 3)))
-    return _finish_object(item, body, frame, "box-fallback", posed, depth, pixels, stands, config)
+    return _finish_object(item, body, frame, "box-fallback", posed, depth, pixels, stands, said, config)
 
 
 def _finish_object(
     item: Instance, body: Solid, frame: ObjectFrame, how: str, posed: PosedFrames, depth: DepthMaps,
-    pixels: ScenePixels, stands: Stands, config: AssetsConfig,
+    pixels: ScenePixels, stands: Stands, said: dict[int, MaterialChoice], config: AssetsConfig,
 ) -> ObjectAsset:  # fmt: skip
     """Give a solid its looks, collision shape and mass."""
     body, world_from_object = to_object_space(body, frame)
@@ -107,7 +110,7 @@ def _finish_object(
         config,
         tolerance,
     )
-    choice = choose_material(item.label, item.label_confidence, baked.mean_rgb, body.extents)
+    choice = choice_for(item, said, baked.mean_rgb, body.extents)
     return ObjectAsset(
         id=item.id,
         label=item.label,
@@ -119,7 +122,7 @@ def _finish_object(
         provenance=AssetProvenance(
             geometry=how,
             appearance="baked from frames" if len(baked.frames) else "not seen",
-            physics=f"material table by {choice.reason}",
+            physics=choice.reason if item.id in said else f"material table by {choice.reason}",
             observed_fraction=baked.seen_share,
         ),
         views=posed.indices[baked.frames].astype(np.int32),

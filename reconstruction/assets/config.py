@@ -1,6 +1,7 @@
 """Configuration of the assets stage."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,11 @@ class AssetsConfig:
     """Concavity at which CoACD stops cutting; hollow things use 0.6 of it."""
     hull_vertices: int = 48
     """Most vertices of one convex piece (PhysX allows 255)."""
+    physics: Literal["table", "vlm"] = "table"
+    """Who says what things are made of and weigh: `table` by label, color and size; `vlm` asks an OpenAI-compatible
+    endpoint (see `SIMRECON_VLM_URL`), object by object, and the table decides where it has no usable answer."""
+    physics_model: str = ""
+    """For `vlm`: the model's name at the endpoint; empty is `SIMRECON_VLM_MODEL`."""
     seed: int = 0
     """Seed of the decomposition."""
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.mass import physical_attributes
-from reconstruction.assets.materials import MaterialChoice
+from reconstruction.assets.physics.mass import physical_attributes
+from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.solid import Solid, hull_solid, to_manifold
 from reconstruction.types import ObjectAsset, TexturedMesh
 from registry.errors import UsageError
@@ -49,12 +49,10 @@ def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = No
     faces = np.asarray(loaded.faces, np.int32)
     uvs, texture = _looks(loaded, len(vertices))
     body = to_manifold(Solid(vertices, faces)) or hull_solid(vertices)
-    choice = MaterialChoice(item.physics.material, False, 0.0, "user's mesh")
-    physics = replace(
-        physical_attributes(body, choice),
-        friction=item.physics.friction,
-        restitution=item.physics.restitution,
-    )
+    choice = MaterialChoice(item.physics.material, False, None, "user's mesh")
+    made, had = physical_attributes(body, choice), item.physics
+    ranges = replace(had.ranges, mass_kg=made.ranges.mass_kg)
+    physics = replace(made, friction=had.friction, restitution=had.restitution, ranges=ranges)
     return replace(
         item,
         visual=TexturedMesh(vertices.astype(np.float32), faces, uvs, texture),

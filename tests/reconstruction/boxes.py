@@ -10,6 +10,7 @@ from reconstruction.types import (
     ConvexPart,
     ObjectAsset,
     PhysicalAttributes,
+    PhysicalRanges,
     TexturedMesh,
 )
 from registry.geometry import rigid
@@ -42,7 +43,8 @@ def thing(number: int, parts, position, *, label="box", turn=None, mass=0.4, hin
     center, size = 0.5 * (points.min(0) + points.max(0)), np.ptp(points, axis=0)
     square = size**2
     inertia = np.diag(mass / 12 * (square.sum() - square))
-    physics = PhysicalAttributes("wood", 500.0, mass, center, inertia, 0.5, 0.1)
+    ranges = PhysicalRanges((mass, mass), (0.5, 0.5), (0.1, 0.1))
+    physics = PhysicalAttributes("wood", 500.0, mass, center, inertia, 0.5, 0.1, ranges)
     return ObjectAsset(
         number,
         label,

@@ -5,8 +5,8 @@ import pytest
 
 from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.mass import mass_properties, physical_attributes
-from reconstruction.assets.materials import MATERIALS, choose_material
+from reconstruction.assets.physics.mass import mass_properties, physical_attributes, shell_properties
+from reconstruction.assets.physics.materials import MATERIALS, MaterialChoice, choose_material
 from reconstruction.assets.solid import _simplify_manifold, box_solid, from_manifold, lighten, to_manifold
 
 
@@ -27,13 +27,60 @@ def test_mass_of_a_box_is_exact():
     np.testing.assert_allclose(inertia, np.diag(size @ size - size**2) * volume / 12, atol=1e-12)
 
 
+def test_inertia_of_a_shell_is_exact():
+    """Against a fine cloud of points on the surface of a bowl, which is thicker on one side than on the other."""
+    solid = bowl()
+    area, center, inertia = shell_properties(solid)
+    a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(areas), 200_000, p=areas / areas.sum())
+    u, v = rng.random((2, len(chosen), 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    points = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    away = points - points.mean(axis=0)
+    expected = area * (np.mean((away**2).sum(axis=1)) * np.eye(3) - away.T @ away / len(away))
+    assert area == pytest.approx(areas.sum())
+    np.testing.assert_allclose(center, points.mean(axis=0), atol=3e-4)
+    np.testing.assert_allclose(inertia, expected, atol=0.01 * expected.max())
+
+
 @pytest.mark.parametrize("name", sorted(MATERIALS))
-def test_physics_is_valid_for_every_material(name):
-    choice = choose_material("unknown", 0.0, np.full(3, 128.0), np.array([0.1, 0.1, 0.1]))
-    choice = type(choice)(name, True, 0.0, "test")
-    physics = physical_attributes(box_solid(np.array([-0.05, -0.05, 0]), np.array([0.05, 0.05, 0.2])), choice)
-    assert 0 < physics.mass_kg < 0.002 * physics.density_kg_m3 + 1e-9
+@pytest.mark.parametrize("hollow", [False, True])
+@pytest.mark.parametrize("filled", [None, (950.0, 1250.0)])
+@pytest.mark.parametrize("sure", [False, True])
+def test_physics_is_valid_and_within_its_ranges(name, hollow, filled, sure):
+    solid = box_solid(np.array([-0.05, -0.05, 0]), np.array([0.05, 0.05, 0.2]))
+    physics = physical_attributes(solid, MaterialChoice(name, hollow, filled, "test", sure))
+    assert 0 < physics.mass_kg < 0.002 * max(physics.density_kg_m3, filled[1] if filled else 0) + 1e-9
     assert np.linalg.eigvalsh(physics.inertia).min() > 0
+    for key in ("mass_kg", "friction", "restitution"):
+        low, high = getattr(physics.ranges, key)
+        assert low <= getattr(physics, key) <= high
+        assert high > low
+
+
+def test_a_guess_has_wider_ranges_than_a_label():
+    size, brown = np.array([0.1, 0.1, 0.1]), np.array([150.0, 100.0, 60.0])
+    solid = box_solid(np.zeros(3), size)
+    known = physical_attributes(solid, choose_material("wood block", 0.9, brown, size)).ranges
+    guess = physical_attributes(solid, choose_material("unknown", 0.0, brown, size)).ranges
+    for key in ("mass_kg", "friction", "restitution"):
+        (low, high), (least, most) = getattr(known, key), getattr(guess, key)
+        assert least <= low
+        assert high <= most
+    assert guess.mass_kg[1] > 2 * known.mass_kg[1]
+
+
+def test_a_package_is_between_empty_and_full():
+    """A half-liter can: 13 to 20 g of metal empty (0.2 to 0.3 mm walls), about half a kilo full."""
+    manifold3d = pytest.importorskip("manifold3d")
+    can = from_manifold(manifold3d.Manifold.cylinder(0.168, 0.033, 0.033, 48))
+    physics = physical_attributes(can, choose_material("can", 0.9, np.zeros(3), can.extents))
+    low, high = physics.ranges.mass_kg
+    assert 0.01 < low < 0.04
+    assert 0.5 < physics.mass_kg < 0.6
+    assert 0.6 < high < 0.8
 
 
 def test_the_last_word_of_a_label_names_the_thing():

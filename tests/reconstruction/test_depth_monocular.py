@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notes import Notes
 from test_depth import CAMERA, CONFIG, make_posed
 
 from reconstruction.depth import estimate_depth
@@ -14,20 +15,6 @@ from reconstruction.depth.views import plan_views
 from registry.errors import EnvironmentMissing, UsageError
 
 HOLE = (slice(20, 110), slice(60, 180))  # over the wall and the box: no plane fills it
-
-
-class Notes:
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-
-    def start(self, total: int, label: str) -> None:
-        pass
-
-    def advance(self, n: int = 1) -> None:
-        pass
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
 
 
 class Oracle:

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from notes import Notes
 from PIL import Image
 
 from reconstruction import frames
@@ -17,20 +18,6 @@ from reconstruction.synthetic.videos import (
     write_video,
 )
 from registry.errors import InputError, UsageError
-
-
-class Notes:
-    """Collects what the stage reports."""
-
-    def __init__(self):
-        self.notes = []
-
-    def start(self, total, label): ...
-
-    def advance(self, n=1): ...
-
-    def note(self, message):
-        self.notes.append(message)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tiny_models
 from chat_server import Server, chat
+from notes import Notes
 from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
 
 from reconstruction.instances import (
@@ -25,22 +26,6 @@ from reconstruction.vlm import Endpoint, VlmClient
 from registry.errors import EnvironmentMissing, UsageError
 
 HEIGHT, WIDTH = 60, 80
-
-
-class Notes:
-    """Keeps notes."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-
-    def start(self, total: int, what: str) -> None:
-        return
-
-    def advance(self, count: int = 1) -> None:
-        return
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
 
 
 def scene() -> tuple[InstanceSet, PosedFrames]:

@@ -7,27 +7,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from notes import Notes
 from scipy.spatial.transform import Rotation
 
 from reconstruction.cache import digest_input
 from reconstruction.frames import FramesConfig, load_frames
 from reconstruction.poses import PosesConfig, estimate_poses
-from reconstruction.progress import NoProgress
 from reconstruction.types import PosedFrames
 from registry.errors import InputError
 
 # ARKit's world has +y up.
 ARKIT_FROM_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-
-
-class Notes(NoProgress):
-    """Keeps what is said."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
 
 
 def tracked(truth: PosedFrames, noise_m: float, noise_deg: float) -> np.ndarray:

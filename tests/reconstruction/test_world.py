@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notes import Notes
 
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import Camera, DepthMaps, PosedFrames, VideoSource, WorldFrame
@@ -18,22 +19,6 @@ BOX_FACES = np.array(
         *([1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]),
     ]
 )
-
-
-class Notes:
-    """Keeps what a stage says."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def start(self, total: int, label: str) -> None:
-        pass
-
-    def advance(self, n: int = 1) -> None:
-        pass
-
-    def note(self, message: str) -> None:
-        self.said.append(message)
 
 
 def box(low: tuple, high: tuple, yaw_deg: float = 0.0, tilt_deg: float = 0.0) -> np.ndarray:
@@ -267,7 +252,7 @@ def test_a_table_top_is_no_floor():
     notes = Notes()
     world = find_world(posed, depth, WorldConfig(), progress=notes)
     assert not world.floor_observed
-    assert any("no floor is in view" in note for note in notes.said)
+    assert any("no floor is in view" in note for note in notes.notes)
     assert abs(errors(world, true)["floor_m"]) < 0.15
     assert world.scale.uncertainty > 0.2
     assert abs(np.log(errors(world, true)["scale"])) < 2 * world.scale.uncertainty
@@ -285,7 +270,7 @@ def test_a_wall_alone_gets_an_assumed_floor_below_everything():
     assert not world.floor_observed
     assert errors(world, true)["gravity_deg"] < 2.5  # the cameras' roll decides
     assert errors(world, true)["gravity_deg"] < 2.5 * world.gravity_sigma_deg
-    assert any("no floor is in view" in note for note in notes.said)
+    assert any("no floor is in view" in note for note in notes.notes)
     points = (
         np.stack([[x, 1.9, 0.55, 1] for x in (-0.5, 0.5)]) @ (world.world_from_sfm @ np.linalg.inv(true)).T
     )
@@ -355,7 +340,7 @@ def test_an_object_height_is_provisional_first_and_exact_then(room):
     notes = Notes()
     first = find_world(posed, depth, WorldConfig(scale="object:3.height=0.74"), progress=notes)
     assert first.scale.method == "camera-height-prior"
-    assert any("provisional" in note for note in notes.said)
+    assert any("provisional" in note for note in notes.notes)
     measured = 0.74 * errors(first, true)["scale"]
     config = WorldConfig(scale="object:3.height=0.74", object_measured_height_m=measured)
     second = find_world(posed, depth, config)

@@ -40,6 +40,7 @@ def object_entry(number: int, label: str, height_m: float) -> dict:
         "inertia": [[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]],
         "friction": 0.6,
         "restitution": 0.1,
+        "ranges": {"mass_kg": [2.0, 5.0], "friction": [0.4, 0.7], "restitution": [0.1, 0.1]},
         "dynamic": True,
         "relation_fixed": False,
         "provenance": {
