@@ -1,7 +1,7 @@
 """The bottom and the inner sides of a container belong to it, though creases and colors part them.
 
 What was put into a container has a shape of its own: its normals turn outwards around it. A piece of surface that lies
-within the outline of another thing, no lower and no higher than that, and does not bulge, is the inside of that thing.
+within the outline of another thing, hardly lower and no higher than that, and does not bulge, is its inside.
 """
 
 import numpy as np
@@ -14,6 +14,9 @@ from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _SLACK_M = 0.01
+_UNSEEN_FOOT_M = (
+    0.03  # outer sides are seen down to here above the bottom: skirts and shadows hide their foot
+)
 _TOUCH_M = 0.02
 
 
@@ -44,7 +47,7 @@ def _holds(graph: MeshGraph, container: Thing, inner: Thing) -> bool:
         return False
     low, high = np.percentile(graph.points[container.vertices, 2], [1, 99])
     bottom, top = np.percentile(graph.points[inner.vertices, 2], [1, 99])
-    if bottom < low - _SLACK_M or top > high + _SLACK_M:
+    if bottom < low - _UNSEEN_FOOT_M or top > high + _SLACK_M:
         return False
     if bottom > 0.5 * (low + high) + _SLACK_M:
         return False  # what lies on top, not at the bottom

@@ -135,8 +135,9 @@ def test_bulge_tells_a_hollow_from_a_sheet_from_a_thing(depth_m, low, high):
     assert low < bulge(graph, np.arange(len(graph.points))) < high
 
 
-def test_the_bottom_of_a_tray_is_joined_with_its_sides_and_what_lies_in_it_is_not():
-    """Both lie within the outline of the sides; only the thing bulges."""
+@pytest.mark.parametrize("seen_from_m", [0.01, 0.025])
+def test_the_bottom_of_a_tray_is_joined_with_its_sides_and_what_lies_in_it_is_not(seen_from_m):
+    """Both lie within the outline of the sides, also of sides of which no foot was seen; only the thing bulges."""
     can_in_tray = [
         can((0.0, 0.0), 0.035, 0.0, 0.1, RED),
         *tray((-0.2, -0.15, 0.0), (0.2, 0.15, 0.07), 0.014, WOOD),
@@ -145,7 +146,7 @@ def test_the_bottom_of_a_tray_is_joined_with_its_sides_and_what_lies_in_it_is_no
     points = graph.points
     in_can = np.linalg.norm(points[:, :2], axis=1) < 0.042
     in_bottom = (np.abs(points[:, 0]) < 0.18) & (np.abs(points[:, 1]) < 0.13) & ~in_can
-    in_sides = ~in_bottom & ~in_can & (points[:, 2] > 0.01)
+    in_sides = ~in_bottom & ~in_can & (points[:, 2] > seen_from_m)
     sides, bottom = (Thing(np.flatnonzero(chosen)) for chosen in (in_sides, in_bottom))
     inner = Thing(np.flatnonzero(in_can), rests_on=bottom)
     left = merge_insides(graph, [sides, bottom, inner], NO_PROGRESS)
