@@ -38,7 +38,7 @@ def find_instances(
     shell = Shell.of(surface, progress)
     progress.advance()
     if masks is None:
-        cut = cut_by_rules(shell, posed, depth, config, progress)
+        cut = cut_by_rules(shell, surface, posed, depth, config, progress)
         cut = refine_by_views(shell, cut, surface, posed, depth, config, progress)
     else:
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)

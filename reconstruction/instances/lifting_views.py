@@ -115,7 +115,7 @@ def _numbered(ids: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, inline="always")
-def _project(point, camera_from_world, fx, fy, cx, cy):  # pragma: no cover - compiled
+def project(point, camera_from_world, fx, fy, cx, cy):  # pragma: no cover - compiled
     """Return a point's pixel (u, v) and z-depth; depth 0 where it is behind the camera or too near."""
     m = camera_from_world
     x, y, z = point
@@ -136,7 +136,7 @@ def _confirm(
     for i in range(points.shape[0]):
         if confirmed[i]:
             continue
-        u, v, depth = _project(points[i], camera_from_world, fx, fy, cx, cy)
+        u, v, depth = project(points[i], camera_from_world, fx, fy, cx, cy)
         if depth > 0.0 and 0.0 <= u < width and 0.0 <= v < height:
             found = measured[int(v), int(u)]
             confirmed[i] = found > 0.0 and abs(found - depth) < agrees * depth
@@ -151,7 +151,7 @@ def _look_up(
     for i in range(points.shape[0]):
         if not confirmed[i]:
             continue
-        u, v, depth = _project(points[i], camera_from_world, fx, fy, cx, cy)
+        u, v, depth = project(points[i], camera_from_world, fx, fy, cx, cy)
         if not (depth > 0.0 and 0.0 <= u < width and 0.0 <= v < height):
             continue
         column, row = int(u), int(v)

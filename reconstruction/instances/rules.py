@@ -11,15 +11,21 @@ from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.scraps import without_fragments
 from reconstruction.instances.segmentation import Thing, segment
+from reconstruction.instances.stacks import cut_stacks
 from reconstruction.instances.stands import merge_stands
 from reconstruction.progress import Progress
 from reconstruction.surface.base_planes import FittedPlane
 from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import DepthMaps, PosedFrames
+from reconstruction.types import DepthMaps, PosedFrames, Surface
 
 
 def cut_by_rules(
-    shell: Shell, posed: PosedFrames, depth: DepthMaps, config: InstancesConfig, progress: Progress
+    shell: Shell,
+    surface: Surface,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: InstancesConfig,
+    progress: Progress,
 ) -> Cut:
     """Cut what stands above the base by connectivity, supports, creases and color; find pictures on the walls."""
     graph, planes, owner = shell.graph, shell.planes, shell.owner.copy()
@@ -38,6 +44,7 @@ def cut_by_rules(
     things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
+    things = cut_stacks(graph, surface, things, posed, depth, config, progress)
     things = without_fragments(graph, things, shell.base[0].observed, config, progress)
     for thing in things:
         if thing.attached:
