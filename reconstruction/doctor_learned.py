@@ -16,8 +16,8 @@ _PATIENCE_S = 3.0
 
 
 def learned_checks() -> list[Check]:
-    """Look for transformers, the weights of each backend's own choice, and the endpoint of a VLM."""
-    return [*_models(), _endpoint()]
+    """Look for transformers, the weights of each backend's own choice, the endpoint of a VLM, and generators."""
+    return [*_models(), _endpoint(), *generator_checks()]
 
 
 def _models() -> list[Check]:
@@ -78,3 +78,54 @@ def _served_models(url: str) -> list[str]:
     )
     response.raise_for_status()
     return [str(entry["id"]) for entry in response.json()["data"]]
+
+
+def generator_checks() -> list[Check]:
+    """Look which backends could generate objects; nothing is generated, and no picture is sent."""
+    return [_rodin(), _hunyuan(), *_local_generators()]
+
+
+def _rodin() -> Check:
+    from reconstruction.assets.generation import GenerationError
+    from reconstruction.assets.generation.rodin import RODIN_KEY, Rodin
+    from reconstruction.assets.generation.service import ServiceLimits
+
+    name = "assets.generator=rodin"
+    if not os.environ.get(RODIN_KEY):
+        return Check(name, False, f"{RODIN_KEY} is not set", f"set {RODIN_KEY} (docs/generation.md)", False)
+    try:
+        credits = Rodin("", "", 0, ServiceLimits(timeout_s=_PATIENCE_S)).balance()
+    except GenerationError as error:
+        return Check(name, False, str(error), f"correct {RODIN_KEY}", False)
+    return Check(name, True, f"the account has {credits:g} credits", "", False)
+
+
+def _hunyuan() -> Check:
+    import requests
+
+    from reconstruction.assets.generation.hunyuan import HUNYUAN_URL, HUNYUAN_VARIABLE
+
+    name, url = "assets.generator=hunyuan3d", os.environ.get(HUNYUAN_VARIABLE) or HUNYUAN_URL
+    fix = f"start its api_server.py, or set {HUNYUAN_VARIABLE} (docs/generation.md)"
+    try:
+        # Its servers know this page since 2.1; before that, "not found" is an answer, too.
+        requests.get(f"{url.rstrip('/')}/health", timeout=_PATIENCE_S)
+    except requests.RequestException as error:
+        return Check(name, False, f"nobody answers at {url} ({type(error).__name__})", fix, False)
+    return Check(name, True, f"a server answers at {url}", "", False)
+
+
+def _local_generators() -> list[Check]:
+    from reconstruction.assets.generation.local import Sam3D, Trellis
+    from registry.errors import SimReconError
+
+    checks = []
+    for backend in (Trellis("", 0), Sam3D("", 0)):
+        name = f"assets.generator={backend.name}"
+        try:
+            backend.check()
+        except SimReconError as error:
+            checks.append(Check(name, False, "not installed", str(error), False))
+        else:
+            checks.append(Check(name, True, "installed", "", False))
+    return checks

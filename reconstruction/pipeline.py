@@ -341,7 +341,7 @@ def reconstruct(
 
 
 def _refuse_missing(config: PipelineConfig) -> None:
-    """Raise what a backend lacks now, not minutes later: a folder, an endpoint."""
+    """Raise what a backend lacks now, not minutes later: a folder, an endpoint, a key."""
     if config.instances.masks == "folder":
         from reconstruction.instances.masks import load_mask_backend
 
@@ -354,6 +354,10 @@ def _refuse_missing(config: PipelineConfig) -> None:
         from reconstruction.assets.physics.load import load_physicist
 
         load_physicist(config.assets)
+    if config.assets.generator != "none":
+        from reconstruction.assets.generation import check_generator
+
+        check_generator(config.assets)
 
 
 def _with_object_scale(run: Run) -> Run:

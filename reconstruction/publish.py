@@ -272,7 +272,7 @@ def _backends(run: "Run") -> dict[str, str]:
         "depth": "plane-sweep",
         "gaussians": run.config.gaussians.backend,
         **instance_backends(run.config.instances),
-        "assets": "embedded",
+        "assets": _completion(run.config.assets.generator),
         "physics": physics_backend(run.config.assets),
         "relations": "geometry",
     }
@@ -281,6 +281,10 @@ def _backends(run: "Run") -> dict[str, str]:
             del backends["masks"], backends["labels"]
         backends |= dict.fromkeys(run.oracle.stages, "ground-truth")
     return backends
+
+
+def _completion(generator: str) -> str:
+    return "embedded" if generator == "none" else f"{generator}, embedded where it is rejected"
 
 
 def _versions() -> dict[str, str]:

@@ -24,6 +24,7 @@ import numpy as np
 import requests
 from pydantic import BaseModel, ValidationError
 
+from reconstruction.requesting import asked_pause, excerpt, write_whole
 from registry.errors import EnvironmentMissing, SimReconError
 
 _ANSWERS = 3  # times that an answer which does not fit is asked for
@@ -176,11 +177,11 @@ class VlmClient:
                 continue
             if response.ok:
                 return _text_of(response)
-            problem = f"HTTP {response.status_code}: {_excerpt(response.text)}"
+            problem = f"HTTP {response.status_code}: {excerpt(response.text)}"
             if response.status_code in (400, 422) and not self._refused.issuperset(_OPTIONAL):
                 self._refused.update(_OPTIONAL)
             elif response.status_code == 429 or response.status_code >= 500:
-                pause = max(pause, _asked_pause(response))
+                pause = max(pause, asked_pause(response))
             elif response.status_code in (400, 413, 422):
                 raise VlmError(f"{self.name}: the question was refused: {problem}")
             else:
@@ -213,25 +214,12 @@ def _text_of(response: requests.Response) -> str:
     except (ValueError, KeyError, IndexError, TypeError) as error:
         kind = response.headers.get("Content-Type", "no type")
         raise VlmUnavailable(
-            f"{response.url}: this is no chat completions endpoint ({kind}: {_excerpt(response.text)}). "
+            f"{response.url}: this is no chat completions endpoint ({kind}: {excerpt(response.text)}). "
             f"SIMRECON_VLM_URL is the base of the API, as in http://localhost:8000/v1"
         ) from error
     if isinstance(content, list):
         content = "".join(part.get("text", "") for part in content if isinstance(part, dict))
     return content if isinstance(content, str) else ""
-
-
-def _asked_pause(response: requests.Response) -> float:
-    """Return how many seconds the endpoint asks to wait, 0 where it does not say."""
-    try:
-        return max(0.0, float(response.headers.get("Retry-After", 0)))
-    except ValueError:  # a date
-        return 0.0
-
-
-def _excerpt(text: str) -> str:
-    words = " ".join(text.split())
-    return words if len(words) <= 200 else words[:200] + "..."
 
 
 def _map_images(messages: list[dict], turn: Callable[[np.ndarray], dict]) -> list[dict]:
@@ -268,19 +256,11 @@ def _described(messages: list[dict]) -> list[dict]:
 
 
 def _record(file: Path, exchange: dict, messages: list[dict]) -> None:
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        for message in messages:
-            for part in message["content"] if isinstance(message["content"], list) else ():
-                if part["type"] == "image":
-                    (file.parent / f"{_image_digest(part['image'])}.jpg").write_bytes(_jpeg(part["image"]))
-        partial = file.with_suffix(f".{os.getpid()}.tmp")
-        partial.write_text(json.dumps(exchange, indent=1))
-        partial.replace(file)
-    except OSError as error:
-        raise EnvironmentMissing(
-            f"{file.parent}: cannot keep answers there: {error.strerror or error}"
-        ) from error
+    for message in messages:
+        for part in message["content"] if isinstance(message["content"], list) else ():
+            if part["type"] == "image":
+                write_whole(file.parent / f"{_image_digest(part['image'])}.jpg", _jpeg(part["image"]))
+    write_whole(file, json.dumps(exchange, indent=1).encode())
 
 
 def _recorded(file: Path) -> str:

@@ -1,6 +1,6 @@
 """Stage 7: every instance becomes a closed, textured object with collision shape and mass; base surfaces get looks."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,6 +8,8 @@ from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.generation.complete import SurfaceColors, generated_shape
+from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
 from reconstruction.assets.hanging import hanging_slab
 from reconstruction.assets.physics import MaterialChoice, physical_attributes
 from reconstruction.assets.physics.base import choice_for
@@ -15,7 +17,7 @@ from reconstruction.assets.physics.load import load_physicist
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
-from reconstruction.assets.volume import ObjectFrame, frame_object, fuse_volume
+from reconstruction.assets.volume import ObjectFrame, ObjectVolume, frame_object, fuse_volume
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import (
     AssetProvenance,
@@ -25,11 +27,30 @@ from reconstruction.types import (
     InstanceSet,
     ObjectAsset,
     PosedFrames,
+    SpaceGrid,
     Surface,
 )
 from registry.geometry import rigid, transform_points
 
 _COVERED_SHARE = 0.75  # of what was seen, along each axis
+
+
+@dataclass(frozen=True)
+class Shape:
+    """An object's closed shape, and where it came from."""
+
+    body: Solid  # in the grid frame
+    frame: ObjectFrame
+    how: str
+    colors: SurfaceColors | None = None  # of what no frame saw, in world space
+
+
+@dataclass(frozen=True)
+class Generated:
+    """What a generator made, and what its meshes are held against."""
+
+    fetched: Fetched
+    space: SpaceGrid | None
 
 
 def build_assets(
@@ -44,7 +65,7 @@ def build_assets(
     Args:
         posed: Frames in world space.
         depth: Their depth maps in metres.
-        surface: The fused surface; objects are fused again, finer, from the depth maps.
+        surface: The fused surface; objects are fused again, finer, from the depth maps. Of it, the free space counts.
         instances: The things and which pixels show them.
         config: Resolution, budgets and limits.
         progress: Told of every object.
@@ -55,12 +76,16 @@ def build_assets(
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
     pixels = prepare_pixels(posed, depth, instances.id_maps)
     stands = find_stands(posed, depth, pixels, instances)
+    fetched = fetch_meshes(instances, posed, stands.seen, config, progress)
+    generated = None if fetched is None else Generated(fetched, surface.space)
     progress.advance()
     physicist = load_physicist(config)
     said = physicist.choose(instances, posed, progress=progress) if physicist else {}
     objects = []
     for item in instances.objects:
-        objects.append(build_object(item, posed, depth, pixels, instances, stands, said, config, progress))
+        objects.append(
+            build_object(item, posed, depth, pixels, instances, stands, said, config, progress, generated)
+        )
         progress.advance()
     base = build_base(posed, depth, instances, tuple(objects), pixels, config)
     progress.advance(len(instances.base))
@@ -70,30 +95,34 @@ def build_assets(
 def build_object(
     item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet,
     stands: Stands, said: dict[int, MaterialChoice], config: AssetsConfig, progress: Progress,
+    generated: Generated | None = None,
 ) -> ObjectAsset:  # fmt: skip
     """Build one asset: shape, looks, collision, physics. What fails on one shape is done again with a box."""
     name = f"object {item.id} ({item.label})"
     try:
-        body, frame, how = object_solid(item, posed, depth, pixels, found, stands, config)
-        if how == "box-fallback":
+        shape = object_shape(item, posed, depth, pixels, found, stands, config, generated)
+        if shape.how == "box-fallback":
             progress.note(f"{name}: too little was seen of it, it became a box")
-        return _finish_object(item, body, frame, how, posed, depth, pixels, stands, said, config)
+        if " rejected: " in shape.how:
+            progress.note(f"{name}: {shape.how.split('; ', 1)[1]}; the embedded completion stands in")
+        return _finish_object(item, shape, posed, depth, pixels, stands, said, config)
     # Compiled geometry libraries raise whatever they like on a degenerate shape, and one object must not cost the
     # scene; running out of memory is no property of the object.
     except MemoryError:
         raise
     except Exception as error:
         progress.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
-    body, frame = box_fallback(item, np.zeros((0, 3)))
-    return _finish_object(item, body, frame, "box-fallback", posed, depth, pixels, stands, said, config)
+    return _finish_object(
+        item, box_fallback(item, np.zeros((0, 3))), posed, depth, pixels, stands, said, config
+    )
 
 
 def _finish_object(
-    item: Instance, body: Solid, frame: ObjectFrame, how: str, posed: PosedFrames, depth: DepthMaps,
-    pixels: ScenePixels, stands: Stands, said: dict[int, MaterialChoice], config: AssetsConfig,
+    item: Instance, shape: Shape, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, stands: Stands,
+    said: dict[int, MaterialChoice], config: AssetsConfig,
 ) -> ObjectAsset:  # fmt: skip
     """Give a solid its looks, collision shape and mass."""
-    body, world_from_object = to_object_space(body, frame)
+    body, world_from_object = to_object_space(shape.body, shape.frame)
     levels = [s.level_m - float(world_from_object[2, 3]) for s in stands.on(item.id) if s.known]
     mapping, faces, uvs = texture.unwrap(body.vertices, body.faces)
     vertices = body.vertices[mapping]
@@ -109,6 +138,7 @@ def _finish_object(
         pixels,
         config,
         tolerance,
+        shape.colors,
     )
     choice = choice_for(item, said, baked.mean_rgb, body.extents)
     return ObjectAsset(
@@ -120,8 +150,8 @@ def _finish_object(
         collision=collision_parts(body, config, levels=tuple(levels)),
         physics=physical_attributes(body, choice),
         provenance=AssetProvenance(
-            geometry=how,
-            appearance="baked from frames" if len(baked.frames) else "not seen",
+            geometry=shape.how,
+            appearance=_appearance(baked, shape),
             physics=choice.reason if item.id in said else f"material table by {choice.reason}",
             observed_fraction=baked.seen_share,
         ),
@@ -131,6 +161,11 @@ def _finish_object(
     )
 
 
+def _appearance(baked: texture.Baked, shape: Shape) -> str:
+    seen = "baked from frames" if len(baked.frames) else ("not seen" if shape.colors is None else "none seen")
+    return seen if shape.colors is None else f"{seen}, the rest as it was generated"
+
+
 def to_object_space(body: Solid, frame: ObjectFrame) -> tuple[Solid, np.ndarray]:
     """Shift a solid of the grid frame so that its origin is at the bottom centre; return world_from_object too."""
     low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
@@ -138,23 +173,18 @@ def to_object_space(body: Solid, frame: ObjectFrame) -> tuple[Solid, np.ndarray]
     return Solid(body.vertices - origin, body.faces), frame.world_from_grid @ rigid(translation=origin)
 
 
-def object_solid(
-    item: Instance,
-    posed: PosedFrames,
-    depth: DepthMaps,
-    pixels: ScenePixels,
-    found: InstanceSet,
-    stands: Stands,
-    config: AssetsConfig,
-) -> tuple[Solid, ObjectFrame, str]:
+def object_shape(
+    item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet,
+    stands: Stands, config: AssetsConfig, generated: Generated | None = None,
+) -> Shape:  # fmt: skip
     """Return an object's closed shape in its grid frame, that frame, and how the shape was made."""
     seen = stands.seen[item.id]
     if len(seen.points) < config.min_points:
-        return *box_fallback(item, seen.points), "box-fallback"
+        return box_fallback(item, seen.points)
     frame = frame_object(item, seen, stands.level(item.id), found)
     hanging = hanging_slab(item.id, frame, posed, depth.camera, found, config)
     if hanging is not None:
-        return hanging.body, frame, "observed+slab" + ("+completed" if hanging.completed else "")
+        return Shape(hanging.body, frame, "observed+slab" + ("+completed" if hanging.completed else ""))
     noise = object_noise(posed, depth, pixels, seen, item.id)
     volume = fuse_volume(item.id, frame, noise, posed, depth, pixels, config)
     size = np.ptp(frame.points, axis=0)
@@ -162,23 +192,40 @@ def object_solid(
     # A container's rim may be close to what it holds; a table has none.
     grow = max(2.0 * volume.noise_m, volume.voxel_m, 0.012 if furniture else 0.004)
     volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))
+    attempt = None
+    if generated is not None:
+        attempt = generated_shape(
+            item.id, generated.fetched, frame, volume, generated.space, config, furniture=furniture
+        )
+        if attempt is not None and attempt.body is not None:
+            return Shape(attempt.body, frame, attempt.how, attempt.colors)
+    body, how = embedded_solid(volume, frame, config, furniture=furniture)
+    if body is None:
+        return box_fallback(item, seen.points)
+    return Shape(body, frame, how if attempt is None else f"{how}; {attempt.how}")
+
+
+def embedded_solid(
+    volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig, *, furniture: bool
+) -> tuple[Solid | None, str]:
+    """Return the embedded completion of what was seen, and how it was made; None where nothing solid comes of it."""
     field = completion.complete(volume, frame, config, furniture=furniture)
     body = solid.extract(field)
     if field.symmetries and not _covers(body, frame):
         field = completion.complete(volume, frame, replace(config, symmetry=False), furniture=furniture)
         body = solid.extract(field)
     if body is None or body.volume < 1e-7:
-        return *box_fallback(item, seen.points), "box-fallback"
+        return None, ""
     if frame.wall_y is None:
         tolerance = max(0.003, 1.5 * volume.noise_m, 0.8 * volume.voxel_m)
         cuboid = solid.fit_cuboid(frame.points, frame.normals, body, tolerance)
         if cuboid is not None:
-            return cuboid, frame, "observed+box"
+            return cuboid, "observed+box"
     on_bottom = np.abs(body.vertices[:, 2]) < 0.3 * volume.voxel_m
     body = solid.taubin(body, int(np.clip(round(3 + 6 * volume.noise_m / volume.voxel_m), 3, 15)), on_bottom)
     budget = config.faces_furniture if furniture else config.faces_small
     body = solid.lighten(body, budget, 0.3 * volume.voxel_m)
-    return body, frame, "observed+" + ("+".join(field.symmetries) or "carved")
+    return body, "observed+" + ("+".join(field.symmetries) or "carved")
 
 
 def _covers(body: Solid | None, frame: ObjectFrame) -> bool:
@@ -189,7 +236,7 @@ def _covers(body: Solid | None, frame: ObjectFrame) -> bool:
     return bool((body.extents > _COVERED_SHARE * seen).all())
 
 
-def box_fallback(item: Instance, points: np.ndarray) -> tuple[Solid, ObjectFrame]:
+def box_fallback(item: Instance, points: np.ndarray) -> Shape:
     """Return a box of the instance's extents standing where it was seen."""
     size = np.maximum(np.nan_to_num(item.extents_m, nan=0.02), 0.01)
     c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
@@ -198,4 +245,5 @@ def box_fallback(item: Instance, points: np.ndarray) -> tuple[Solid, ObjectFrame
     half = size / 2
     box = solid.box_solid(np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], size[2]]))
     local = (points - bottom) @ rotation
-    return box, ObjectFrame(rigid(rotation, bottom), local, np.zeros_like(local), False, None)
+    frame = ObjectFrame(rigid(rotation, bottom), local, np.zeros_like(local), False, None)
+    return Shape(box, frame, "box-fallback")

@@ -60,7 +60,31 @@ class AssetsConfig:
     physics_model: str = ""
     """For `vlm`: the model's name at the endpoint; empty is `SIMRECON_VLM_MODEL`."""
     seed: int = 0
-    """Seed of the decomposition."""
+    """Seed of the decomposition, and of a generator."""
+    generator: Literal["none", "rodin", "hunyuan3d", "trellis", "sam3d"] = "none"
+    """Who completes objects from pictures of them (docs/generation.md): a service (rodin costs credits), Hunyuan3D's
+    own server, or a model on this machine. What disagrees with the video is rejected, the embedded way stands in."""
+    generator_url: str = ""
+    """Address of the service; empty: Rodin's own, SIMRECON_HUNYUAN3D_URL or http://localhost:8081 for hunyuan3d."""
+    generator_model: str = ""
+    """Rodin's tier (Gen-2), TRELLIS' weights (a name or a folder), or the pipeline.yaml of SAM 3D Objects; for
+    hunyuan3d only a name that tells kept meshes of several models apart."""
+    generator_views: int = 1
+    """Most pictures of an object that are shown to the generator (hunyuan3d and sam3d take one)."""
+    generator_texture: bool = True
+    """Have hunyuan3d paint the mesh, too (a Hunyuan3D-2 server does with --enable_tex alone)."""
+    generator_poll: bool = False
+    """Ask hunyuan3d by /send and /status, where something in between cuts long requests."""
+    generator_budget: float = 0.0
+    """Credits that one run may spend. What would go beyond is not sent, and said."""
+    generator_timeout_s: float = 900.0
+    """Time limit of one object's generation."""
+    generator_max_mb: float = 100.0
+    """Largest mesh file that is taken."""
+    generator_missed: float = 0.15
+    """A mesh is rejected if a larger share of what was seen is farther from it than 1 cm and 3 % of the object."""
+    generator_intruding: float = 0.1
+    """A mesh is rejected if a larger share of its surface lies as deep in space that rays passed through."""
 
 
 ASSETS_PRESETS = {

@@ -7,12 +7,12 @@ import numpy as np
 
 from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.loaded import colors_of, load_mesh, picture_of, upright
 from reconstruction.assets.physics.mass import physical_attributes
 from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.solid import Solid, hull_solid, to_manifold
 from reconstruction.types import ObjectAsset, TexturedMesh
 from registry.errors import UsageError
-from registry.geometry import WORLD_FROM_GLTF
 
 
 def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = None) -> ObjectAsset:
@@ -26,23 +26,17 @@ def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = No
     Raises:
         UsageError: the file is missing or holds no usable mesh.
     """
-    import trimesh
-
     config = config or AssetsConfig()
     if not path.is_file():
         raise UsageError(f"overrides: the mesh {path} of object {item.id} does not exist")
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh raises whatever its many readers raise
-        raise UsageError(f"overrides: cannot read the mesh {path} of object {item.id}: {error}") from error
-    if len(getattr(loaded, "faces", ())) < 4:
-        raise UsageError(f"overrides: {path} of object {item.id} holds no mesh of at least 4 triangles")
-    vertices = np.asarray(loaded.vertices, np.float64)
-    if path.suffix.lower() in (".glb", ".gltf"):
-        vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
+        loaded = load_mesh(str(path))
+    except ValueError as error:
+        raise UsageError(f"overrides: the mesh {path} of object {item.id}: {error}") from error
+    vertices = upright(loaded.vertices, gltf=path.suffix.lower() in (".glb", ".gltf"))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = vertices - np.array([*(low + high)[:2] / 2, low[2]])
-    if not np.isfinite(vertices).all() or (high - low).max() > 20 or (high - low).max() < 1e-3:
+    if (high - low).max() > 20 or (high - low).max() < 1e-3:
         raise UsageError(
             f"overrides: {path} of object {item.id} is {(high - low).round(3)} m large; metres are expected"
         )
@@ -68,17 +62,12 @@ def _looks(loaded, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return uvs (v, 2) and a square texture of a trimesh; a plain colour where it has none."""
     import cv2
 
-    visual = loaded.visual
-    uv = getattr(visual, "uv", None)
-    material = getattr(visual, "material", None)
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if uv is not None and len(uv) == count and image is not None:
-        picture = np.asarray(image.convert("RGB"))
+    drawn = picture_of(loaded)
+    if drawn is not None:
+        uv, picture = drawn
         side = int(min(1024, max(picture.shape[:2])))
-        return np.asarray(uv, np.float32), cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
-    try:
-        color = np.asarray(visual.to_color().vertex_colors[:, :3], np.float64).mean(axis=0)
-    except (AttributeError, IndexError, ValueError):
-        color = np.full(3, 170.0)
+        return uv.astype(np.float32), cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+    colors = colors_of(loaded)
+    color = np.full(3, 170.0) if colors is None else colors.astype(np.float64).mean(axis=0)
     texture = np.broadcast_to(np.round(color).astype(np.uint8), (8, 8, 3)).copy()
     return np.full((count, 2), 0.5, np.float32), texture

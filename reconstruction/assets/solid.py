@@ -40,10 +40,10 @@ def extract(field: CompletedField) -> Solid | None:
     solid = Solid(field.origin + (vertices + 0.5) * field.voxel_m, faces.astype(np.int32))
     if solid.volume < 0:
         solid = Solid(solid.vertices, solid.faces[:, ::-1].copy())
-    return _without_crumbs(solid)
+    return without_crumbs(solid)
 
 
-def _without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
+def without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
     """Drop small bodies, and bodies inside others (closed cavities); legs that lost their joint are kept and reach up.
 
     A leg is slim, so that its share of the volume says little: what stands as high as much of the thing belongs to it.

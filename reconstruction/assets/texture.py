@@ -6,6 +6,7 @@ take colours from the nearest seen surface.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,6 +16,11 @@ from reconstruction.assets.views import ScenePixels
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import Camera, PosedFrames, TexturedMesh
 from registry.geometry import invert_rigid
+
+if TYPE_CHECKING:
+    from reconstruction.assets.generation.complete import SurfaceColors
+
+_GAIN = (0.6, 1.6)  # by which generated colors may be brought to those of the frames
 
 
 @dataclass(frozen=True)
@@ -156,8 +162,9 @@ def collect_colors(
 def bake_object(
     vertices_world: np.ndarray, faces: np.ndarray, uvs: np.ndarray, target: int, posed: PosedFrames,
     depth_camera: Camera, pixels: ScenePixels, config: AssetsConfig, tolerance_m: float,
+    beneath: "SurfaceColors | None" = None,
 ) -> Baked:  # fmt: skip
-    """Bake the texture of one object from the frames that see it."""
+    """Bake the texture of one object from the frames that see it; what none sees has the colors `beneath`, if any."""
     frames = choose_frames(posed, pixels, target, config.texture_frames)
     size = _texture_size(vertices_world, faces, uvs, frames, posed, config)
     texels = texels_of(vertices_world, faces, uvs, size)
@@ -170,7 +177,8 @@ def bake_object(
         borders.append(np.minimum(cv2.distanceTransform(mask, cv2.DIST_L2, 3), 6.0) / 6.0)
     looks = prepare_looks(posed, depth_camera, frames, depths, borders)
     color, seen, share = collect_colors(texels, looks, tolerance_m)
-    return _finish(texels, color, seen, size, frames, share)
+    filled = None if beneath is None else _looked_up(texels, color, seen, beneath)
+    return _finish(texels, color, seen, size, frames, share, filled)
 
 
 def _texture_size(
@@ -217,11 +225,15 @@ def exposure_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _finish(
-    texels: Texels, color: np.ndarray, seen: np.ndarray, size: int, frames: np.ndarray, share: np.ndarray
-) -> Baked:
-    """Fill unseen texels from the nearest seen surface, write the picture and grow charts over their borders."""
+    texels: Texels, color: np.ndarray, seen: np.ndarray, size: int, frames: np.ndarray, share: np.ndarray,
+    filled: np.ndarray | None = None,
+) -> Baked:  # fmt: skip
+    """Fill unseen texels (from `filled`, else from the nearest seen surface), and grow charts over their borders."""
     known = seen.copy()
-    if seen.any() and not seen.all():
+    if filled is not None:
+        color[~seen] = filled[~seen]
+        known[:] = True
+    elif seen.any() and not seen.all():
         # Every few texels is enough: what lies between is interpolated.
         step = 1
         while (~seen).sum() / step**2 > 6000:
@@ -232,12 +244,14 @@ def _finish(
     elif not seen.any():
         color[:] = 150.0
         known[:] = True
-    mean = color[seen].mean(axis=0) if seen.any() else np.full(3, 150.0)
+    mean = (
+        color[seen].mean(axis=0) if seen.any() else (np.full(3, 150.0) if filled is None else color.mean(0))
+    )
     picture = np.zeros((size, size, 3), np.float32)
-    filled = np.zeros((size, size), bool)
+    drawn = np.zeros((size, size), bool)
     picture[texels.rows[known], texels.columns[known]] = color[known]
-    filled[texels.rows[known], texels.columns[known]] = True
-    picture = push_pull(picture, filled)
+    drawn[texels.rows[known], texels.columns[known]] = True
+    picture = push_pull(picture, drawn)
     order = np.argsort(-share, kind="stable")
     used = [int(k) for k in order if share[k] > 0]
     return Baked(
@@ -246,6 +260,20 @@ def _finish(
         frames[used],
         mean,
     )
+
+
+def _looked_up(texels: Texels, color: np.ndarray, seen: np.ndarray, beneath: "SurfaceColors") -> np.ndarray:
+    """Return colors float32 (t, 3) of the nearest surface that faces alike, as bright as the frames have it."""
+    from scipy.spatial import cKDTree
+
+    size = max(float(np.ptp(texels.points, axis=0).max()), 1e-6)
+    own = np.concatenate([beneath.points, 0.05 * size * beneath.normals], axis=1)
+    nearest = cKDTree(own).query(np.concatenate([texels.points, 0.05 * size * texels.normals], axis=1))[1]
+    out = beneath.colors[nearest].astype(np.float32)
+    if seen.sum() > 50:
+        gain = np.median(color[seen], axis=0) / np.maximum(np.median(out[seen], axis=0), 1.0)
+        out = np.clip(out * np.clip(gain, *_GAIN), 0, 255).astype(np.float32)
+    return out
 
 
 def _from_neighbours(texels: Texels, color: np.ndarray, seen: np.ndarray, wanted: np.ndarray) -> np.ndarray:

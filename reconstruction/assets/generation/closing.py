@@ -1,0 +1,77 @@
+"""From a generated mesh, in its place, to one closed manifold solid; holes closed, thin sheets given thickness."""
+
+import numpy as np
+
+from reconstruction.assets.completion import CompletedField
+from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.generation.meshes import GeneratedMesh
+from reconstruction.assets.solid import Solid, extract, lighten, taubin, to_manifold, without_crumbs
+
+_CELLS_MORE = 1.4  # than the embedded completion uses: a generated mesh has no noise
+_SMOOTHING = 3
+
+
+def closed_solid(mesh: GeneratedMesh, config: AssetsConfig, budget: int) -> Solid | None:
+    """Return a mesh in metres as a closed solid of about `budget` faces; None where nothing solid is left.
+
+    Where the mesh is a closed manifold already its own surface is kept. Otherwise the space around it is flooded on a
+    grid, and what the flood does not reach is inside; the surface stays where the mesh has it.
+    """
+    own = to_manifold(_joined(mesh.vertices, mesh.faces))
+    if own is not None:
+        own = without_crumbs(own)
+    voxel = _voxel(mesh, config)
+    body = own if own is not None else extract(flooded(mesh, voxel, config.min_thickness_m))
+    if body is None:
+        return None
+    if own is None:
+        body = taubin(body, _SMOOTHING, np.abs(body.vertices[:, 2] - body.vertices[:, 2].min()) < 0.3 * voxel)
+    body = to_manifold(lighten(body, budget, 0.3 * voxel))
+    return body if body is not None and body.volume > 1e-7 else None
+
+
+def flooded(mesh: GeneratedMesh, voxel_m: float, thickness_m: float) -> CompletedField:
+    """Return a signed distance: near the surface by the side that it faces, elsewhere by what a flood reaches.
+
+    Where the flood gets in through a hole, what remains is a shell of `thickness_m`, inwards from the surface.
+    """
+    from scipy.ndimage import binary_dilation, label
+    from scipy.spatial import cKDTree
+
+    thickness_m = max(thickness_m, 2.0 * voxel_m)
+    reach = int(np.ceil(thickness_m / voxel_m)) + 1
+    pad = reach + 2
+    origin = mesh.points.min(axis=0) - pad * voxel_m
+    shape = np.ceil((mesh.points.max(axis=0) - origin) / voxel_m).astype(np.int64) + pad
+    crust = np.zeros(shape, bool)
+    crust[tuple(np.floor((mesh.points - origin) / voxel_m).astype(np.int64).T)] = True
+    near = binary_dilation(crust, np.ones((3, 3, 3), bool), iterations=reach)
+    centers = origin + (np.argwhere(near) + 0.5) * voxel_m
+    distance, nearest = cKDTree(mesh.points).query(centers)
+    front = np.einsum("nk,nk->n", centers - mesh.points[nearest], mesh.normals[nearest]) > 0
+    bodies, _ = label(~near)
+    outside = bodies == bodies[0, 0, 0]
+    touched = binary_dilation(outside)[near]
+    if touched.any() and front[touched].mean() < 0.5:  # a mesh inside out
+        front = ~front
+    field = np.where(outside, 1.0, -1.0) * reach * voxel_m
+    field[near] = np.where(front, distance, np.maximum(-distance, distance - thickness_m))
+    limit = 3.0 * voxel_m
+    return CompletedField(origin, voxel_m, np.clip(field, -limit, limit).astype(np.float32), ())
+
+
+def _voxel(mesh: GeneratedMesh, config: AssetsConfig) -> float:
+    size = np.maximum(mesh.extents, 1e-3)
+    finest = float(size.max()) / (_CELLS_MORE * config.cells_along_longest)
+    return max(finest, float((size.prod() / config.max_voxels) ** (1 / 3)), 0.5 * config.voxel_min_m)
+
+
+def _joined(vertices: np.ndarray, faces: np.ndarray) -> Solid:
+    """Join vertices in the same place: readers split them at texture seams."""
+    step = 1e-6 * max(float(np.ptp(vertices, axis=0).max()), 1e-9)
+    _, first, index = np.unique(
+        np.round(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    faces = index.ravel()[faces]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return Solid(vertices[first], faces[whole].astype(np.int32))

@@ -1,0 +1,126 @@
+"""Meshes of a scene's objects, made before the objects are built: what it costs is said first, and not exceeded."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.generation.base import (
+    GenerationBackend,
+    GenerationError,
+    GeneratorUnavailable,
+    ObjectPictures,
+)
+from reconstruction.assets.generation.load import load_generator, records_folder
+from reconstruction.assets.generation.pictures import object_pictures
+from reconstruction.assets.generation.records import Records
+from reconstruction.assets.views import SeenPoints
+from reconstruction.progress import Progress
+from reconstruction.types import InstanceSet, PosedFrames
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """What a generator made of a scene's objects."""
+
+    by: str  # the generator
+    meshes: dict[int, bytes]  # .glb files by object
+    refused: dict[int, str]  # why there is none, by object
+
+
+def fetch_meshes(
+    found: InstanceSet, posed: PosedFrames, seen: dict[int, SeenPoints], config: AssetsConfig, progress: Progress
+) -> Fetched | None:  # fmt: skip
+    """Have every object generated that stands and was seen well enough to be registered.
+
+    Args:
+        found: The objects.
+        posed: Their frames.
+        seen: Their seen points, by id.
+        config: Which generator, and what it may cost.
+        progress: Is told what will be sent and spent before it is, and what failed.
+
+    Returns:
+        None where no generator is asked for.
+    """
+    backend = load_generator(config)
+    if backend is None:
+        return None
+    records = Records(records_folder(), backend)
+    wanted = [
+        item
+        for item in found.objects
+        if not item.attached_hint and len(seen[item.id].points) >= config.min_points
+    ]
+    count = min(config.generator_views, backend.most_pictures)
+    pictures = object_pictures(found, posed, wanted, max(1, count))
+    # Those that were seen most first: they gain most where not all can be paid.
+    order = sorted(pictures, key=lambda number: (-len(seen[number].points), number))
+    allowed, refused = _within_budget([pictures[number] for number in order], records, backend, config)
+    _announce(allowed, refused, records, backend, config, progress)
+    meshes, failed = _make(allowed, records, backend)
+    for number, reason in sorted(failed.items()):
+        progress.note(f"object {number}: no mesh by {backend.name}: {reason}")
+    return Fetched(backend.name, meshes, refused | failed)
+
+
+def _within_budget(
+    pictures: list[ObjectPictures], records: Records, backend: GenerationBackend, config: AssetsConfig
+) -> tuple[list[ObjectPictures], dict[int, str]]:
+    """Return what may be asked for, and why the others may not."""
+    spent, allowed, refused = 0.0, [], {}
+    for one in pictures:
+        cost = 0.0 if records.is_paid(one) else backend.cost
+        if cost > 0 and spent + cost > config.generator_budget + 1e-9:
+            refused[one.id] = (
+                f"it would cost {cost:g} credits, over the budget of {config.generator_budget:g}"
+            )
+            continue
+        spent += cost
+        allowed.append(one)
+    return allowed, refused
+
+
+def _announce(
+    allowed: list[ObjectPictures], refused: dict[int, str], records: Records, backend: GenerationBackend,
+    config: AssetsConfig, progress: Progress,
+) -> None:  # fmt: skip
+    """Say what is about to be sent and spent."""
+    kept = sum(records.has(one) for one in allowed)
+    due = sum(not records.is_paid(one) for one in allowed)
+    parts = [f"{backend.name}: {len(allowed) - kept} objects are generated, {kept} are kept from before"]
+    if backend.sends_to and len(allowed) > kept:
+        parts.append(f"pictures of them go to {backend.sends_to}")
+    if backend.cost > 0:
+        parts.append(
+            f"{due * backend.cost:g} credits will be spent ({backend.cost:g} each, budget {config.generator_budget:g})"
+        )
+    progress.note("; ".join(parts))
+    if refused:
+        more = len(refused) * backend.cost
+        progress.note(
+            f"{backend.name}: {len(refused)} objects are not sent, they would cost {more:g} credits more: allow "
+            f"it with --set assets.generator_budget={due * backend.cost + more:g}"
+        )
+
+
+def _make(
+    allowed: list[ObjectPictures], records: Records, backend: GenerationBackend
+) -> tuple[dict[int, bytes], dict[int, str]]:
+    """Return meshes and failures; once a generator turns out to be away, nothing more is asked of it."""
+    gone: list[str] = []
+
+    def one(pictures: ObjectPictures) -> bytes | str:
+        if gone and not records.has(pictures):
+            return gone[0]
+        try:
+            return records.generate(pictures)
+        except GeneratorUnavailable as error:
+            gone.append(str(error))
+            return str(error)
+        except GenerationError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(max_workers=max(1, backend.at_once)) as pool:
+        results = list(pool.map(one, allowed))
+    meshes = {p.id: made for p, made in zip(allowed, results) if isinstance(made, bytes)}
+    return meshes, {p.id: made for p, made in zip(allowed, results) if isinstance(made, str)}

@@ -1,0 +1,48 @@
+"""Which pictures of an object a generator is shown, and what they are sent as."""
+
+import hashlib
+
+import cv2
+import numpy as np
+
+from reconstruction.assets.generation.base import ObjectPictures, Picture
+from reconstruction.types import Instance, InstanceSet, PosedFrames
+
+_LABEL_BELIEVED = 0.5
+
+
+def object_pictures(
+    found: InstanceSet, posed: PosedFrames, wanted: list[Instance], count: int
+) -> dict[int, ObjectPictures]:
+    """Return up to `count` pictures of each wanted object that some keyframe shows, by its id."""
+    views = keyframe_pictures(found, posed, count)  # the one place to choose other views
+    out = {}
+    for item in wanted:
+        if views.get(item.id):
+            label = item.label if item.label_confidence >= _LABEL_BELIEVED and item.label != "unknown" else ""
+            out[item.id] = ObjectPictures(item.id, label, tuple(views[item.id]))
+    return out
+
+
+def keyframe_pictures(found: InstanceSet, posed: PosedFrames, count: int) -> dict[int, list[Picture]]:
+    """Return the keyframes that show each object best, cropped, by its id."""
+    from reconstruction.instances.naming.views import best_views
+
+    return {
+        number: [Picture(view.crop, view.mask) for view in views if view.mask.any()]
+        for number, views in best_views(found, posed, count).items()
+    }
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """Return an RGB or RGBA image uint8 (h, w, c) as a PNG."""
+    how = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    return cv2.imencode(".png", cv2.cvtColor(image, how))[1].tobytes()
+
+
+def pixel_digest(picture: Picture) -> str:
+    """Return a name for what a picture shows (of its pixels, not of a file, which differs with its library)."""
+    digest = hashlib.sha256(str(picture.color.shape).encode())
+    digest.update(np.ascontiguousarray(picture.color).tobytes())
+    digest.update(np.packbits(picture.mask).tobytes())
+    return digest.hexdigest()[:32]

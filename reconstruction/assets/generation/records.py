@@ -1,0 +1,93 @@
+"""Kept generations: pictures, exchanges and meshes in a folder. What is in it is neither asked nor paid again.
+
+A record is named by a digest of everything that shapes the mesh: the generator, its settings, the label and the
+pixels. `DIGEST.glb` is the mesh, byte by byte as it came; `DIGEST.json` says from what and how; `DIGEST.pending.json`
+is a task that was begun and not fetched, so that a run that was stopped goes on with it instead of paying anew.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from reconstruction.assets.generation.base import GenerationBackend, GenerationError, Job, ObjectPictures
+from reconstruction.assets.generation.pictures import encode_png, pixel_digest
+from reconstruction.requesting import write_whole
+
+
+class Records:
+    """The folder, for one generator."""
+
+    def __init__(self, folder: Path, backend: GenerationBackend) -> None:
+        """Nothing is read or written yet."""
+        self._folder, self._backend = folder, backend
+
+    def any_kept(self) -> bool:
+        """Tell whether any mesh of this generator is kept."""
+        return any(self._folder.glob(f"{self._backend.name}-*.glb"))
+
+    def has(self, pictures: ObjectPictures) -> bool:
+        """Tell whether the mesh of these pictures is kept."""
+        return self._file(pictures, ".glb").is_file()
+
+    def is_paid(self, pictures: ObjectPictures) -> bool:
+        """Tell whether nothing more is to be paid for these pictures: kept, or under way."""
+        return self.has(pictures) or self._file(pictures, ".pending.json").is_file()
+
+    def generate(self, pictures: ObjectPictures) -> bytes:
+        """Return the mesh of an object, kept or made.
+
+        Raises:
+            GenerationError: there is none.
+        """
+        mesh = self._file(pictures, ".glb")
+        if mesh.is_file():
+            return mesh.read_bytes()
+        waiting = self._file(pictures, ".pending.json")
+        job = Job(_read_task(waiting), lambda task: _keep_task(waiting, task))
+        record = self._description(pictures)
+        try:
+            data = self._backend.generate(pictures, job)
+        except GenerationError as error:
+            self._note(pictures, record | {"exchanges": job.exchanges, "failed": str(error)})
+            raise
+        write_whole(mesh, data)
+        facts = {"cost_credits": self._backend.cost, "sha256": hashlib.sha256(data).hexdigest()}
+        self._note(pictures, record | facts | {"exchanges": job.exchanges})
+        return data
+
+    def _note(self, pictures: ObjectPictures, record: dict[str, Any]) -> None:
+        for picture in pictures.pictures:
+            shown = self._folder / f"{pixel_digest(picture)}.png"
+            if not shown.is_file():
+                write_whole(shown, encode_png(picture.cut_out()))
+        write_whole(self._file(pictures, ".json"), json.dumps(record, indent=1).encode())
+
+    def _description(self, pictures: ObjectPictures) -> dict[str, Any]:
+        return {
+            "generator": self._backend.name,
+            "settings": self._backend.settings(),
+            "label": pictures.label,
+            "pictures": [f"{pixel_digest(picture)}.png" for picture in pictures.pictures],
+        }
+
+    def _file(self, pictures: ObjectPictures, suffix: str) -> Path:
+        text = json.dumps(self._description(pictures), sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:32]
+        return self._folder / f"{self._backend.name}-{digest}{suffix}"
+
+
+def _read_task(file: Path) -> dict[str, str] | None:
+    """Return a task under way; None where there is none, or the file is damaged."""
+    try:
+        task = json.loads(file.read_text())
+    except (OSError, ValueError):
+        return None
+    return task if isinstance(task, dict) and all(isinstance(value, str) for value in task.values()) else None
+
+
+def _keep_task(file: Path, task: dict[str, str] | None) -> None:
+    if task is None:
+        file.unlink(missing_ok=True)
+    else:
+        write_whole(file, json.dumps(task).encode())

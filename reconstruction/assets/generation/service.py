@@ -1,0 +1,203 @@
+"""A generation service behind HTTP: retries, time limits, replies that must be what the protocol says."""
+
+import hashlib
+import time
+from dataclasses import dataclass
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+import requests
+from pydantic import BaseModel, ValidationError
+
+from reconstruction.assets.generation.base import GenerationError, GeneratorUnavailable, Job, RequestRefused
+from reconstruction.requesting import asked_pause, excerpt
+
+_TRIES = 5
+_LONGEST_PAUSE_S = 60.0
+_LONGEST_REPLY_S = 120.0  # of one request that does not wait for a generation
+_CONNECT_S = 10.0
+_CHUNK = 1 << 18
+_BUSY = (429, 500, 502, 503, 504)
+_PERHAPS_TAKEN = (502, 504)  # a gateway gave up: what is behind it may have taken the request
+_MOST_TEXT = 1 << 20  # of a JSON reply that carries no mesh
+Reply = TypeVar("Reply", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class ServiceLimits:
+    """How long, how often and how much."""
+
+    timeout_s: float = 900.0  # for one object, from the first request to the last byte
+    max_bytes: int = 100 << 20  # of one mesh
+    pause_s: float = 1.0  # before the second try; doubled before each further one
+    poll_s: float = 5.0  # between two looks at a job
+
+
+class Service:
+    """One service, for one job after another; every request and reply is written to the job."""
+
+    def __init__(self, name: str, url: str, key: str, limits: ServiceLimits) -> None:
+        """Nothing is sent yet."""
+        self.name, self.url, self.limits = name, url.rstrip("/"), limits
+        self._key = key
+
+    def deadline(self) -> float:
+        """Return when a job that begins now must be done (monotonic seconds)."""
+        return time.monotonic() + self.limits.timeout_s
+
+    def ask(
+        self, job: Job, method: str, path: str, reply: type[Reply], deadline: float, *, paid: bool = False,
+        mesh_inside: bool = False, **content: Any,
+    ) -> Reply:  # fmt: skip
+        """Send a request and return its JSON reply.
+
+        Args:
+            job: Is told of it.
+            method: "GET" or "POST".
+            path: Below the address of the service.
+            reply: What the answer is parsed into.
+            deadline: Of the job.
+            paid: Is not sent again where it may have been taken.
+            mesh_inside: The reply may be as large as a mesh.
+            content: What `requests` takes: `json`, `files`, `data`.
+        """
+        data, kind = self._exchange(
+            job, method, f"{self.url}{path}", deadline, again=not paid,
+            most=self.limits.max_bytes * 2 if mesh_inside else _MOST_TEXT, **content,
+        )  # fmt: skip
+        try:
+            parsed = reply.model_validate_json(data)
+        except ValidationError as error:
+            raise GeneratorUnavailable(
+                f"{self.url}{path}: this is no {self.name} service: it answered with {kind or 'no type'} "
+                f"({excerpt(data[:2000].decode(errors='replace')) or 'nothing'}: {error.errors()[0]['msg']})"
+            ) from error
+        job.exchanges[-1]["reply"] = excerpt(data[:2000].decode(errors="replace"))
+        return parsed
+
+    def fetch(
+        self, job: Job, method: str, url: str, deadline: float, *, again: bool = True, **content: Any
+    ) -> bytes:
+        """Return the bytes of a mesh; the key goes to the service's own host alone."""
+        data, kind = self._exchange(
+            job, method, url, deadline, again=again, most=self.limits.max_bytes, long=not again, **content
+        )
+        job.exchanges[-1] |= {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        if data[:4] != b"glTF":
+            raise GenerationError(
+                f"{self.name} sent no .glb but {kind or 'something without a type'} "
+                f"({excerpt(data[:300].decode(errors='replace')) or 'nothing'})"
+            )
+        return data
+
+    def wait(self, deadline: float) -> None:
+        """Pause before the next look at a job.
+
+        Raises:
+            GenerationError: the job's time is up.
+        """
+        if time.monotonic() + self.limits.poll_s > deadline:
+            raise self._late()
+        time.sleep(self.limits.poll_s)
+
+    def _late(self) -> GenerationError:
+        return GenerationError(f"{self.name} was not done within {self.limits.timeout_s:g} s")
+
+    def _exchange(
+        self, job: Job, method: str, url: str, deadline: float, *, again: bool, most: int, long: bool = False,
+        **content: Any,
+    ) -> tuple[bytes, str]:  # fmt: skip
+        """Return the body and the type of a successful reply."""
+        pause, problem, answered = self.limits.pause_s, "", True
+        for attempt in range(_TRIES):
+            if attempt:
+                if time.monotonic() + pause > deadline:
+                    break
+                time.sleep(min(pause, _LONGEST_PAUSE_S))
+                pause *= 2
+            left = deadline - time.monotonic()
+            if left <= 0:
+                break
+            entry = {"method": method, "address": url.split("?")[0]}
+            job.exchanges.append(entry)
+            try:
+                with self._send(
+                    method, url, left if long else min(left, _LONGEST_REPLY_S), content
+                ) as response:
+                    entry["status"] = response.status_code
+                    if response.ok:
+                        return self._body(response, deadline, most), response.headers.get("Content-Type", "")
+                    text = self._text(response)
+                    problem = f"HTTP {response.status_code}: {excerpt(text)}"
+                    self._judge(response.status_code, problem, again)
+                    pause = min(max(pause, asked_pause(response)), _LONGEST_PAUSE_S)
+                    answered = True
+            except requests.Timeout as error:
+                entry["failed"] = "no answer in time"
+                if not again and not isinstance(error, requests.ConnectTimeout):
+                    raise GenerationError(
+                        f"{self.name} gave no answer in time; as it may have taken the request, it is not sent again"
+                    ) from error
+                problem, answered = "no answer in time", False
+            except requests.RequestException as error:
+                entry["failed"] = type(error).__name__
+                if not again and not _never_sent(error):
+                    raise GenerationError(
+                        f"{self.name}: the connection broke ({type(error).__name__}); as it may have taken the "
+                        f"request, it is not sent again"
+                    ) from error
+                problem, answered = f"cannot be reached ({type(error).__name__})", False
+        if not problem:
+            raise self._late()
+        raise (GenerationError if answered else GeneratorUnavailable)(f"{_host(url)}: {problem}")
+
+    def _send(self, method: str, url: str, timeout_s: float, content: dict[str, Any]) -> requests.Response:
+        own = urlsplit(url).netloc == urlsplit(self.url).netloc
+        headers = {"Authorization": f"Bearer {self._key}"} if self._key and own else {}
+        return requests.request(
+            method,
+            url,
+            headers=headers,
+            timeout=(min(_CONNECT_S, timeout_s), timeout_s),
+            stream=True,
+            **content,
+        )
+
+    def _judge(self, status: int, problem: str, again: bool) -> None:
+        """Return where the request may be sent once more."""
+        if status in (401, 403):
+            raise GeneratorUnavailable(f"{self.name} refuses the key ({problem})")
+        if status == 402:
+            raise GeneratorUnavailable(f"{self.name} wants more credits than the account has ({problem})")
+        if status not in _BUSY:
+            raise RequestRefused(f"{self.name} refused the request or failed ({problem})")
+        if not again and status in _PERHAPS_TAKEN:
+            raise GenerationError(
+                f"{self.name}: {problem}; as it may have taken the request, it is not sent again"
+            )
+
+    def _body(self, response: requests.Response, deadline: float, most: int) -> bytes:
+        """Read a reply piece by piece: neither larger nor longer than allowed."""
+        out = bytearray()
+        for piece in response.iter_content(_CHUNK):
+            out += piece
+            if len(out) > most:
+                raise GenerationError(
+                    f"{self.name} sent more than {most / 1e6:.0f} MB; --set assets.generator_max_mb= allows more"
+                )
+            if time.monotonic() > deadline:
+                raise self._late()
+        return bytes(out)
+
+    def _text(self, response: requests.Response) -> str:
+        return next(response.iter_content(4096), b"").decode(errors="replace")
+
+
+def _never_sent(error: requests.RequestException) -> bool:
+    """Tell whether nobody was there to take a request."""
+    reason = getattr(error.args[0] if error.args else None, "reason", None)
+    return type(reason).__name__ in ("NewConnectionError", "ConnectTimeoutError", "NameResolutionError")
+
+
+def _host(url: str) -> str:
+    return f"{urlsplit(url).scheme}://{urlsplit(url).netloc}"
