@@ -1,0 +1,318 @@
+"""Compiled kernels of the viewpoint objective: cull, blend the target behind its occluders, and differentiate by pose.
+
+They extend `gaussians.kernels` (projection, sorting, tiles) by what a viewpoint needs and drop what it does not: no
+colors, no normals, no derivatives by the Gaussians. Every Gaussian stops light; only those of the target are summed,
+once plainly (what of the target is seen, and at what depth) and once by their weight (what seeing it is still worth).
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from reconstruction.gaussians.kernels import (
+    AX,
+    AY,
+    BX,
+    BY,
+    N_SPLAT_GRADIENTS,
+    OPACITY,
+    REACH2,
+    TILE,
+    WX,
+    WY,
+    XC,
+    YC,
+    ZC,
+)
+
+_HALF = np.float32(0.5)
+_ONE = np.float32(1.0)
+_TWO = np.float32(2.0)
+_FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
+_FALLOFF_STEP = np.float32(-1.0 / 128.0)
+_E2, _E3, _E4, _E5 = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120)
+_FLAT_LOW, _FLAT_HIGH = np.float32(0.9), np.float32(1.1)  # as in gaussians.blend_kernels
+# Planes of the blended image: sums of alpha T over the target's splats, plain, times weight, times depth.
+SEEN, WORTH, DEPTH = 0, 1, 2
+N_PLANES = 3
+N_GRADIENTS = 9  # of a splat: by XC .. WY
+
+
+@numba.njit(cache=True, nogil=True)
+def mark_near_view(
+    start, stop, means, radii, rotation, translation, intrinsics, window, far, near, marked
+):  # pragma: no cover - compiled
+    """Mark spheres that may touch what lies between the camera and depth `far` within a window of the picture.
+
+    Args:
+        start: First sphere; stop alike.
+        means: (n, 3) centers in world space; radii (n,).
+        rotation: (3, 3) camera_from_world; translation (3,) alike.
+        intrinsics: fx, fy, cx, cy.
+        window: x0, y0, x1, y1 in pixels.
+        far: Depth.
+        near: Depth.
+        marked: uint8 (n,) filled.
+    """
+    left, right = (window[0] - intrinsics[2]) / intrinsics[0], (window[2] - intrinsics[2]) / intrinsics[0]
+    top, bottom = (window[1] - intrinsics[3]) / intrinsics[1], (window[3] - intrinsics[3]) / intrinsics[1]
+    nl, nr = 1.0 / math.sqrt(1.0 + left * left), 1.0 / math.sqrt(1.0 + right * right)
+    nt, nb = 1.0 / math.sqrt(1.0 + top * top), 1.0 / math.sqrt(1.0 + bottom * bottom)
+    for i in range(start, stop):
+        m, radius = means[i], radii[i]
+        marked[i] = 0
+        z = rotation[2, 0] * m[0] + rotation[2, 1] * m[1] + rotation[2, 2] * m[2] + translation[2]
+        if z < near or z - radius > far:
+            continue
+        x = rotation[0, 0] * m[0] + rotation[0, 1] * m[1] + rotation[0, 2] * m[2] + translation[0]
+        y = rotation[1, 0] * m[0] + rotation[1, 1] * m[1] + rotation[1, 2] * m[2] + translation[1]
+        if (x - left * z) * nl < -radius or (right * z - x) * nr < -radius:
+            continue
+        if (y - top * z) * nt < -radius or (bottom * z - y) * nb < -radius:
+            continue
+        marked[i] = 1
+
+
+@numba.njit(cache=True)
+def last_of_target(tile_start, entries, own):  # pragma: no cover - compiled
+    """Return where each tile may stop (t,): behind its last entry of the target, as nothing behind it counts."""
+    ends = np.empty(len(tile_start) - 1, np.int64)
+    for t in range(len(ends)):
+        end = tile_start[t + 1]
+        while end > tile_start[t] and own[entries[end - 1]] == 0:
+            end -= 1
+        ends[t] = end
+    return ends
+
+
+@numba.njit(cache=True, inline="always", fastmath=_FAST)
+def _falloff(rho):  # pragma: no cover - compiled
+    """Return exp(-rho / 2) by plain arithmetic, as `gaussians.blend_kernels` does."""
+    x = rho * _FALLOFF_STEP
+    e = _ONE + x * (_ONE + x * (_E2 + x * (_E3 + x * (_E4 + x * _E5))))
+    e = max(e, x - x)
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    return e * e
+
+
+@numba.njit(cache=True, nogil=True)
+def blend_target(
+    start,
+    stop,
+    splats,
+    boxes,
+    own,
+    worth,
+    tile_start,
+    tile_end,
+    entries,
+    tiles_x,
+    scalars,
+    image,
+    contributions,
+):  # pragma: no cover - compiled
+    """Sum the target's share of every pixel of the tiles start..stop, through everything that lies before it.
+
+    Args:
+        start: First tile; stop alike.
+        splats: (k, 17) near to far; boxes (k, 4) alike.
+        own: (k,) 1 where a splat is of the target, else 0.
+        worth: (k,) weight of each splat in the objective, 0 where it is not of the target.
+        tile_start: Of `bin_to_tiles`; entries alike.
+        tile_end: Of `last_of_target`.
+        tiles_x: Tiles in a row.
+        scalars: (2,) largest alpha, transmittance at which a pixel is finished.
+        image: (h, w, 3) filled, planes SEEN, WORTH, DEPTH.
+        contributions: (e, 1) filled: sum over the tile's pixels of alpha T of every entry.
+    """  # fmt: skip
+    for tile in range(start, stop):
+        _blend_tile(
+            tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy", forceinline=True)
+def _blend_tile(
+    tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions
+):  # fmt: skip  # pragma: no cover - compiled
+    height, width = image.shape[0], image.shape[1]
+    alpha_max, stop = scalars[0], scalars[1]
+    zero = alpha_max - alpha_max
+    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    sums = np.zeros((N_PLANES, TILE, TILE), image.dtype)
+    light = np.ones((TILE, TILE), image.dtype)
+    xs, ys = np.empty(TILE, image.dtype), np.empty(TILE, image.dtype)
+    for j in range(TILE):
+        xs[j], ys[j] = tx + j, ty + j
+    row_sums = np.zeros(TILE, image.dtype)
+    contributions[tile_start[tile] : tile_start[tile + 1]] = 0
+    for e in range(tile_start[tile], tile_end[tile]):
+        if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
+            break
+        s = splats[entries[e]]
+        box = boxes[entries[e]]
+        mine, value = own[entries[e]], worth[entries[e]]
+        row_sums[:] = 0
+        xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
+        ax, bx, wx, reach2, opacity = s[AX], s[BX], s[WX], s[REACH2], s[OPACITY]
+        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
+            dy = ys[i] - yc
+            u_row, v_row, w_row, dy2 = s[AY] * dy, s[BY] * dy, _ONE + s[WY] * dy, dy * dy
+            for j in range(TILE):
+                t = light[i, j]
+                dx = xs[j] - xc
+                w = w_row + wx * dx
+                inverse_w = _ONE / w
+                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
+                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+                on_disk = (w > zero) & (rho3 <= rho2)
+                rho = rho3 if on_disk else rho2
+                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                w = w if on_disk else w_flat
+                alpha = min(opacity * _falloff(rho), alpha_max)
+                alpha = alpha if (rho <= reach2) & (t >= stop) else zero
+                weight = alpha * t
+                sums[SEEN, i, j] += weight * mine
+                sums[WORTH, i, j] += weight * value
+                sums[DEPTH, i, j] += weight * mine * (zc / w)
+                light[i, j] = t - weight
+                row_sums[j] += weight
+        contributions[e, 0] = row_sums.sum()
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            for c in range(N_PLANES):
+                image[y, x, c] = sums[c, y - ty, x - tx]
+
+
+@numba.njit(cache=True, nogil=True)
+def blend_target_backward(
+    start,
+    stop,
+    splats,
+    boxes,
+    own,
+    worth,
+    tile_start,
+    tile_end,
+    entries,
+    tiles_x,
+    scalars,
+    image,
+    image_gradients,
+    entry_gradients,
+):  # pragma: no cover - compiled
+    """Differentiate `blend_target`: front to back again, with what lies behind as total minus prefix.
+
+    Args:
+        start: As for `blend_target`, up to scalars.
+        image: (h, w, 3) of `blend_target`.
+        image_gradients: (h, w, 3).
+        entry_gradients: (e, 9) filled.
+    """  # fmt: skip
+    for tile in range(start, stop):
+        _blend_tile_backward(
+            tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, image_gradients,
+            entry_gradients,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy", forceinline=True)
+def _blend_tile_backward(
+    tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, image_gradients,
+    entry_gradients,
+):  # fmt: skip  # pragma: no cover - compiled
+    height, width = image.shape[0], image.shape[1]
+    alpha_max, stop = scalars[0], scalars[1]
+    zero = alpha_max - alpha_max
+    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    light = np.ones((TILE, TILE), image.dtype)
+    given = np.zeros((N_PLANES + 1, TILE, TILE), image.dtype)  # gradients, and what is not passed yet
+    lanes = np.empty((N_GRADIENTS, TILE), image.dtype)
+    xs, ys = np.empty(TILE, image.dtype), np.empty(TILE, image.dtype)
+    for j in range(TILE):
+        xs[j], ys[j] = tx + j, ty + j
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            for c in range(N_PLANES):
+                given[c, y - ty, x - tx] = image_gradients[y, x, c]
+                given[N_PLANES, y - ty, x - tx] += image_gradients[y, x, c] * image[y, x, c]
+    entry_gradients[tile_start[tile] : tile_start[tile + 1]] = 0
+    for e in range(tile_start[tile], tile_end[tile]):
+        if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
+            break
+        s = splats[entries[e]]
+        box = boxes[entries[e]]
+        mine, value = own[entries[e]], worth[entries[e]]
+        xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
+        ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
+        opacity, reach2 = s[OPACITY], s[REACH2]
+        lanes[:] = 0
+        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
+            dy = ys[i] - yc
+            u_row, v_row, w_row, dy2 = ay * dy, by * dy, _ONE + wy * dy, dy * dy
+            for j in range(TILE):
+                t = light[i, j]
+                dx = xs[j] - xc
+                w = w_row + wx * dx
+                inverse_w = _ONE / w
+                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
+                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+                on_disk = (w > zero) & (rho3 <= rho2)
+                rho = rho3 if on_disk else rho2
+                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                moves = on_disk | (w == w_flat)
+                w = w if on_disk else w_flat
+                inverse_w = _ONE / w
+                z = zc * inverse_w
+                falloff = _falloff(rho)
+                inside = (rho <= reach2) & (t >= stop)
+                falloff = falloff if inside else zero
+                full = opacity * falloff
+                alpha = min(full, alpha_max)
+                weight = alpha * t
+                light[i, j] = t - weight
+                g_z = given[DEPTH, i, j] * mine
+                q = given[SEEN, i, j] * mine + given[WORTH, i, j] * value + g_z * z
+                rest = given[N_PLANES, i, j] - weight * q
+                given[N_PLANES, i, j] = rest
+                d_z = weight * g_z
+                d_alpha = t * q - rest / (_ONE - alpha)
+                d_alpha = d_alpha if inside & (full <= alpha_max) else zero
+                d_rho = -_HALF * d_alpha * alpha
+                disk_rho = d_rho if on_disk else zero
+                flat_rho = zero if on_disk else d_rho
+                d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
+                d_w = -(d_u * u + d_v * v) - d_z * z * inverse_w
+                d_w = d_w if moves else zero
+                lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
+                lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
+                lanes[ZC, j] += d_z * inverse_w
+                lanes[AX, j] += d_u * dx
+                lanes[AY, j] += d_u * dy
+                lanes[BX, j] += d_v * dx
+                lanes[BY, j] += d_v * dy
+                lanes[WX, j] += d_w * dx
+                lanes[WY, j] += d_w * dy
+        for c in range(N_GRADIENTS):
+            total = zero
+            for j in range(TILE):
+                total += lanes[c, j]
+            entry_gradients[e, c] = total
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_entries(start, stop, entry_gradients, first, positions, rows, out):  # pragma: no cover - compiled
+    """Sum the entries of the splats start..stop, in order, into out (n, 18) at the Gaussians' rows."""
+    for r in range(start, stop):
+        for c in range(N_SPLAT_GRADIENTS):
+            out[rows[r], c] = 0
+        for i in range(first[r], first[r + 1]):
+            for c in range(N_GRADIENTS):
+                out[rows[r], c] += entry_gradients[positions[i], c]

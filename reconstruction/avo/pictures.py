@@ -1,0 +1,155 @@
+"""What a chosen camera shows: color, mask, depth, how much is visible, and the same without what hides the target."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruction.avo.inpainting import Inpainter
+from reconstruction.avo.scene import Target, ViewScene
+from reconstruction.gaussians.model import SH_C0
+from reconstruction.gaussians.rasterizer import RasterSettings, rasterize
+from reconstruction.types import Camera
+
+_OPAQUE = 0.5
+_WHOLE_HIDES = 0.1  # a thing that covers this share of the target's outline is taken away as a whole
+_NEARER = 0.97  # of the target's depth: what lies nearer than this within its outline hides it
+_HOLE_BORDER_PX = 2
+_SETTINGS = RasterSettings(near=0.02)
+
+
+@dataclass(frozen=True)
+class View:
+    """One view of a target. World space, metres; pictures have the camera's size."""
+
+    target: tuple[int, ...]  # ids
+    world_from_camera: np.ndarray  # float64 (4, 4), OpenCV, upright
+    camera: Camera
+    origin: str  # how it was found, for people
+    gain: float  # share of the target's opacity that it shows and no view before it did
+    color: np.ndarray  # uint8 (h, w, 3) RGB of the whole scene, black where nothing is known
+    alpha: np.ndarray  # float32 (h, w) the target's own opacity, behind what hides it
+    depth: np.ndarray  # float32 (h, w) z-depth of the target where alpha > 0.5, else 0
+    visibility: float  # share of the target's outline in this picture that nothing hides
+    clean: np.ndarray  # uint8 (h, w, 3) without what hides the target, holes inpainted
+    inpainted: np.ndarray  # bool (h, w) which pixels of `clean` are made up
+
+    @property
+    def mask(self) -> np.ndarray:
+        """Where the target is seen, bool (h, w)."""
+        return self.alpha > _OPAQUE
+
+
+def draw_view(
+    scene: ViewScene,
+    target: Target,
+    camera: Camera,
+    pose: np.ndarray,
+    origin: str,
+    gain: float,
+    inpainter: Inpainter,
+) -> View:
+    """Draw a view.
+
+    Args:
+        scene: of `prepare_scene`.
+        target: what is looked at.
+        camera: of the pictures.
+        pose: (4, 4) world_from_camera.
+        origin: as in `View`.
+        gain: as in `View`.
+        inpainter: for `clean`.
+    """
+    own = np.zeros(len(scene.packed), bool)
+    own[target.rows] = True
+    marked = scene.packed.copy()
+    marked[:, 10:13] = (
+        np.where(own[:, None], 0.5, -0.5) / SH_C0
+    )  # rendered as 1 where it is the target's, else 0
+    whole = rasterize(scene.packed, camera, pose, _SETTINGS).features
+    alpha = rasterize(marked, camera, pose, _SETTINGS).features[..., 0]
+    alone = rasterize(scene.packed[own], camera, pose, _SETTINGS).features
+    outline = alone[..., 7]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(outline > 1e-6, alone[..., 3] / outline, 0.0)
+    clean, holes = _without_occluders(scene, own, camera, pose, outline > _OPAQUE, depth)
+    total = float(outline.sum())
+    return View(
+        target=target.ids,
+        world_from_camera=pose,
+        camera=camera,
+        origin=origin,
+        gain=gain,
+        color=_uint8(whole[..., :3]),
+        alpha=alpha,
+        depth=np.where(alpha > _OPAQUE, depth, 0.0).astype(np.float32),
+        visibility=min(float(alpha.sum()) / total, 1.0) if total > 0 else 0.0,
+        clean=inpainter.inpaint(clean, holes),
+        inpainted=holes,
+    )
+
+
+def _without_occluders(
+    scene: ViewScene,
+    own: np.ndarray,
+    camera: Camera,
+    pose: np.ndarray,
+    outline: np.ndarray,
+    depth: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the picture (h, w, 3) without what lies before the target, and where nothing is left to show (h, w)."""
+    before = _before_target(scene, own, camera, pose, outline, depth)
+    share = {
+        int(i): _covered(scene, (scene.instance == i) & before, camera, pose, outline)
+        for i in np.unique(scene.instance[before])
+    }
+    things = [i for i, covered in share.items() if i and i not in scene.base and covered > _WHOLE_HIDES]
+    kept = ~(before | (np.isin(scene.instance, things) & ~own))
+    features = rasterize(scene.packed[kept], camera, pose, _SETTINGS).features
+    opacity = features[..., 7]
+    color = features[..., :3] / np.maximum(opacity, 1e-3)[..., None]
+    return _uint8(np.where(opacity[..., None] > _OPAQUE, color, 0.0)), _grown(opacity <= _OPAQUE)
+
+
+def _before_target(
+    scene: ViewScene,
+    own: np.ndarray,
+    camera: Camera,
+    pose: np.ndarray,
+    outline: np.ndarray,
+    depth: np.ndarray,
+) -> np.ndarray:
+    """Return which Gaussians (g,) have their centers within the target's outline, nearer than it."""
+    local = (scene.packed[:, :3] - pose[:3, 3]) @ pose[:3, :3]
+    z = np.maximum(local[:, 2], 1e-6)
+    u = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(np.int64)
+    v = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(np.int64)
+    inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height) & ~own
+    out = np.zeros(len(own), bool)
+    rows = np.flatnonzero(inside)
+    u, v = u[rows], v[rows]
+    out[rows] = outline[v, u] & (local[rows, 2] < _NEARER * depth[v, u])
+    return out
+
+
+def _covered(
+    scene: ViewScene, rows: np.ndarray, camera: Camera, pose: np.ndarray, outline: np.ndarray
+) -> float:
+    """Return the share of the outline that some Gaussians cover."""
+    small = camera.resized(max(camera.width // 4, 8), max(camera.height // 4, 8))
+    opacity = rasterize(scene.packed[rows], small, pose, _SETTINGS).features[..., 7]
+    rows_v = np.arange(small.height) * camera.height // small.height
+    columns = np.arange(small.width) * camera.width // small.width
+    inside = outline[np.ix_(rows_v, columns)]
+    return float((opacity[inside] > _OPAQUE).mean()) if inside.any() else 0.0
+
+
+def _grown(holes: np.ndarray) -> np.ndarray:
+    """Return the holes with their dark border."""
+    import cv2
+
+    kernel = np.ones((2 * _HOLE_BORDER_PX + 1,) * 2, np.uint8)
+    return cv2.dilate(holes.astype(np.uint8), kernel).astype(bool)
+
+
+def _uint8(color: np.ndarray) -> np.ndarray:
+    return np.round(np.clip(color, 0, 1) * 255).astype(np.uint8)

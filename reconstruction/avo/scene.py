@@ -1,0 +1,95 @@
+"""What all targets of a scene share, prepared once; and what a target is."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruction.avo.clearance import Clearance, measure_clearance
+from reconstruction.avo.config import AvoConfig
+from reconstruction.gaussians.model import Gaussians
+from reconstruction.instances.gaussian_ids import gaussian_instances
+from reconstruction.types import Camera, InstanceSet, Surface
+from registry.errors import UsageError
+
+_INPUTS = 48  # input cameras that are looked at, evenly spread over the film
+_OUTER_SHARE = 0.98  # of the target's Gaussians lie in its sphere: strays do not push the camera away
+
+
+@dataclass(frozen=True)
+class ViewScene:
+    """The scene as viewpoints see it. World space, metres, floor at z = 0."""
+
+    gaussians: Gaussians
+    packed: np.ndarray  # float32 (g, 13)
+    instance: np.ndarray  # int32 (g,) id of the thing that each Gaussian belongs to; 0 = none
+    base: tuple[int, ...]  # ids of floor, walls and ceiling
+    clearance: Clearance
+    camera: Camera  # of the input frames
+    inputs: np.ndarray  # float64 (n, 4, 4) world_from_camera of input frames, evenly spread
+    frames: np.ndarray  # int (n,) their rows among the keyframes
+
+
+@dataclass(frozen=True)
+class Target:
+    """One thing, or a region: several things that are looked at together."""
+
+    ids: tuple[int, ...]
+    rows: np.ndarray  # int64 (m,) of its Gaussians, ascending
+    center: np.ndarray  # float64 (3,)
+    radius_m: float  # of a sphere that holds (nearly) all of it
+    distance_m: float  # d_target: at which that sphere fills the wanted share of the field of view
+
+
+def prepare_scene(
+    gaussians: Gaussians, surface: Surface, instances: InstanceSet, camera: Camera
+) -> ViewScene:
+    """Prepare a scene for any number of targets.
+
+    Args:
+        gaussians: in world space (`GaussianScene.in_world`), with the input cameras.
+        surface: with its free space.
+        instances: what belongs to which thing.
+        camera: of the input frames.
+
+    Raises:
+        UsageError: the Gaussians carry no cameras.
+    """
+    poses = np.asarray(gaussians.world_from_camera, np.float64)
+    if not len(poses):
+        raise UsageError(
+            "views: the Gaussians carry no input cameras, so nothing is known of where one may stand"
+        )
+    rows = np.unique(np.linspace(0, len(poses) - 1, _INPUTS).round().astype(int))
+    return ViewScene(
+        gaussians=gaussians,
+        packed=gaussians.packed(),
+        instance=gaussian_instances(gaussians.means, surface.vertices, instances.vertex_instance),
+        base=tuple(b.id for b in instances.base),
+        clearance=measure_clearance(surface.space, poses[:, :3, 3]),
+        camera=camera,
+        inputs=poses[rows],
+        frames=rows,
+    )
+
+
+def make_target(scene: ViewScene, ids: Sequence[int] | int, config: AvoConfig) -> Target | None:
+    """Return the target of an id, or of a region of ids; None where no Gaussian belongs to it."""
+    wanted = (int(ids),) if np.isscalar(ids) else tuple(sorted({int(i) for i in ids}))
+    rows = np.flatnonzero(np.isin(scene.instance, wanted))
+    if not len(rows):
+        return None
+    means = scene.packed[rows, :3].astype(np.float64)
+    low, high = np.percentile(means, [1, 99], axis=0)
+    center = 0.5 * (low + high)
+    away = np.linalg.norm(means - center, axis=1)
+    radius = max(float(np.quantile(away, _OUTER_SHARE)), 0.02)
+    half = math.radians(0.5 * config.fov_deg)
+    distance = max(radius / math.sin(config.fill * half), config.min_distance_m)
+    return Target(wanted, rows, center, radius, distance)
+
+
+def reach_of(packed: np.ndarray, sigma_cutoff: float) -> np.ndarray:
+    """Return how far each Gaussian (n, 13) reaches from its center, (n,) metres."""
+    return (sigma_cutoff * np.exp(packed[:, 7:9].max(axis=1))).astype(packed.dtype)

@@ -1,0 +1,34 @@
+"""Where the search for a view may begin: at the input cameras, and at places around the target in free space."""
+
+import math
+
+import numpy as np
+
+from reconstruction.avo.cameras import look_at
+from reconstruction.avo.config import AvoConfig
+from reconstruction.avo.scene import Target, ViewScene
+
+_AZIMUTHS, _PITCHES_DEG = 12, (12.0, 35.0, 60.0)
+_NEARER = (1.0, 0.8, 0.62, 0.48)  # shares of the target distance that are tried until a place is free
+
+
+def input_starts(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
+    """Return the input cameras (n, 4, 4), turned so that they look at the target, upright."""
+    return np.stack([look_at(p[:3, 3], target.center, config.max_pitch_deg) for p in scene.inputs])
+
+
+def starts_around(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
+    """Return cameras (n, 4, 4) around the target that stand in free space, as near the target distance as can be."""
+    out = []
+    for pitch in map(math.radians, _PITCHES_DEG):
+        for number in range(_AZIMUTHS):
+            angle = 2.0 * math.pi * number / _AZIMUTHS
+            away = np.array(
+                [math.cos(pitch) * math.cos(angle), math.cos(pitch) * math.sin(angle), math.sin(pitch)]
+            )
+            for share in _NEARER:
+                eye = target.center + share * (target.distance_m + target.radius_m) * away
+                if scene.clearance.at(eye) >= config.clearance_m:
+                    out.append(look_at(eye, target.center, config.max_pitch_deg))
+                    break
+    return np.array(out).reshape(-1, 4, 4)
