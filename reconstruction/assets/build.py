@@ -8,9 +8,11 @@ from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.fused import fused_points, without_strays
 from reconstruction.assets.generation.complete import SurfaceColors, generated_shape
 from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
 from reconstruction.assets.hanging import hanging_slab
+from reconstruction.assets.hanging_relief import relief
 from reconstruction.assets.physics import MaterialChoice, physical_attributes
 from reconstruction.assets.physics.base import choice_for
 from reconstruction.assets.physics.load import load_physicist
@@ -75,6 +77,7 @@ def build_assets(
     """
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
     pixels = prepare_pixels(posed, depth, instances.id_maps)
+    pixels = without_strays(pixels, posed, depth.camera, surface, instances)
     stands = find_stands(posed, depth, pixels, instances)
     fetched = fetch_meshes(instances, posed, stands.seen, config, progress)
     generated = None if fetched is None else Generated(fetched, surface.space)
@@ -84,7 +87,9 @@ def build_assets(
     objects = []
     for item in instances.objects:
         objects.append(
-            build_object(item, posed, depth, pixels, instances, stands, said, config, progress, generated)
+            build_object(
+                item, posed, depth, surface, pixels, instances, stands, said, config, progress, generated
+            )
         )
         progress.advance()
     base = build_base(posed, depth, instances, tuple(objects), pixels, config)
@@ -93,14 +98,14 @@ def build_assets(
 
 
 def build_object(
-    item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet,
+    item: Instance, posed: PosedFrames, depth: DepthMaps, surface: Surface, pixels: ScenePixels, found: InstanceSet,
     stands: Stands, said: dict[int, MaterialChoice], config: AssetsConfig, progress: Progress,
     generated: Generated | None = None,
 ) -> ObjectAsset:  # fmt: skip
     """Build one asset: shape, looks, collision, physics. What fails on one shape is done again with a box."""
     name = f"object {item.id} ({item.label})"
     try:
-        shape = object_shape(item, posed, depth, pixels, found, stands, config, generated)
+        shape = object_shape(item, posed, depth, surface, pixels, found, stands, config, generated)
         if shape.how == "box-fallback":
             progress.note(f"{name}: too little was seen of it, it became a box")
         if " rejected: " in shape.how:
@@ -174,7 +179,7 @@ def to_object_space(body: Solid, frame: ObjectFrame) -> tuple[Solid, np.ndarray]
 
 
 def object_shape(
-    item: Instance, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet,
+    item: Instance, posed: PosedFrames, depth: DepthMaps, surface: Surface, pixels: ScenePixels, found: InstanceSet,
     stands: Stands, config: AssetsConfig, generated: Generated | None = None,
 ) -> Shape:  # fmt: skip
     """Return an object's closed shape in its grid frame, that frame, and how the shape was made."""
@@ -200,6 +205,10 @@ def object_shape(
         if attempt is not None and attempt.body is not None:
             return Shape(attempt.body, frame, attempt.how, attempt.colors)
     body, how = embedded_solid(volume, frame, config, furniture=furniture)
+    if frame.wall_y is not None:
+        fused = fused_points(item.id, frame, surface, found)
+        if len(fused) and not _covers(body, fused):
+            body, how = relief(fused, frame.wall_y, config), "observed+relief"
     if body is None:
         return box_fallback(item, seen.points)
     return Shape(body, frame, how if attempt is None else f"{how}; {attempt.how}")
@@ -211,7 +220,7 @@ def embedded_solid(
     """Return the embedded completion of what was seen, and how it was made; None where nothing solid comes of it."""
     field = completion.complete(volume, frame, config, furniture=furniture)
     body = solid.extract(field)
-    if field.symmetries and not _covers(body, frame):
+    if field.symmetries and not _covers(body, frame.points):
         field = completion.complete(volume, frame, replace(config, symmetry=False), furniture=furniture)
         body = solid.extract(field)
     if body is None or body.volume < 1e-7:
@@ -228,11 +237,11 @@ def embedded_solid(
     return body, "observed+" + ("+".join(field.symmetries) or "carved")
 
 
-def _covers(body: Solid | None, frame: ObjectFrame) -> bool:
-    """Tell whether a body is as large as what was seen: a wrong symmetry frees what was there."""
+def _covers(body: Solid | None, points: np.ndarray) -> bool:
+    """Tell whether a body is as large as what was seen: a wrong symmetry frees what was there, as do few pixels."""
     if body is None:
         return False
-    seen = np.ptp(np.percentile(frame.points, [3, 97], axis=0), axis=0)
+    seen = np.ptp(np.percentile(points, [3, 97], axis=0), axis=0)
     return bool((body.extents > _COVERED_SHARE * seen).all())
 
 

@@ -14,6 +14,7 @@ from reconstruction.types import DepthMaps, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _SAME_LEVEL_M = 0.015
+_HIDDEN_M = 0.01
 # No camera sees the board below a thing, but something carries it: at least this much is there.
 _BOARD_M = 0.02
 _FOOTPRINT_SHRINK_M = 0.006
@@ -70,6 +71,10 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
             carriers[parent] = lift_object(posed, depth, pixels, parent, 150_000)
         level = support_height(item, points, carriers.get(parent), found)
         low, high = np.percentile(points[:, 2], [0.5, 99.5])
+        bottom = float(item.center[2] - 0.5 * item.extents_m[2])
+        # What is in a container goes on behind the rim: the stage before has looked for the floor of it.
+        if bottom < low - _HIDDEN_M and (level is None or level > low - _HIDDEN_M):
+            level = bottom
         middle = np.median(points[:, :2], axis=0)
         # The outermost points are depth errors at the outline: drop them before the hull.
         flat = points[:: max(1, len(points) // 20_000), :2]
@@ -86,14 +91,21 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
 
 
 def _agreed(by_child: dict[int, Standing]) -> dict[int, Standing]:
-    """Give children of one parent whose levels differ by noise only the same level: they stand on one board."""
+    """Give children of one parent whose levels differ by noise only the same level: they stand on one board.
+
+    What seems to stand up to 3 cm lower than most others around does not sink into their board either.
+    """
     out = dict(by_child)
     for parent in {s.parent for s in by_child.values()}:
         rest = sorted((s.level_m, s.child) for s in by_child.values() if s.parent == parent and s.known)
         while rest:
             group = [x for x in rest if x[0] - rest[0][0] < 2 * _SAME_LEVEL_M]
             level = float(np.median([x[0] for x in group]))
-            group = [x for x in group if abs(x[0] - level) < _SAME_LEVEL_M] or group[:1]
+            agreeing = [x for x in group if abs(x[0] - level) < _SAME_LEVEL_M]
+            if len(agreeing) > 0.5 * len(group):
+                group = [x for x in group if x[0] < level + _SAME_LEVEL_M]
+            else:
+                group = agreeing or group[:1]
             for own, child in group:
                 out[child] = replace(out[child], level_m=level if len(group) > 1 else own)
             rest = [x for x in rest if x not in group]

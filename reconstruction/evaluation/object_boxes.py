@@ -10,7 +10,7 @@ from reconstruction.evaluation.alignment import Alignment
 from reconstruction.evaluation.ground_truth import GroundTruth, TrueEntity
 from reconstruction.evaluation.matching import box_iou, match
 from reconstruction.evaluation.object_facts import ObjectFacts, object_facts
-from reconstruction.types import InstanceSet, Surface
+from reconstruction.types import Instance, InstanceSet, Surface
 
 IOU_BOUNDS = (0.25, 0.5)
 _TRIMMED_PERCENT = 1.0
@@ -78,16 +78,27 @@ def instance_boxes(vertices: np.ndarray, instances: InstanceSet, alignment: Alig
     """Return the boxes (m, 2, 3) of the instances stage in the true world, before any mesh is made of them.
 
     `vertices` (n, 3) are the surface's, to which `instances` gives ids. A box is the middle 98 % of an object's surface
-    along each axis, down to where the stage says that it stands.
+    along each axis, down to where the stage says that it stands; of what hangs on a wall, from the wall to the front as
+    the stage says: a picture is thinner than the noise of its surface.
     """
-    points = alignment.to_true(vertices)
+    vertices = np.asarray(vertices, np.float64)
     boxes = np.zeros((len(instances.objects), 2, 3))
     for row, item in enumerate(instances.objects):
-        own = points[instances.vertex_instance == item.id]
+        own = vertices[instances.vertex_instance == item.id]
+        own = alignment.to_true(_from_wall_to_front(own, item) if item.attached_hint else own)
         boxes[row] = np.percentile(own, [_TRIMMED_PERCENT, 100 - _TRIMMED_PERCENT], axis=0)
         bottom = item.center - [0.0, 0.0, 0.5 * item.extents_m[2]]
         boxes[row, 0, 2] = min(boxes[row, 0, 2], alignment.to_true(bottom[None])[0, 2])
     return boxes
+
+
+def _from_wall_to_front(points: np.ndarray, item: Instance) -> np.ndarray:
+    """Return points (k, 3) of a thing moved into its box along its wall's normal, and again at the wall: (2k, 3)."""
+    normal = np.array([np.cos(item.yaw_rad), np.sin(item.yaw_rad), 0.0])
+    half = 0.5 * item.extents_m[0]
+    along = (points - item.center) @ normal
+    moved = points + (np.clip(along, -half, half) - along)[:, None] * normal
+    return np.concatenate([moved, points - (along + half)[:, None] * normal])
 
 
 def instance_box_figures(

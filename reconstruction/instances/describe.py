@@ -2,11 +2,17 @@
 
 import numpy as np
 
-from reconstruction.instances.boxes import UprightBox, upright_box, with_bottom
+from reconstruction.instances.boxes import UprightBox, quantiles, upright_box, with_bottom
+from reconstruction.instances.convexity import is_inside
 from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.instances.segmentation import Thing
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import BaseEntity, Instance
+
+_FLAT_SPREAD_M, _FLAT_REACH_M = 0.015, 0.03  # of a flat thing's surface: its noise, and the far end of that
+_LEAST_FRONT_M = 0.02
+_HIDDEN_M = 0.05  # of a thing may be hidden by what stands before its foot
+_CONTAINER_FLOOR_M = 0.008  # thickness of the bottom of a bowl or a basket
 
 
 def describe(
@@ -65,19 +71,25 @@ def _box_on_support(
         return (
             with_bottom(box, 0.0) if base[0].observed and bottom < max(0.06, 0.15 * box.extents_m[2]) else box
         )
+    if is_inside(graph, thing.rests_on.vertices, thing.vertices, bottom):
+        floor = _bottom_of(graph, thing.rests_on, base) + _CONTAINER_FLOOR_M
+        return with_bottom(box, float(np.clip(floor, bottom - box.extents_m[2], bottom)))
     under = thing.rests_on.vertices
     near = (
         np.abs(graph.points[under, :2] - box.center[:2]) < 0.5 * np.linalg.norm(box.extents_m[:2]) + 0.03
     ).all(1)
     carrying = under[near & (graph.normals[under, 2] > 0.7) & (graph.points[under, 2] < bottom + 0.02)]
-    if len(carrying) < 5:
+    heights = graph.points[carrying, 2]
+    heights = heights[heights > bottom - _HIDDEN_M]
+    if len(carrying) < 5 or not len(heights):
         return box
-    level = (
-        float(np.median(graph.points[carrying, 2][graph.points[carrying, 2] > bottom - 0.05], axis=0))
-        if (graph.points[carrying, 2] > bottom - 0.05).any()
-        else bottom
-    )
-    return with_bottom(box, min(level, bottom + 0.01))
+    return with_bottom(box, min(float(np.median(heights)), bottom + 0.01))
+
+
+def _bottom_of(graph: MeshGraph, thing: Thing, base: tuple[BaseEntity, ...]) -> float:
+    box = upright_box(graph.points[thing.vertices], graph.areas[thing.vertices])
+    box = _box_on_support(graph, thing, box, base)
+    return float(box.center[2] - 0.5 * box.extents_m[2])
 
 
 def _box_to_wall(graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[BaseEntity, ...]) -> UprightBox:
@@ -89,9 +101,19 @@ def _box_to_wall(graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[Ba
     yaw = float(np.arctan2(normal[1], normal[0]))
     points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
     turned = upright_box(points, areas, yaw)
-    distance = points @ normal + wall.surface.plane[3]
-    front = max(float(np.percentile(distance, 80)), 0.02)
+    front = _front(points @ normal + wall.surface.plane[3], areas)
     along = np.array([-np.sin(yaw), np.cos(yaw)])
     center = turned.center.copy()
     center[:2] = (turned.center[:2] @ along) * along + (0.5 * front - wall.surface.plane[3]) * normal[:2]
     return UprightBox(center, yaw, np.array([front, turned.extents_m[1], turned.extents_m[2]]))
+
+
+def _front(distance: np.ndarray, areas: np.ndarray) -> float:
+    """Return how far a thing stands out from its wall, from its vertices' distances (n,) to it.
+
+    The surface of what is flat is as thick as its noise, of which the far end says nothing; what is not flat ends at
+    its far end.
+    """
+    low, middle, high, end = quantiles(distance, areas, (0.2, 0.5, 0.8, 0.98))
+    flat = max(high - middle, middle - low) < _FLAT_SPREAD_M and end - middle < _FLAT_REACH_M
+    return max(float(high if flat else end), _LEAST_FRONT_M)

@@ -227,3 +227,19 @@ def test_boxes_of_the_stage_are_in_the_true_world_and_reach_their_support(truth)
     (box,) = instance_boxes(points, instances, alignment)
     assert box[1] == pytest.approx((0.54, 0.43, 0.8), abs=2e-3)
     assert box[0] == pytest.approx((0.46, 0.37, 0.7), abs=2e-3)
+
+
+def test_a_picture_is_as_thick_as_the_stage_says_and_its_back_is_on_the_wall():
+    """Its surface is a cloud from 1 to 5 cm before the wall at x = 0; the stage says 2 cm."""
+    from reconstruction.evaluation.alignment import Alignment
+    from reconstruction.types import Instance, InstanceSet
+
+    rng = np.random.default_rng(0)
+    points = np.column_stack(
+        [rng.uniform(0.01, 0.05, 5000), rng.uniform(-0.2, 0.2, 5000), rng.uniform(1, 1.6, 5000)]
+    )
+    item = Instance(4, "picture", 0.5, np.array([0.01, 0, 1.3]), 0.0, np.array([0.02, 0.4, 0.6]), 1, True)
+    instances = InstanceSet(np.full(len(points), 4, np.int32), (), (item,), np.zeros((1, 2, 2), np.uint16))
+    same = Alignment(np.eye(4), np.zeros(0, np.int32), np.zeros(0), np.zeros(0), 0.0)
+    (box,) = instance_boxes(points, instances, same)
+    assert box == pytest.approx(np.array([[0.0, -0.196, 1.0], [0.02, 0.196, 1.594]]), abs=2e-3)

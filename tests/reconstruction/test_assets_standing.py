@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.assets.standing import Standing, without_children
+from reconstruction.assets.standing import Standing, _agreed, without_children
 from reconstruction.assets.views import SeenPoints
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, support_height
 from reconstruction.types import Instance, InstanceSet
@@ -101,3 +101,18 @@ def test_a_rim_that_goes_on_and_a_rim_with_nothing_beyond_it_stay():
     for ring in (lambda r: (r > 0.11) & (r < 0.2), lambda r: r > 0.11):
         rimmed = slab_with(ring)
         assert raised_columns(stand(rimmed)) == raised_columns(rimmed)
+
+
+def standing_at(*levels: float) -> dict[int, Standing]:
+    none = np.zeros((0, 2))
+    return {k: Standing(k, 1, level, True, none, level + 0.1) for k, level in enumerate(levels, start=2)}
+
+
+def test_what_seems_to_sink_into_its_board_stands_where_the_others_do():
+    levels = [s.level_m for s in _agreed(standing_at(0.80, 0.802, 0.778, 0.801)).values()]
+    assert levels == pytest.approx([0.8005] * 4, abs=1e-3)
+
+
+def test_what_stands_higher_or_on_another_board_keeps_its_level():
+    agreed = _agreed(standing_at(0.80, 0.802, 0.825, 0.60))
+    assert [agreed[k].level_m for k in (4, 5)] == [0.825, 0.60]

@@ -6,7 +6,7 @@ from fused_surfaces import box, can, fused, tray
 from surfaces import Patchwork, frames_of, sheet, surface_from
 
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.instances.convexity import bulge
+from reconstruction.instances.convexity import bulge, is_inside
 from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.segmentation import Thing, _absorb_fragments
 from reconstruction.instances.splitting import split_touching
@@ -169,3 +169,23 @@ def test_what_rested_on_a_scrap_that_it_takes_in_rests_on_what_carried_the_scrap
     kept = _absorb_fragments(graph, [table, scrap, thing], InstancesConfig())
     assert [id(one) for one in kept] == [id(table), id(thing)]
     assert thing.rests_on is table
+
+
+def test_what_is_in_a_container_goes_on_behind_the_rim():
+    """A can in a basket, seen from 6 cm above the bottom on; the basket's inner sides are seen lower than that."""
+    basket = tray((-0.15, -0.1, 0.0), (0.15, 0.1, 0.1), 0.018, WOOD)
+    surface = fused([*basket, can((0.03, 0.0), 0.035, 0.018, 0.16, RED)], half_m=0.25, top_m=0.3)
+    graph = MeshGraph.from_surface(surface)
+    above = graph.points[:, 2] > 0.002
+    on_can = np.hypot(graph.points[:, 0] - 0.03, graph.points[:, 1]) < 0.045
+    hidden = (graph.points[:, 2] < 0.06) & (np.hypot(graph.points[:, 0] - 0.03, graph.points[:, 1]) < 0.06)
+    inner = np.flatnonzero(on_can & ~hidden & above)
+    container = np.flatnonzero(~on_can & ~hidden & above)
+    assert is_inside(graph, container, inner, 0.06)
+    # On its bottom, which is seen all around, it is not hidden; nor on a table without a rim.
+    whole = np.flatnonzero(on_can & (graph.points[:, 2] > 0.024))
+    assert not is_inside(graph, np.flatnonzero(~on_can & above), whole, 0.024)
+    table = fused([TABLE, can((0.0, 0.0), 0.035, 0.4, 0.5, RED)], half_m=0.45, top_m=0.6)
+    graph = MeshGraph.from_surface(table)
+    low = graph.points[:, 2] < 0.404
+    assert not is_inside(graph, np.flatnonzero(low), np.flatnonzero(~low), 0.404)

@@ -1,0 +1,69 @@
+"""What stands out from a wall without being flat, as a relief: a wall shelf, a row of hooks.
+
+A board seen edge on has few pixels in any frame, too few to carve it from; the fused surface has all frames' word on
+it. A thing that hangs is fixed to its wall, so that what lies between its front and the wall is taken for solid.
+"""
+
+import numpy as np
+from scipy import ndimage
+
+from reconstruction.assets.completion import CompletedField
+from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.solid import Solid, extract, lighten
+
+_CELL_M, _MAX_CELLS = 0.008, 96
+_FRONT_PERCENT = 90.0  # of the distances to the wall in a cell
+_CLOSED_CELLS = 2
+_MAX_REACH_M = 0.6
+_TOLERANCE_M = 0.001
+
+
+def relief(points: np.ndarray, wall_y: float, config: AssetsConfig) -> Solid | None:
+    """Return what lies between points (k, 3) and the wall at `wall_y`, in the grid frame, +y into the wall.
+
+    No part stands out less than `config.flat_thickness_m`. None where there is nothing.
+    """
+    away = np.clip(wall_y - points[:, 1], config.flat_thickness_m, _MAX_REACH_M)
+    if len(points) == 0:
+        return None
+    across = points[:, [0, 2]]
+    start = across.min(axis=0)
+    size = np.maximum(across.max(axis=0) - start, _CELL_M)
+    cell = max(_CELL_M, float(size.max()) / _MAX_CELLS)
+    shape = tuple(np.ceil(size / cell).astype(int))
+    # Whole cells, so that the relief is as large as what was seen.
+    steps = size / shape
+    index = np.clip(np.floor((across - start) / steps).astype(int), 0, np.array(shape) - 1)
+    flat = np.ravel_multi_index(index.T, shape)
+    order = np.lexsort((away, flat))
+    first = np.flatnonzero(np.r_[True, np.diff(flat[order]) > 0])
+    count = np.diff(np.r_[first, len(flat)])
+    front = np.zeros(shape)
+    rank = np.floor(_FRONT_PERCENT / 100 * (count - 1)).astype(int)
+    front.reshape(-1)[flat[order][first]] = away[order][first + rank]
+    padded = np.pad(front, _CLOSED_CELLS)
+    closed = ndimage.grey_closing(padded, size=(2 * _CLOSED_CELLS + 1,) * 2)
+    front = closed[_CLOSED_CELLS:-_CLOSED_CELLS, _CLOSED_CELLS:-_CLOSED_CELLS]
+    body = _between(front, start, steps, wall_y, cell)
+    return None if body is None else lighten(body, config.faces_small, _TOLERANCE_M)
+
+
+def _between(
+    front: np.ndarray, start: np.ndarray, steps: np.ndarray, wall_y: float, cell: float
+) -> Solid | None:
+    """Return the solid between the wall and fronts (nx, nz) in metres before it, 0 = nothing."""
+    layers = max(int(np.ceil(front.max() / cell)), 1)
+    step_y = front.max() / layers
+    depth = (np.arange(layers) + 0.5) * step_y  # of the middle of each layer before the wall
+    filled = depth[None, :, None] < front[:, None, :]
+    grid = np.pad(filled, 1)
+    field = CompletedField(np.zeros(3), 1.0, np.where(grid, -0.5, 0.5).astype(np.float32), ())
+    body = extract(field)
+    if body is None:
+        return None
+    # The field's unit is a cell; in y it counts from the wall into the room.
+    cells = body.vertices - 1.0
+    vertices = np.column_stack(
+        [start[0] + cells[:, 0] * steps[0], wall_y - cells[:, 1] * step_y, start[1] + cells[:, 2] * steps[1]]
+    )
+    return Solid(vertices, body.faces[:, ::-1].copy())

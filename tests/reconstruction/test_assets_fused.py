@@ -1,0 +1,93 @@
+"""What the fused surface says of a thing: which depth strays from it, and what stands out from a wall."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from surfaces import frames_of, merged, sheet, solid_box, surface_from
+
+from reconstruction.assets import AssetsConfig
+from reconstruction.assets.fused import fused_points, sample_surface, without_strays
+from reconstruction.assets.hanging_relief import relief
+from reconstruction.assets.views import prepare_pixels
+from reconstruction.assets.volume import ObjectFrame
+from reconstruction.types import Instance, InstanceSet
+
+RED = (200, 40, 40)
+BOX = Instance(2, "box", 0.5, np.array([0, 0, 0.1]), 0.0, np.array([0.3, 0.3, 0.2]), 1, False)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """A box on a floor, drawn into frames; every vertex above the floor is the box's."""
+    surface = surface_from(
+        merged(
+            sheet((-1, -1, 0), (2, 0, 0), (0, 2, 0), (90, 90, 90)),
+            solid_box((-0.15, -0.15, 0.0), (0.15, 0.15, 0.2), RED),
+        )
+    )
+    posed, depth = frames_of(surface, 160, 120)
+    owner = np.where(surface.vertices[:, 2] > 0.001, 2, 1).astype(np.int32)
+    images = np.asarray(posed.images).astype(int)
+    ids = np.where(images[..., 0] > images[..., 1] + 60, 2, 1).astype(np.uint16)
+    return surface, posed, depth, InstanceSet(owner, (), (BOX,), ids)
+
+
+def test_depth_off_the_surface_of_its_thing_is_not_believed(room):
+    surface, posed, depth, found = room
+    pixels = prepare_pixels(posed, depth, found.id_maps)
+    shown = (pixels.ids == 2) & (pixels.depth > 0)
+    assert shown.sum() > 500
+    assert (without_strays(pixels, posed, depth.camera, surface, found).depth[shown] > 0).mean() > 0.97
+    flying = np.argwhere(shown)[::7]
+    smeared = pixels.depth.copy()
+    smeared[tuple(flying.T)] += 0.5  # behind the box, as at an outline
+    kept = without_strays(replace(pixels, depth=smeared), posed, depth.camera, surface, found).depth
+    assert (kept[tuple(flying.T)] == 0).mean() > 0.97
+    others = pixels.ids != 2
+    np.testing.assert_array_equal(kept[others], smeared[others])
+
+
+def test_a_surface_that_is_elsewhere_does_not_judge(room):
+    surface, posed, depth, found = room
+    pixels = prepare_pixels(posed, depth, found.id_maps)
+    moved = replace(surface, vertices=surface.vertices + np.float32(0.5))
+    np.testing.assert_array_equal(
+        without_strays(pixels, posed, depth.camera, moved, found).depth, pixels.depth
+    )
+
+
+def test_samples_cover_a_thing_evenly_whatever_its_triangles(room):
+    surface, _, _, found = room
+    samples = sample_surface(2, surface, found)
+    on_top = np.abs(samples[:, 2] - 0.2) < 1e-4
+    # The top is 900 cm2 of 3,300 in all; the lowest centimetre is shared with the floor.
+    assert on_top.mean() == pytest.approx(900 / 3300, abs=0.04)
+    frame = ObjectFrame(np.eye(4), samples, samples, False, None)
+    assert np.ptp(fused_points(2, frame, surface, found), axis=0) == pytest.approx([0.3, 0.3, 0.2], abs=0.015)
+    assert len(sample_surface(7, surface, found)) == 0
+
+
+def test_a_relief_reaches_from_the_wall_to_what_was_seen():
+    """A shelf: a board 60 cm wide and 20 cm deep seen from above, and a front edge 4 cm high."""
+    rng = np.random.default_rng(0)
+    top = np.column_stack([rng.uniform(-0.3, 0.3, 4000), rng.uniform(-0.2, 0, 4000), np.full(4000, 0.04)])
+    edge = np.column_stack([rng.uniform(-0.3, 0.3, 2000), np.full(2000, -0.2), rng.uniform(0, 0.04, 2000)])
+    body = relief(np.concatenate([top, edge]), 0.0, AssetsConfig())
+    assert body.vertices.min(axis=0) == pytest.approx([-0.3, -0.2, 0.0], abs=0.005)
+    assert body.vertices.max(axis=0) == pytest.approx([0.3, 0.0, 0.04], abs=0.005)
+    assert body.volume == pytest.approx(0.6 * 0.2 * 0.04, rel=0.15)
+    edges = np.sort(np.concatenate([body.faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))]), axis=1)
+    _, uses = np.unique(edges, axis=0, return_counts=True)
+    assert (uses == 2).all()
+
+
+def test_parts_of_a_relief_stand_out_as_far_as_they_were_seen():
+    """A board 3 cm thick with a peg 9 cm long."""
+    rng = np.random.default_rng(0)
+    board = np.column_stack([rng.uniform(-0.2, 0.2, 6000), np.full(6000, -0.03), rng.uniform(0, 0.1, 6000)])
+    on_peg = np.hypot(board[:, 0], board[:, 2] - 0.05) < 0.015
+    body = relief(np.where(on_peg[:, None], board - [0, 0.06, 0], board), 0.0, AssetsConfig())
+    assert body.vertices[:, 1].min() == pytest.approx(-0.09, abs=1e-3)
+    assert body.volume == pytest.approx(0.4 * 0.1 * 0.03 + np.pi * 0.015**2 * 0.06, rel=0.15)
+    assert relief(np.zeros((0, 3)), 0.0, AssetsConfig()) is None
