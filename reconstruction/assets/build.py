@@ -7,7 +7,7 @@ import numpy as np
 from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts
-from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.fused import fused_points, without_strays
 from reconstruction.assets.generation.complete import SurfaceColors, generated_shape
 from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
@@ -84,13 +84,16 @@ def build_assets(
     progress.advance()
     physicist = load_physicist(config)
     said = physicist.choose(instances, posed, progress=progress) if physicist else {}
-    objects = []
-    for item in instances.objects:
+    objects: list[ObjectAsset] = []
+    hulls = 0
+    for left, item in zip(range(len(instances.objects) - 1, -1, -1), instances.objects):
+        own = config.with_hulls(config.hulls_scene - hulls - left * LEAST_HULLS)
         objects.append(
             build_object(
-                item, posed, depth, surface, pixels, instances, stands, said, config, progress, generated
+                item, posed, depth, surface, pixels, instances, stands, said, own, progress, generated
             )
         )
+        hulls += len(objects[-1].collision)
         progress.advance()
     base = build_base(posed, depth, instances, tuple(objects), pixels, config)
     progress.advance(len(instances.base))
@@ -110,7 +113,7 @@ def build_object(
             progress.note(f"{name}: too little was seen of it, it became a box")
         if " rejected: " in shape.how:
             progress.note(f"{name}: {shape.how.split('; ', 1)[1]}; the embedded completion stands in")
-        return _finish_object(item, shape, posed, depth, pixels, stands, said, config)
+        return _finish_object(item, shape, posed, depth, pixels, stands, said, config, progress)
     # Compiled geometry libraries raise whatever they like on a degenerate shape, and one object must not cost the
     # scene; running out of memory is no property of the object.
     except MemoryError:
@@ -118,13 +121,13 @@ def build_object(
     except Exception as error:
         progress.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
     return _finish_object(
-        item, box_fallback(item, np.zeros((0, 3))), posed, depth, pixels, stands, said, config
+        item, box_fallback(item, np.zeros((0, 3))), posed, depth, pixels, stands, said, config, progress
     )
 
 
 def _finish_object(
     item: Instance, shape: Shape, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, stands: Stands,
-    said: dict[int, MaterialChoice], config: AssetsConfig,
+    said: dict[int, MaterialChoice], config: AssetsConfig, progress: Progress,
 ) -> ObjectAsset:  # fmt: skip
     """Give a solid its looks, collision shape and mass."""
     body, world_from_object = to_object_space(shape.body, shape.frame)
@@ -152,7 +155,9 @@ def _finish_object(
         label_confidence=float(item.label_confidence),
         world_from_object=world_from_object,
         visual=texture.textured(vertices, faces, uvs, baked.texture),
-        collision=collision_parts(body, config, levels=tuple(levels)),
+        collision=collision_parts(
+            body, config, levels=tuple(levels), progress=progress, name=f"object {item.id} ({item.label})"
+        ),
         physics=physical_attributes(body, choice),
         provenance=AssetProvenance(
             geometry=shape.how,

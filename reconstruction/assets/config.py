@@ -1,7 +1,9 @@
 """Configuration of the assets stage."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
+
+LEAST_HULLS = 6  # of an object, whatever the scene's budget
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,10 @@ class AssetsConfig:
     """Most convex pieces of a small object's collision shape."""
     hulls_furniture: int = 28
     """Most convex pieces of furniture."""
+    hulls_ring: int = 32
+    """Most convex pieces of the walls of a container, which are cut by upright and level planes."""
+    hulls_scene: int = 800
+    """Convex pieces of all objects: where they would be more, what comes last gets fewer, but 6 each."""
     convex_enough: float = 0.93
     """Solids that fill this share of their convex hull collide as that hull."""
     dent_share: float = 0.12
@@ -86,11 +92,21 @@ class AssetsConfig:
     generator_intruding: float = 0.1
     """A mesh is rejected if a larger share of its surface lies as deep in space that rays passed through."""
 
+    def with_hulls(self, most: int) -> "AssetsConfig":
+        """Return the config with no more than so many convex pieces for one object, but `LEAST_HULLS`."""
+        most = max(most, LEAST_HULLS)
+        return replace(
+            self,
+            hulls_small=min(self.hulls_small, most),
+            hulls_furniture=min(self.hulls_furniture, most),
+            hulls_ring=min(self.hulls_ring, most),
+        )
+
 
 ASSETS_PRESETS = {
     "fast": AssetsConfig(
         cells_along_longest=56, max_voxels=500_000, faces_small=2500, faces_furniture=6000, texture_max_px=512,
-        texture_frames=8, base_texel_m=0.015, hulls_small=12, hulls_furniture=20,
+        texture_frames=8, base_texel_m=0.015, hulls_small=12, hulls_furniture=20, hulls_ring=16,
     ),
     "default": AssetsConfig(),
     "quality": AssetsConfig(

@@ -1,10 +1,14 @@
 """From a signed distance field to one watertight, manifold, light mesh; boxes where nothing better is known."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reconstruction.assets.completion import CompletedField
+
+if TYPE_CHECKING:
+    import manifold3d
 
 _LEG_SHARE, _LEG_HEIGHT_SHARE = 0.003, 0.4  # of the largest body's volume, of the thing's height
 _LEG_GAP_M, _LEG_OVERLAP_M = 0.06, 0.003
@@ -136,6 +140,12 @@ def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
 
 def to_manifold(solid: Solid) -> Solid | None:
     """Return the mesh as manifold3d accepts it, or None where it is not a closed manifold."""
+    body = manifold_of(solid)
+    return None if body is None else from_manifold(body)
+
+
+def manifold_of(solid: Solid) -> "manifold3d.Manifold | None":
+    """Return the body of a mesh, or None where it is not a closed manifold."""
     import manifold3d
 
     mesh = manifold3d.Mesh(
@@ -146,7 +156,7 @@ def to_manifold(solid: Solid) -> Solid | None:
     body = manifold3d.Manifold(mesh)
     if body.status() != manifold3d.Error.NoError or body.is_empty() or body.volume() <= 0:
         return None
-    return from_manifold(body)
+    return body
 
 
 def from_manifold(body) -> Solid:

@@ -1,0 +1,156 @@
+"""Collision shapes of hollow things and furniture: what is dropped into them stays, and rests on their true floor."""
+
+import numpy as np
+import pytest
+
+from reconstruction.assets.collision import collision_parts
+from reconstruction.assets.collision.decomposition import Decomposer
+from reconstruction.assets.collision.rings import find_hole
+from reconstruction.assets.collision.slicing import own_levels
+from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
+from reconstruction.assets.solid import Solid, box_solid, from_manifold
+from reconstruction.synthetic import containers, furnishing
+from reconstruction.synthetic.furniture import Workshop
+from reconstruction.synthetic.things import Place, Thing
+from registry.simulation import BodySpec, Physics
+
+manifold3d = pytest.importorskip("manifold3d")
+MARBLE_M = 0.005  # radius
+DROPPED_FROM_M = 0.02
+MAKERS = {
+    name: getattr(containers, f"make_{name}")
+    for name in ("bowl", "mug", "cup", "plate", "tray", "open_box", "basket", "crate")
+} | {"bookcase": furnishing.make_bookcase}
+
+
+def made(name: str, seed: int) -> tuple[Thing, Solid]:
+    """Return a thing of the generator and its closed mesh."""
+    thing = MAKERS[name](Workshop(np.random.default_rng(seed), 0.01, 0.02), name)
+    bodies = []
+    for part in thing.parts:
+        vertices = np.concatenate([patch.vertices for patch in part])
+        starts = np.cumsum([0] + [len(patch.vertices) for patch in part])
+        faces = np.concatenate([np.asarray(patch.faces) + start for patch, start in zip(part, starts)])
+        _, index, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
+        faces = inverse.reshape(-1)[faces]
+        faces = faces[
+            (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+        ]
+        mesh = manifold3d.Mesh(vertices[index].astype(np.float32), faces.astype(np.uint32))
+        bodies.append(manifold3d.Manifold(mesh))
+    return thing, from_manifold(manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add))
+
+
+def floors_of(thing: Thing) -> list[Place]:
+    """Return where marbles are dropped: the places in it, or the floor of a cup, which has none."""
+    if thing.places:
+        return list(thing.places)
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    disc = 0.28 * min(thing.size[:2]) * np.stack([np.cos(turn), np.sin(turn)], -1)
+    return [Place(0.006, disc, inside=True, rim_m=thing.size[2] - 0.006)]
+
+
+def drop_marbles(parts: list[np.ndarray], floors: list[Place]) -> list[tuple[np.ndarray, Place]]:
+    """Drop a row of marbles onto every floor; return where each is after two seconds."""
+    trimesh = pytest.importorskip("trimesh")
+    ball = np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=MARBLE_M).vertices)
+    ground = np.array([[x, y, z] for x in (-3, 3) for y in (-3, 3) for z in (-0.05, 0.0)])
+    physics = Physics(1 / 240, 0.0)
+    for number, shape in ((1, parts), (2, [ground])):
+        still = BodySpec(
+            number, "still", tuple(shape), 1.0, np.zeros(3), None, 0.5, 0.0, np.eye(4), False, base=True
+        )
+        physics.add(still)
+    dropped = []
+    for floor in floors:
+        center = floor.area.mean(axis=0)
+        for corner in (*floor.area[:: max(1, len(floor.area) // 6)], center):
+            pose = np.eye(4)
+            pose[:2, 3] = center + 0.7 * (corner - center)
+            pose[2, 3] = floor.height_m + MARBLE_M + min(DROPPED_FROM_M, 0.3 * floor.headroom_m)
+            number = 10 + len(dropped)
+            physics.add(BodySpec(number, "marble", (ball,), 0.0014, np.zeros(3), None, 0.4, 0.1, pose, True))
+            dropped.append((number, floor))
+    physics.step(480)
+    return [(physics.pose(number)[:3, 3], floor) for number, floor in dropped]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", MAKERS)
+def test_marbles_stay_and_rest_on_the_true_floor(name, seed):
+    thing, solid = made(name, seed)
+    parts = collision_parts(solid, AssetsConfig())
+    low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+    every = np.concatenate([part.vertices for part in parts])
+    np.testing.assert_allclose(every.min(axis=0), low, atol=0.003)
+    np.testing.assert_allclose(every.max(axis=0), high, atol=0.003)
+    for at, floor in drop_marbles([part.vertices for part in parts], floors_of(thing)):
+        assert (at[:2] > low[:2]).all()
+        assert (at[:2] < high[:2]).all()
+        assert at[2] - MARBLE_M == pytest.approx(floor.height_m, abs=0.001)
+
+
+def test_a_table_is_its_slab_and_its_legs():
+    legs = [
+        box_solid(np.array([x, y, 0]), np.array([x + 0.05, y + 0.05, 0.7]))
+        for x in (0, 1.15)
+        for y in (0, 0.75)
+    ]
+    top = box_solid(np.array([0, 0, 0.7]), np.array([1.2, 0.8, 0.74]))
+    bodies = [
+        manifold3d.Manifold(manifold3d.Mesh(s.vertices.astype(np.float32), s.faces.astype(np.uint32)))
+        for s in (*legs, top)
+    ]
+    solid = from_manifold(manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add))
+    assert own_levels(solid) == pytest.approx([0.7], abs=0.001)
+    parts = collision_parts(solid, AssetsConfig())
+    assert len(parts) == 5
+    hulls = [Solid(part.vertices.astype(float), part.faces).volume for part in parts]
+    assert sum(hulls) == pytest.approx(solid.volume, rel=0.01)
+
+
+def test_a_ring_is_told_from_a_cup_and_a_slab():
+    tube = manifold3d.Manifold.cylinder(0.1, 0.05, 0.05, 48) - manifold3d.Manifold.cylinder(
+        0.3, 0.04, 0.04, 48
+    ).translate((0, 0, -0.1))
+    hole = find_hole(from_manifold(tube))
+    assert hole is not None
+    np.testing.assert_allclose(hole.center, 0, atol=0.003)
+    cup = tube + manifold3d.Manifold.cylinder(0.02, 0.045, 0.045, 48)
+    for solid in (from_manifold(cup), box_solid(np.zeros(3), np.ones(3))):
+        assert find_hole(solid) is None
+
+
+def test_a_crash_of_the_decomposer_costs_only_its_part():
+    solid = box_solid(np.zeros(3), np.ones(3))
+    options = {"threshold": 0.1, "budget": 4, "hull_vertices": 48, "seed": 0}
+    decomposer = Decomposer()
+    try:
+        assert decomposer.run(solid.vertices, solid.faces + 1_000_000, options) is None
+        assert len(decomposer.run(solid.vertices, solid.faces, options)) == 1
+    finally:
+        decomposer.close()
+
+
+def test_a_decomposer_that_does_not_end_is_ended():
+    decomposer = Decomposer(limit_s=0.01)
+    try:
+        assert (
+            decomposer.run(
+                np.eye(3),
+                np.array([[0, 1, 2]]),
+                {"threshold": 0.1, "budget": 4, "hull_vertices": 48, "seed": 0},
+            )
+            is None
+        )
+    finally:
+        decomposer.close()
+
+
+def test_a_full_scene_leaves_an_object_fewer_parts_but_some():
+    config = AssetsConfig()
+    assert config.with_hulls(500) == config
+    assert config.with_hulls(10).hulls_ring == 10
+    assert config.with_hulls(-3).hulls_small == LEAST_HULLS
+    _, bowl = made("bowl", 0)
+    assert len(collision_parts(bowl, config.with_hulls(10))) < len(collision_parts(bowl, config))
