@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gltf_validator import gltf_issues
 
 from reconstruction.assets import AssetsConfig, build_assets
+from reconstruction.assets.gltf import write_glb
 from reconstruction.assets.solid import Solid, to_manifold
 from reconstruction.progress import NoProgress
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
@@ -47,6 +49,28 @@ def instances_of(capture, names):
 def built(small_capture):
     found = instances_of(small_capture, ("can", "bowl", "book"))
     return build_assets(small_capture.posed, small_capture.depth, EMPTY, found, CONFIG), found
+
+
+def test_every_glb_is_valid_gltf(built, tmp_path):
+    """By Khronos' validator: no error and no warning."""
+    assets, _ = built
+    files = []
+    for item in assets.objects:
+        files.append(tmp_path / f"{item.id}.glb")
+        write_glb(item.visual, files[-1])
+    for item in assets.base:
+        files.append(tmp_path / f"base_{item.id}.glb")
+        write_glb(item.visual, files[-1])
+    issues = gltf_issues(files)
+    assert len(issues) == len(files) == 4
+    assert not any(issue["severity"] < 2 for found in issues.values() for issue in found), issues
+
+
+def test_the_validator_sees_what_is_wrong(built, tmp_path):
+    whole, torn = tmp_path / "whole.glb", tmp_path / "torn.glb"
+    write_glb(built[0].objects[0].visual, whole)
+    torn.write_bytes(whole.read_bytes()[:-400])
+    assert any(issue["severity"] == 0 for issue in gltf_issues([torn])[str(torn)])
 
 
 def test_objects_are_closed_and_where_they_are(built, small_capture):
