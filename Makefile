@@ -1,6 +1,9 @@
 # make demo   set up, reconstruct the shipped video, and show what came out
 # make test   set up and run the tests (a few minutes); make test-slow runs the long ones
 VENV ?= .venv
+# Test files are spread over two processes; JOBS=0 runs them in one, in order.
+JOBS ?= 2
+SPREAD = -n $(JOBS) --dist loadfile
 PYTHON_IN_VENV = $(VENV)/bin/python
 
 .PHONY: setup demo test test-slow lint format build clean
@@ -12,10 +15,10 @@ demo: setup
 	@$(PYTHON_IN_VENV) tools/demo.py
 
 test: setup
-	$(PYTHON_IN_VENV) -m pytest
+	$(PYTHON_IN_VENV) -m pytest $(SPREAD)
 
 test-slow: setup
-	$(PYTHON_IN_VENV) -m pytest -m "slow and not gpu"
+	$(PYTHON_IN_VENV) -m pytest $(SPREAD) -m "slow and not gpu"
 
 lint: setup
 	$(VENV)/bin/ruff check .
