@@ -8,6 +8,7 @@ to the edges of color there, and most frames then put the skirt where it belongs
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
@@ -16,6 +17,7 @@ from reconstruction.instances.lifting import vote
 from reconstruction.instances.lifting_views import view_masks
 from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.progress import Progress
+from reconstruction.surface.mesh_graph import MeshGraph, pieces
 from reconstruction.types import DepthMaps, PosedFrames, Surface
 
 _MAX_FRAMES = 36
@@ -23,6 +25,7 @@ _MIN_FRAMES = 2  # that see a vertex
 _SURE_SHARE = 0.6  # of them must put it elsewhere
 _LEAST_KEPT = 0.5  # of a thing's area: votes that take more are not trusted
 _LEAST_LOST = 0.03  # and what is less is the rim that every cut has, no skirt
+_SCRAP_SHARE, _SCRAP_GAP_M = 0.05, 0.25  # of a thing's area; away from the rest of it
 _LEAST_DRAWN = 0.75  # of a thing's pixels: a frame whose snapping takes more draws it too small to tell
 
 
@@ -42,7 +45,8 @@ def refine_by_views(
         progress: told of every frame.
 
     Returns:
-        The same things, none without more than half of its area; vertices that base entities win have their ids.
+        The same things, none without more than half of its area, and none that hangs with scraps of surface far from
+        the rest of it; vertices that base entities win have their ids.
     """
     if not cut.things or config.snap_radius_px <= 0:
         return cut
@@ -60,6 +64,9 @@ def refine_by_views(
         kept = areas[thing.vertices[refined[thing.vertices] == number]].sum() / areas[thing.vertices].sum()
         if not _LEAST_KEPT <= kept < 1.0 - _LEAST_LOST:
             refined[thing.vertices] = number
+    for number, thing in enumerate(cut.things, start=first):
+        if thing.attached:  # legs and boards of furniture may be far from the rest of what was fused
+            refined[_far_scraps(shell.graph, np.flatnonzero(refined == number), config.bridge_gap_m)] = 0
     things = [
         replace(thing, vertices=np.flatnonzero(refined == number))
         for number, thing in enumerate(cut.things, start=first)
@@ -68,6 +75,18 @@ def refine_by_views(
     for thing in things:
         thing.rests_on = renewed.get(id(thing.rests_on))
     return Cut(things, np.where(refined < first, refined, 0).astype(np.int32))
+
+
+def _far_scraps(graph: MeshGraph, vertices: np.ndarray, bridge_m: float) -> np.ndarray:
+    """Return the vertices of small pieces so far from the rest of a thing that they only have its id by mistake."""
+    groups = pieces(graph, vertices, bridge_m)
+    least = _SCRAP_SHARE * graph.areas[vertices].sum()
+    small = [group for group in groups if graph.areas[group].sum() < least]
+    if not small or len(small) == len(groups):
+        return vertices[:0]
+    rest = cKDTree(graph.points[np.concatenate([g for g in groups if graph.areas[g].sum() >= least])])
+    far = [group for group in small if rest.query(graph.points[group])[0].min() > _SCRAP_GAP_M]
+    return np.concatenate(far) if far else vertices[:0]
 
 
 def _drawn(

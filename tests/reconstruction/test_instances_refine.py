@@ -7,10 +7,11 @@ from surfaces import floor_sheet, frames_of, looking_at, merged, solid_box, surf
 
 from reconstruction.instances import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
-from reconstruction.instances.refine import refine_by_views
+from reconstruction.instances.refine import _far_scraps, refine_by_views
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.rasterize import rasterize_mesh
+from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import Camera, DepthMaps
 
 SIZE = (160, 120)
@@ -103,3 +104,18 @@ def test_without_snapping_the_cut_is_left_alone():
     things = [Thing(np.setdiff1d(table, skirt)), Thing(np.union1d(box, skirt))]
     cut = refined(surface, posed, depth, things, InstancesConfig(snap_radius_px=0))
     assert cut.things is things
+
+
+def test_a_scrap_far_from_the_rest_of_its_thing_is_none_of_it():
+    surface, _, _ = filmed()
+    box, _, _ = parts_of(surface)
+    graph = MeshGraph.from_surface(surface)
+    x, y, z = graph.points.T
+    near = np.flatnonzero((np.abs(x - 0.2) < 0.02) & (np.abs(y) < 0.02) & (z > 0.39))
+    far = np.flatnonzero((x > 0.37) & (y > 0.27) & (z > 0.39))
+    assert len(near)
+    assert len(far)
+    found = _far_scraps(graph, np.sort(np.concatenate([box, near, far])), 0.02)
+    np.testing.assert_array_equal(np.sort(found), far)
+    legs = np.flatnonzero((np.abs(np.abs(x) - 0.35) < 0.04) & (z > 0.39))  # two halves of one thing
+    assert len(_far_scraps(graph, legs, 0.02)) == 0
