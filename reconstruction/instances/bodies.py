@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.supports import SupportRegion, contact_height, find_supports
+from reconstruction.instances.tops import cut_between_tops
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 _CRUMB_REACH_M = 0.04
@@ -81,7 +82,11 @@ class Bodies:
 
 def find_bodies(graph: MeshGraph, rest: np.ndarray, config: InstancesConfig) -> Bodies:
     """Return the bodies among vertices `rest` (sorted indices, without the base)."""
-    found = [_Body(graph, piece) for piece in pieces(graph, rest, config.bridge_gap_m)]
+    found = [
+        _Body(graph, part)
+        for piece in pieces(graph, rest, config.bridge_gap_m)
+        for part in cut_between_tops(graph, piece)
+    ]
     bodies = [body for body in found if body.area_m2 >= config.min_piece_area_m2]
     crumbs = [body.vertices for body in found if body.area_m2 < config.min_piece_area_m2]
     bodies = _with_stands(_with_legs(bodies))

@@ -9,6 +9,7 @@ from reconstruction.instances.bodies import find_bodies
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.candidates import candidates_on
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.hollows import clings_to, hollows_on, looks_like, shell_and_contents
 from reconstruction.instances.neighbors import neighbors_of
 from reconstruction.instances.splitting import split_touching
 from reconstruction.instances.supports import SupportRegion, find_supports
@@ -64,11 +65,15 @@ def _decompose(
     remaining = body
     carried: list[tuple[np.ndarray, float]] = []
     beside: list[np.ndarray] = []
+    containers: list[np.ndarray] = []
     for support in find_supports(graph, body, config):
         if abs(support.height_m - ground_m) < _SAME_GROUND_M:
             continue
         if not np.isin(support.vertices, remaining, assume_unique=True).mean() > 0.5:
             continue  # it lies on something that was taken off already, whose own turn comes
+        for hollow in hollows_on(graph, remaining, support):
+            containers.append(hollow)
+            remaining = np.setdiff1d(remaining, hollow, assume_unique=True)
         for candidate in candidates_on(graph, remaining, support, config):
             candidate = _flood_same_color(graph, candidate, remaining, support)
             carried.append((candidate, support.height_m))
@@ -77,6 +82,7 @@ def _decompose(
             for neighbor in neighbors_of(graph, remaining, support, config):
                 beside.append(neighbor)
                 remaining = np.setdiff1d(remaining, neighbor, assume_unique=True)
+    containers, carried = _with_handles(graph, containers, carried)
     own.vertices = remaining
     out: list[Thing] = []
     # Furniture has legs and cushions of other colors: only small things are looked at for touching neighbors.
@@ -89,6 +95,10 @@ def _decompose(
     for neighbor in beside:
         out.extend(_decompose(graph, neighbor, rests_on, depth, config, ground_m))
     lower: list[Thing] = []
+    for container in containers:
+        found = _container(graph, container, _nearest_below(graph, container, carriers), depth + 1, config)
+        out.extend(found)
+        lower.extend(found)
     for candidate, height in sorted(carried, key=lambda c: (graph.points[c[0], 2].min(), c[0][0])):
         on = next((thing for thing in lower if _lies_on(graph, candidate, thing)), None)
         parent = _nearest_below(graph, candidate, carriers) if on is None else on
@@ -96,6 +106,39 @@ def _decompose(
         out.extend(found)
         lower.extend(found)
     return out
+
+
+def _with_handles(
+    graph: MeshGraph, containers: list[np.ndarray], carried: list[tuple[np.ndarray, float]]
+) -> tuple[list[np.ndarray], list[tuple[np.ndarray, float]]]:
+    """Give the containers what clings to them in their color, and leave out the skirts behind them."""
+    containers, kept = list(containers), []
+    for part, height in carried:
+        row = next((k for k, one in enumerate(containers) if clings_to(graph, part, one)), None)
+        if row is None:
+            kept.append((part, height))
+        elif looks_like(graph, part, containers[row]):
+            containers[row] = np.union1d(containers[row], part)
+    return containers, kept
+
+
+def _container(
+    graph: MeshGraph, body: np.ndarray, rests_on: Thing, depth: int, config: InstancesConfig
+) -> list[Thing]:
+    """Return an open container as one thing, what is in it, and what it stands on if that is wider."""
+    found = [t for t in _decompose(graph, body, rests_on, depth, config) if len(t.vertices)]
+    under, own, contents = shell_and_contents(graph, body, [thing.vertices for thing in found])
+    if not own:
+        return found
+    carrier = found[under[0]] if under else rests_on
+    shell = Thing(np.sort(np.concatenate([found[k].vertices for k in own])), carrier, depth)
+    within = {id(found[k]) for k in own + under}
+    for k in contents:
+        if found[k].rests_on is rests_on or id(found[k].rests_on) in within:
+            found[k].rests_on = shell
+    for k in under:
+        found[k].rests_on = rests_on
+    return [*(found[k] for k in under), shell, *(found[k] for k in contents)]
 
 
 def _lies_on(graph: MeshGraph, upper: np.ndarray, lower: Thing) -> bool:

@@ -1,0 +1,104 @@
+"""Open containers are whole, with or without contents; tables side by side are two."""
+
+import numpy as np
+import pytest
+from fused_surfaces import box, can, fused, tray
+from surfaces import floor_sheet, frames_of, merged, sheet, solid_box, surface_from
+
+from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.instances.hollows import clings_to, hollows_on, looks_like
+from reconstruction.instances.supports import find_supports
+from reconstruction.instances.tops import cut_between_tops
+from reconstruction.progress import NO_PROGRESS
+from reconstruction.surface.mesh_graph import MeshGraph
+
+WOOD, GREEN, RED, WHITE = (120, 80, 50), (40, 140, 60), (190, 30, 30), (235, 235, 230)
+TABLE = box((-0.4, -0.35, 0.0), (0.4, 0.35, 0.4), WOOD)
+LOW_TRAY = tray((-0.16, -0.12, 0.4), (0.16, 0.12, 0.44), 0.012, WOOD)
+
+
+def hollows_in(solids):
+    """Return the hollows on the table, and the graph."""
+    graph = MeshGraph.from_surface(fused([TABLE, *solids], voxel_m=0.007, half_m=0.45, top_m=0.6))
+    body = np.flatnonzero(graph.points[:, 2] > 0.01)
+    top = max(find_supports(graph, body, InstancesConfig()), key=lambda one: one.footprint.area_m2)
+    return hollows_on(graph, body, top), graph
+
+
+def test_a_low_tray_in_the_color_of_its_table_is_a_container_with_what_is_in_it():
+    (found,), graph = hollows_in([*LOW_TRAY, can((0.12, 0.08), 0.03, 0.41, 0.5, RED)])
+    low, high = graph.points[found].min(axis=0), graph.points[found].max(axis=0)
+    np.testing.assert_allclose([*low[:2], *high[:2]], [-0.16, -0.12, 0.16, 0.12], atol=0.025)
+    assert high[2] > 0.49
+
+
+@pytest.mark.parametrize(
+    "solids",
+    [
+        [box((-0.1, -0.1, 0.4), (0.1, 0.1, 0.45), RED)],
+        [
+            box((-0.2, -0.05, 0.4), (-0.1, 0.05, 0.55), RED),
+            box((0.1, -0.05, 0.4), (0.2, 0.05, 0.45), GREEN),
+            box((-0.05, 0.1, 0.4), (0.05, 0.2, 0.5), WHITE),
+        ],
+        [box((-0.15, -0.1, 0.4), (0.15, 0.1, 0.43), RED), can((0.0, 0.0), 0.04, 0.43, 0.5, WHITE)],
+    ],
+    ids=["a closed box", "things around a place", "a can on a book"],
+)
+def test_what_has_no_closed_rim_is_no_container(solids):
+    assert hollows_in(solids)[0] == []
+
+
+def test_a_tray_is_one_thing_and_carries_what_is_in_it():
+    """Whose bottom is hardly higher than the table."""
+    surface = fused([TABLE, *LOW_TRAY, can((-0.05, 0.03), 0.03, 0.41, 0.5, RED)], top_m=0.6)
+    posed, depth = frames_of(surface, 320, 240)
+    found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
+    at = [(-0.35, -0.3, 0.4), (0.1, -0.05, 0.412), (0.16, 0.0, 0.44), (-0.16, 0.0, 0.44), (-0.05, 0.03, 0.5)]
+    nearest = [int(np.argmin(np.linalg.norm(surface.vertices - np.array(p), axis=1))) for p in at]
+    table, bottom, right, left, thing = (int(found.vertex_instance[i]) for i in nearest)
+    rests = {o.id: o.support_hint for o in found.objects}
+    assert len(rests) == 3
+    assert bottom == right == left
+    assert rests[bottom] == table
+    assert rests[thing] == bottom
+
+
+def test_a_handle_is_the_containers_and_a_skirt_of_another_color_is_not():
+    parts = {
+        "tray": solid_box((-0.15, -0.1, 0.0), (0.15, 0.1, 0.06), GREEN),
+        "handle": solid_box((0.15, -0.03, 0.02), (0.18, 0.03, 0.05), GREEN),
+        "skirt": sheet((-0.1, 0.102, 0.0), (0.2, 0, 0), (0, 0.03, 0.04), WOOD),
+        "far": solid_box((-0.35, -0.05, 0.0), (-0.16, 0.05, 0.05), GREEN),
+    }
+    graph = MeshGraph.from_surface(surface_from(merged(floor_sheet(WHITE), *parts.values())))
+    rows = {name: _vertices_of(graph, part) for name, part in parts.items()}
+    assert [name for name in rows if name != "tray" and clings_to(graph, rows[name], rows["tray"])] == [
+        "handle",
+        "skirt",
+    ]
+    assert looks_like(graph, rows["handle"], rows["tray"])
+    assert not looks_like(graph, rows["skirt"], rows["tray"])
+
+
+def _vertices_of(graph, part):
+    low, high = part.vertices.min(axis=0) - 1e-4, part.vertices.max(axis=0) + 1e-4
+    inside = ((graph.points > low) & (graph.points < high)).all(axis=1)
+    return np.flatnonzero(inside & (graph.points[:, 2] > 1e-3))
+
+
+@pytest.mark.parametrize(("gap_m", "parts"), [(0.1, 2), (0.0, 1)])
+def test_tables_with_a_gap_between_them_are_two(gap_m, parts):
+    """Joined by smeared surface that slopes down from one top across a part of the gap."""
+    left = solid_box((-0.9, -0.3, 0.0), (-0.5 * gap_m, 0.3, 0.45), WOOD)
+    right = solid_box((0.5 * gap_m, -0.3, 0.0), (0.9, 0.3, 0.46 if gap_m else 0.45), RED)
+    smear = sheet((-0.05, -0.1, 0.45), (0.1, 0, -0.04), (0, 0.06, 0), WOOD)
+    graph = MeshGraph.from_surface(surface_from(merged(left, right, *([smear] if gap_m else []))))
+    found = cut_between_tops(graph, np.arange(len(graph.points)))
+    assert len(found) == parts
+    assert sum(len(part) for part in found) == len(graph.points)
+    if parts == 2:
+        assert {tuple(np.sign(np.median(graph.points[part, 0], keepdims=True))) for part in found} == {
+            (-1.0,),
+            (1.0,),
+        }
