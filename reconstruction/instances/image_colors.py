@@ -1,6 +1,6 @@
 """Colors of the surface as the keyframes show them: finer than the mesh, whose colors blur over a centimetre."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -41,18 +41,8 @@ class SurfaceSamples:
         )
 
 
-def sample_colors(
-    graph: MeshGraph, surface: Surface, chosen: np.ndarray, posed: PosedFrames, depth: DepthMaps
-) -> SurfaceSamples:
-    """Look at the triangles between vertices in all keyframes that see them.
-
-    Args:
-        graph: the surface as a graph.
-        surface: the surface in world space.
-        chosen: vertices; triangles with all three corners among them are looked at.
-        posed: keyframes with cameras in world space.
-        depth: their depth in metres, which tells what is seen from what is hidden.
-    """
+def surface_samples(graph: MeshGraph, surface: Surface, chosen: np.ndarray) -> SurfaceSamples:
+    """Return samples of the triangles whose corners are all among vertices `chosen`, without colors as yet."""
     inside = np.zeros(len(graph.points), bool)
     inside[chosen] = True
     faces = np.asarray(surface.faces, np.int64)
@@ -62,25 +52,33 @@ def sample_colors(
     points = np.einsum("bk,fkd->fbd", _BARYCENTRIC, corners).reshape(-1, 3)
     normals = np.einsum("bk,fkd->fbd", _BARYCENTRIC, graph.normals[faces]).reshape(-1, 3)
     count = len(_BARYCENTRIC)
-    sums, weights = np.zeros((len(points), 3)), np.zeros(len(points))
+    vertex = faces[:, _BARYCENTRIC.argmax(axis=1)].reshape(-1)
+    areas = np.repeat(doubled / (2.0 * count), count)
+    return SurfaceSamples(points, normals, areas, vertex, np.full((len(points), 3), np.nan, np.float32))
+
+
+def with_colors(samples: SurfaceSamples, posed: PosedFrames, depth: DepthMaps) -> SurfaceSamples:
+    """Look at samples in all keyframes that see them.
+
+    Args:
+        samples: of the surface in world space.
+        posed: keyframes with cameras in world space.
+        depth: their depth in metres, which tells what is seen from what is hidden.
+    """
+    sums, weights = np.zeros((len(samples.points), 3)), np.zeros(len(samples.points))
     camera = posed.camera
-    for row in range(len(posed.images) if len(points) else 0):
+    for row in range(len(posed.images) if len(samples.points) else 0):
         pose = np.asarray(posed.world_from_camera[row], np.float64)
         _add_frame(
-            points, normals, invert_rigid(pose), pose[:3, 3], camera.fx, camera.fy, camera.cx, camera.cy,
+            samples.points, samples.normals, invert_rigid(pose), pose[:3, 3],
+            camera.fx, camera.fy, camera.cx, camera.cy,
             np.ascontiguousarray(depth.depth[row], np.float32), depth.camera.width / camera.width,
             cv2.cvtColor(np.ascontiguousarray(posed.images[row]), cv2.COLOR_RGB2LAB), sums, weights,
         )  # fmt: skip
-    lab = np.full((len(points), 3), np.nan, np.float32)
+    lab = np.full((len(weights), 3), np.nan, np.float32)
     seen = weights > 0
     lab[seen] = sums[seen] / weights[seen, None] * [100 / 255, 1, 1] - [0, 128, 128]  # of 8 bits
-    return SurfaceSamples(
-        points,
-        normals,
-        np.repeat(doubled / (2.0 * count), count),
-        faces[:, _BARYCENTRIC.argmax(axis=1)].reshape(-1),
-        lab,
-    )
+    return replace(samples, lab=lab)
 
 
 @njit(cache=True)

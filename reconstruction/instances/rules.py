@@ -7,6 +7,7 @@ from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.feet import merge_feet
+from reconstruction.instances.flats import cut_flats
 from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.scraps import without_fragments
@@ -44,6 +45,7 @@ def cut_by_rules(
     things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
+    things = cut_flats(graph, surface, things, posed, depth, config, progress)
     things = cut_stacks(graph, surface, things, posed, depth, config, progress)
     things = without_fragments(graph, things, shell.base[0].observed, config, progress)
     for thing in things:

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.image_colors import SurfaceSamples, sample_colors
+from reconstruction.instances.image_colors import SurfaceSamples, surface_samples, with_colors
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
@@ -82,7 +82,7 @@ def cut_stacks(
     if not small:
         return things
     chosen = np.concatenate([thing.vertices for thing in small])
-    samples = sample_colors(graph, surface, chosen, posed, depth)
+    samples = with_colors(surface_samples(graph, surface, chosen), posed, depth)
     out, waiting = list(things), list(small)
     while waiting:
         lower = waiting.pop()

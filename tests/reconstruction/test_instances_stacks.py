@@ -6,7 +6,7 @@ from fused_surfaces import box, can, fused
 from surfaces import frames_of
 
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.instances.image_colors import sample_colors
+from reconstruction.instances.image_colors import surface_samples, with_colors
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.stacks import cut_stacks
 from reconstruction.progress import NO_PROGRESS
@@ -104,11 +104,11 @@ def test_colors_are_those_of_the_frames():
     graph = MeshGraph.from_surface(surface)
     carton = np.flatnonzero((graph.points[:, 2] > 0.03) & (graph.points[:, 2] < 0.12))
     filmed = posed.__class__(**{**vars(posed), "images": images})
-    samples = sample_colors(graph, surface, carton, filmed, depth)
+    samples = with_colors(surface_samples(graph, surface, carton), filmed, depth)
     seen = np.isfinite(samples.lab[:, 0])
     assert seen.mean() > 0.5
     red = lab_from_rgb(np.array([[190, 60, 40]], np.uint8))[0]
     np.testing.assert_allclose(np.median(samples.lab[seen], axis=0), red, atol=6.0)
     nearer = depth.__class__(depth.camera, 0.5 * depth.depth, depth.confidence)
-    hidden = sample_colors(graph, surface, carton, filmed, nearer)
+    hidden = with_colors(samples, filmed, nearer)
     assert not np.isfinite(hidden.lab).any()
