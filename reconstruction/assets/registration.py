@@ -175,7 +175,8 @@ class _Search:
         return [poses[k] for k in order[:kept]]
 
     def _cost(self, pose: Pose, count: int) -> float:
-        distance, _, _ = self._to_mesh(pose, _thinned(len(self.seen.points), count))
+        distance, _, facing = self._to_mesh(pose, _thinned(len(self.seen.points), count))
+        distance = np.where(facing, distance, distance + 0.5 * self.near_m)
         near = 0.5 * self.near_m
         unexplained = np.minimum(distance / near, 3.0).mean() / 3.0
         mesh = _thinned(len(self.points), 2 * count)
@@ -203,7 +204,7 @@ class _Search:
         distance = np.hypot(along, np.maximum(sideways - spacing, 0.0))
         known = np.linalg.norm(self.seen.normals[rows], axis=1) > 0.5
         facing = ~known | (np.einsum("nk,nk->n", self.seen.normals[rows], normal) > _FACING)
-        return np.where(facing, distance, distance + 0.5 * self.near_m), nearest, facing
+        return distance, nearest, facing
 
     @property
     def _spacing(self) -> float:

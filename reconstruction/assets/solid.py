@@ -117,23 +117,29 @@ def taubin(solid: Solid, iterations: int, fixed: np.ndarray) -> Solid:
     return Solid(vertices, solid.faces)
 
 
-def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
-    """Decimate to a manifold mesh of at most about `max_faces` faces."""
+def lightened(solid: Solid, max_faces: int) -> Solid | None:
+    """Return about `max_faces` faces of a solid by quadric decimation; None where that breaks or shrinks it."""
     import fast_simplification
 
-    start = solid
+    vertices, faces = fast_simplification.simplify(
+        np.ascontiguousarray(solid.vertices, np.float64),
+        np.ascontiguousarray(solid.faces, np.int32),
+        target_count=int(max_faces),
+        agg=4,
+    )
+    closed = to_manifold(compact(Solid(vertices.astype(np.float64), faces.astype(np.int32))))
+    if closed is None or abs(closed.volume - solid.volume) >= 0.05 * solid.volume + 1e-7:
+        return None
+    return closed
+
+
+def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
+    """Decimate to a manifold mesh of at most about `max_faces` faces."""
     if len(solid.faces) > max_faces:
-        vertices, faces = fast_simplification.simplify(
-            np.ascontiguousarray(solid.vertices, np.float64),
-            np.ascontiguousarray(solid.faces, np.int32),
-            target_count=int(max_faces),
-            agg=4,
-        )
-        light = compact(Solid(vertices.astype(np.float64), faces.astype(np.int32)))
-        closed = to_manifold(light)
-        if closed is not None and abs(closed.volume - start.volume) < 0.05 * start.volume + 1e-7:
-            return closed
-        solid = _simplify_manifold(start, max_faces, tolerance_m)
+        light = lightened(solid, max_faces)
+        if light is not None:
+            return light
+        solid = _simplify_manifold(solid, max_faces, tolerance_m)
     closed = to_manifold(solid)
     return solid if closed is None else closed
 

@@ -5,29 +5,42 @@ import numpy as np
 from reconstruction.assets.completion import CompletedField
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.generation.meshes import GeneratedMesh
-from reconstruction.assets.solid import Solid, extract, lighten, taubin, to_manifold, without_crumbs
+from reconstruction.assets.solid import (
+    Solid,
+    extract,
+    lighten,
+    lightened,
+    taubin,
+    to_manifold,
+    without_crumbs,
+)
 
 _CELLS_MORE = 1.4  # than the embedded completion uses: a generated mesh has no noise
 _SMOOTHING = 3
+_LEAST_M3 = 1e-7
+_WALL = 1.0  # voxels from the surface at which the flood stops
 
 
 def closed_solid(mesh: GeneratedMesh, config: AssetsConfig, budget: int) -> Solid | None:
     """Return a mesh in metres as a closed solid of about `budget` faces; None where nothing solid is left.
 
-    Where the mesh is a closed manifold already its own surface is kept. Otherwise the space around it is flooded on a
-    grid, and what the flood does not reach is inside; the surface stays where the mesh has it.
+    Where the mesh is a closed manifold, and stays one when it is made light, its own surface is kept. Otherwise the
+    space around it is flooded on a grid, and what the flood does not reach is inside.
     """
     own = to_manifold(_joined(mesh.vertices, mesh.faces))
     if own is not None:
         own = without_crumbs(own)
+    if own is not None and len(own.faces) > budget:
+        own = lightened(own, budget)
+    if own is not None:
+        return own if own.volume > _LEAST_M3 else None
     voxel = _voxel(mesh, config)
-    body = own if own is not None else extract(flooded(mesh, voxel, config.min_thickness_m))
+    body = extract(flooded(mesh, voxel, config.min_thickness_m))
     if body is None:
         return None
-    if own is None:
-        body = taubin(body, _SMOOTHING, np.abs(body.vertices[:, 2] - body.vertices[:, 2].min()) < 0.3 * voxel)
+    body = taubin(body, _SMOOTHING, np.abs(body.vertices[:, 2] - body.vertices[:, 2].min()) < 0.3 * voxel)
     body = to_manifold(lighten(body, budget, 0.3 * voxel))
-    return body if body is not None and body.volume > 1e-7 else None
+    return body if body is not None and body.volume > _LEAST_M3 else None
 
 
 def flooded(mesh: GeneratedMesh, voxel_m: float, thickness_m: float) -> CompletedField:
@@ -49,13 +62,18 @@ def flooded(mesh: GeneratedMesh, voxel_m: float, thickness_m: float) -> Complete
     centers = origin + (np.argwhere(near) + 0.5) * voxel_m
     distance, nearest = cKDTree(mesh.points).query(centers)
     front = np.einsum("nk,nk->n", centers - mesh.points[nearest], mesh.normals[nearest]) > 0
-    bodies, _ = label(~near)
-    outside = bodies == bodies[0, 0, 0]
-    touched = binary_dilation(outside)[near]
-    if touched.any() and front[touched].mean() < 0.5:  # a mesh inside out
+    wall = np.zeros(shape, bool)
+    wall[near] = distance < _WALL * voxel_m
+    bodies, _ = label(~wall)
+    air = bodies == bodies[0, 0, 0]
+    rim = binary_dilation(air & ~near)[near]
+    if rim.any() and front[rim].mean() < 0.5:  # a mesh inside out
         front = ~front
-    field = np.where(outside, 1.0, -1.0) * reach * voxel_m
+    field = np.where(air, 1.0, -1.0) * reach * voxel_m
     field[near] = np.where(front, distance, np.maximum(-distance, distance - thickness_m))
+    # What the air does not reach is no hollow: pages of a book, shells within shells.
+    reached = binary_dilation(air, iterations=int(np.ceil(_WALL)) + 1)
+    field = np.where((field > 0) & ~reached, -0.5 * voxel_m, field)
     limit = 3.0 * voxel_m
     return CompletedField(origin, voxel_m, np.clip(field, -limit, limit).astype(np.float32), ())
 

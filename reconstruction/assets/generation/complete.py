@@ -15,6 +15,7 @@ from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 from reconstruction.types import SpaceGrid
 from registry.geometry import transform_points
 
+_BELIEVED_SHARE = 0.3  # of the points; if fewer are kept, all count
 _FREE = 1  # state of a cell of the scene's space grid
 
 
@@ -58,7 +59,7 @@ def generated_shape(
         mesh = read_generated(fetched.meshes[number], config.seed)
     except GenerationError as error:
         return Attempt(f"{fetched.by} rejected: {error}")
-    seen = SeenSurface(frame.points, frame.normals, 0.0 if frame.on_support else None)
+    seen = believed_surface(frame, volume)
     fit = register(mesh.points, mesh.normals, seen, free_space(frame, volume, space))
     fault = fit.fault(config.generator_missed, config.generator_intruding)
     if fault:
@@ -68,6 +69,17 @@ def generated_shape(
     if body is None:
         return Attempt(f"{fetched.by} rejected: its mesh cannot be closed to a solid")
     return Attempt(_description(fetched.by, fit), body, _colors(placed, frame))
+
+
+def believed_surface(frame: ObjectFrame, volume: ObjectVolume) -> SeenSurface:
+    """Return the seen points that the object's volume keeps as surface: seen by enough frames, and within outlines."""
+    cell = np.floor((frame.points - volume.origin) / volume.voxel_m).astype(np.int64)
+    inside = np.all((cell >= 0) & (cell < volume.seen.shape), axis=1)
+    kept = inside.copy()
+    kept[inside] = volume.seen[tuple(cell[inside].T)]
+    if kept.mean() < _BELIEVED_SHARE:
+        kept[:] = True
+    return SeenSurface(frame.points[kept], frame.normals[kept], 0.0 if frame.on_support else None)
 
 
 def free_space(frame: ObjectFrame, volume: ObjectVolume, space: SpaceGrid | None) -> FreeDepth:
