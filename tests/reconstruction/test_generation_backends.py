@@ -22,6 +22,7 @@ from reconstruction.assets.generation import records as records_module
 from reconstruction.assets.generation.base import Picture
 from reconstruction.assets.generation.hunyuan import Hunyuan3D
 from reconstruction.assets.generation.meshes import read_generated
+from reconstruction.assets.generation.pictures import _without_specks
 from reconstruction.assets.generation.records import Records
 from reconstruction.assets.generation.rodin import Rodin
 from reconstruction.assets.generation.service import ServiceLimits
@@ -82,6 +83,15 @@ def test_rodin_is_sent_pictures_of_the_object_alone(rodin):
     assert [json.loads(body)["subscription_key"] for body in rodin.sent("/api/v2/status")] == ["sub-1"] * 3
     assert json.loads(rodin.sent("/api/v2/download")[0]) == {"task_uuid": "task-1"}
     assert set(rodin.keys) == {"Bearer secret-key"}
+
+
+def test_specks_beside_an_object_are_no_part_of_its_picture():
+    mask = np.zeros((40, 60), bool)
+    mask[5:25, 5:25] = mask[5:25, 40:50] = mask[35:37, 55:58] = True
+    kept = _without_specks(mask)
+    assert kept[5:25, 5:25].all()
+    assert kept[5:25, 40:50].all()  # cut in two by something in front
+    assert kept.sum() == mask.sum() - 6
 
 
 def test_rodins_key_goes_to_no_other_host(rodin):

@@ -9,6 +9,7 @@ from reconstruction.assets.generation.base import ObjectPictures, Picture
 from reconstruction.types import Instance, InstanceSet, PosedFrames
 
 _LABEL_BELIEVED = 0.5
+_SPECK_SHARE = 0.1  # of an object's largest part in the picture
 
 
 def object_pictures(
@@ -29,9 +30,17 @@ def keyframe_pictures(found: InstanceSet, posed: PosedFrames, count: int) -> dic
     from reconstruction.instances.naming.views import best_views
 
     return {
-        number: [Picture(view.crop, view.mask) for view in views if view.mask.any()]
+        number: [Picture(view.crop, _without_specks(view.mask)) for view in views if view.mask.any()]
         for number, views in best_views(found, posed, count).items()
     }
+
+
+def _without_specks(mask: np.ndarray) -> np.ndarray:
+    """Return a mask without what is small and apart: smears of its neighbors."""
+    _, labels, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    sizes = facts[1:, cv2.CC_STAT_AREA]
+    kept = 1 + np.flatnonzero(sizes >= _SPECK_SHARE * sizes.max())
+    return np.isin(labels, kept)
 
 
 def encode_png(image: np.ndarray) -> bytes:
