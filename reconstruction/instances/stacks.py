@@ -149,7 +149,7 @@ def _score(own: SurfaceSamples, above: np.ndarray, height: float) -> float:
         return 0.0
     flat = own.points[:, :2] - np.percentile(own.points[column, :2], [5, 95], axis=0).mean(axis=0)
     radius = np.hypot(flat[:, 0], flat[:, 1])
-    turn = (np.arctan2(flat[:, 1], flat[:, 0]) / (2 * np.pi) * _DIRECTIONS).astype(int) % _DIRECTIONS
+    turn = np.floor(np.arctan2(flat[:, 1], flat[:, 0]) / (2 * np.pi) * _DIRECTIONS).astype(int) % _DIRECTIONS
     around = _medians(radius, turn, column)
     below = _medians(radius, turn, lower & (slope < _STEEP) & (radius > 0.4 * around[turn]))
     level = (own.normals[:, 2] > _LEVEL) & (np.abs(z - height) < 2 * _NEAR_M)
