@@ -14,8 +14,6 @@ from reconstruction.assets import symmetry
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 
-_HIDDEN_SLACK_M = 0.01
-
 
 @dataclass(frozen=True)
 class CompletedField:
@@ -167,9 +165,7 @@ def _contact(volume: ObjectVolume, hull: np.ndarray, frame: ObjectFrame, *, furn
     """Unknown voxels between the object and its support close below: seen surface ends there, so it stands there."""
     size = np.percentile(frame.points, 99, axis=0) - np.percentile(frame.points, 1, axis=0)
     reach = 0.03 if furniture else max(0.03, 0.4 * float(size[:2].min()))
-    if frame.on_support:  # what is seen lowest stands there, however much is hidden by what is around it
-        reach = max(reach, float(np.percentile(frame.points[:, 2], 2)) + _HIDDEN_SLACK_M)
-    else:
+    if not frame.on_support:
         reach = min(reach, 0.02)
     solid_above = volume.known & (volume.distance < 0)
     layers = min(int(np.ceil(reach / volume.voxel_m)), volume.distance.shape[2] - 1)

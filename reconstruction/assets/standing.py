@@ -14,7 +14,6 @@ from reconstruction.types import DepthMaps, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _SAME_LEVEL_M = 0.015
-_HIDDEN_M = 0.01
 # No camera sees the board below a thing, but something carries it: at least this much is there.
 _BOARD_M = 0.02
 _FOOTPRINT_SHRINK_M = 0.006
@@ -71,10 +70,6 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
             carriers[parent] = lift_object(posed, depth, pixels, parent, 150_000)
         level = support_height(item, points, carriers.get(parent), found)
         low, high = np.percentile(points[:, 2], [0.5, 99.5])
-        bottom = float(item.center[2] - 0.5 * item.extents_m[2])
-        # What is in a container goes on behind the rim: the stage before has looked for the floor of it.
-        if bottom < low - _HIDDEN_M and (level is None or level > low - _HIDDEN_M):
-            level = bottom
         middle = np.median(points[:, :2], axis=0)
         # The outermost points are depth errors at the outline: drop them before the hull.
         flat = points[:: max(1, len(points) // 20_000), :2]
