@@ -23,7 +23,7 @@ class AvoConfig:
     min_gain: float = 0.003
     """No further view that would show less than this share of the target's opacity anew."""
 
-    back_weight: float = 0.3
+    back_weight: float = 0.5
     """What the back of a Gaussian counts beside its front. Backs show through sides of a thing that no frame saw: the
     view is where a completed shape can be looked at, but its picture shows a shell from within. 0: no such views."""
 
@@ -46,7 +46,7 @@ class AvoConfig:
     """Lambda: of the squared difference to the target distance, relative to it. Information counts as a share of
     what the best start shows."""
 
-    steps: int = 30
+    steps: int = 24
     """Gradient steps of a view."""
 
     rate: float = 0.06
@@ -55,10 +55,10 @@ class AvoConfig:
     free_weight: float = 1.0
     """Of the squared shortfall of the clearance, relative to it."""
 
-    clearance_m: float = 0.15
+    clearance_m: float = 0.08
     """Cameras are pushed away from what is nearer than this: surfaces and space that no frame looked into."""
 
-    min_clearance_m: float = 0.05
+    min_clearance_m: float = 0.04
     """No camera is nearer than this to it."""
 
     max_pitch_deg: float = 80.0

@@ -1,12 +1,13 @@
 """What a viewpoint is worth: what it shows of the target through the whole scene, at which distance; and the gradient.
 
-    L(v) = -1/P sum_p w(p) sum_i e_i alpha_i T_i(p)  +  lambda sum_p S(p) (D(p)/d - 1)^2 / sum_p S(p)
+    L(v) = -1/P sum_p w(p) sum_i e_i alpha_i T_i(p)  +  lambda (D/d - 1)^2
 
 i runs over the target's Gaussians, T over everything that lies before them, e_i is what is left of the effective
-opacity of the side of a Gaussian that is seen, S(p) the target's own opacity at a pixel, D(p) its own depth there and
-d the target distance. w is the solid angle of a pixel beside that of the middle one, and a little less far out: plain
-pixels show more towards the border, which would draw the target there. P pixels count as 1, so that lambda means the
-same for targets of all sizes and shapes.
+opacity of the side of a Gaussian that is seen, D the mean depth of what is seen of the target and d the target
+distance. (The mean square over pixels would also count how deep the target itself is, and draw cameras to its
+flattest side.) w is the solid angle of a pixel beside that of the middle one, and a little less far out: plain
+pixels show more towards the border, which would draw the target there. P pixels count as 1, so that lambda means
+the same for targets of all sizes and shapes.
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +38,7 @@ class Value:
         float  # pixels that show the target, weighted with what is left, as a share of `reference_px`
     )
     seen: float  # the same, unweighted
-    depth_term: float  # mean squared relative difference to the target distance
+    depth_term: float  # squared difference of the depth to the target distance, relative to that
     depth_m: float  # mean depth of the target's pixels, 0 where none is seen
     loss: float
     gradient: np.ndarray | None  # (6,) by world_from_camera exp(xi): translation, rotation in camera axes
@@ -140,14 +141,12 @@ class Objective:
         by_image[..., kernels.WORTH] = -size / pixels
         if total <= _LEAST_SEEN * size.size:
             return Value(information, total / pixels, 0.0, 0.0, -information, None), by_image
-        with np.errstate(divide="ignore", invalid="ignore"):
-            off = np.where(seen > _LEAST_SEEN, depth / seen / distance - 1.0, 0.0)  # D/d - 1
-        term = float((seen * off**2).sum()) / total
-        # d/dS of S (Z/(S d) - 1)^2 is off^2 - 2 off (off + 1); d/dZ is 2 off / d; each over the sum of S.
-        by_image[..., kernels.SEEN] = weight * (off**2 - 2 * off * (off + 1.0) - term) / total
+        mean = float(depth.sum()) / total
+        off = mean / distance - 1.0
+        by_image[..., kernels.SEEN] = -weight * 2.0 * off * mean / (distance * total)
         by_image[..., kernels.DEPTH] = weight * 2.0 * off / (distance * total)
-        loss = -information + weight * term
-        return Value(information, total / pixels, term, float(depth.sum()) / total, loss, None), by_image
+        loss = -information + weight * off**2
+        return Value(information, total / pixels, off**2, mean, loss, None), by_image
 
     def _facing(self, eye: np.ndarray) -> np.ndarray:
         """Tell which Gaussians of the target (m,) turn their front to the eye (3,)."""
@@ -194,11 +193,15 @@ class Objective:
         run_over(
             len(rows), kernels.sum_entries, entry_gradients, blended.bins[2], blended.bins[3], rows, splat_gradients
         )  # fmt: skip
+        moved = np.flatnonzero(
+            splat_gradients[rows].any(axis=1)
+        )  # the others lie behind the target everywhere
+        rows, splats = rows[moved], blended.splats[moved]
         by_parameters = np.empty((n, shared.N_PARAMETERS), dtype)
         by_pose = np.empty((len(rows), 6), np.float64)
         run_over(
             len(rows), shared.project_backward, self.packed[blended.chosen], rows, *blended.pose,
-            _intrinsics(blended.camera), blended.splats, splat_gradients, by_parameters, by_pose,
+            _intrinsics(blended.camera), splats, splat_gradients, by_parameters, by_pose,
         )  # fmt: skip
         return by_pose.sum(axis=0)
 

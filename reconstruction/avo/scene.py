@@ -13,7 +13,7 @@ from reconstruction.instances.gaussian_ids import gaussian_instances
 from reconstruction.types import Camera, InstanceSet, Surface
 from registry.errors import UsageError
 
-_INPUTS = 48  # input cameras that are looked at, evenly spread over the film
+_INPUTS = 40  # input cameras that are looked at, evenly spread over the film
 _OUTER_SHARE = 0.98  # of the target's Gaussians lie in its sphere: strays do not push the camera away
 
 

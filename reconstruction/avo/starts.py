@@ -8,8 +8,8 @@ from reconstruction.avo.cameras import look_at
 from reconstruction.avo.config import AvoConfig
 from reconstruction.avo.scene import Target, ViewScene
 
-_AZIMUTHS, _PITCHES_DEG = 12, (12.0, 35.0, 60.0)
-_NEARER = (1.0, 0.8, 0.62, 0.48)  # shares of the target distance that are tried until a place is free
+_AZIMUTHS, _PITCHES_DEG = 12, (6.0, 25.0, 45.0, 65.0)
+_SHARES = (1.0, 1.2, 0.8, 0.62, 0.48)  # of the target distance, tried until a place is free
 
 
 def input_starts(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
@@ -26,7 +26,7 @@ def starts_around(scene: ViewScene, target: Target, config: AvoConfig) -> np.nda
             away = np.array(
                 [math.cos(pitch) * math.cos(angle), math.cos(pitch) * math.sin(angle), math.sin(pitch)]
             )
-            for share in _NEARER:
+            for share in _SHARES:
                 eye = target.center + share * (target.distance_m + target.radius_m) * away
                 if scene.clearance.at(eye) >= config.clearance_m:
                     out.append(look_at(eye, target.center, config.max_pitch_deg))

@@ -19,8 +19,10 @@ from registry.geometry import matrix_from_quat
 
 _APART_DEG = 25.0  # starts that are optimized look from directions at least this far apart
 _CANONICAL_PITCH_DEG = 25.0
-_BY_PIXELS = 0.3  # of the ranking of starts; the rest is by what is seen anew
-_SEEN_AT, _CLEAR_SHARE = 0.33, 0.1
+_BY_PIXELS = 0.15  # of the ranking of starts; the rest is by what is seen anew
+_SEEN_AT, _CLEAR_SHARE = 0.33, 0.05
+_FRONTS_FROM = 2  # every second input camera tells fronts from backs
+_BETTER = 1.1  # by this factor a start must show more than what the search made of it, to stay
 _LEAST_PX = 0.05  # of a Gaussian; less is never a good view of it
 
 
@@ -81,6 +83,10 @@ class Coverage:
         """Share of the opacity that is left."""
         return float((self._opacities * self.left).sum()) / self._total
 
+    def gain(self, contributions: np.ndarray) -> float:
+        """Return the share of the opacity that a view with these contributions (2, m) shows anew."""
+        return self.remaining - self.after(contributions).remaining
+
     def after(self, contributions: np.ndarray) -> "Coverage":
         """Return what is left after a view with these contributions (2, m)."""
         out = copy(self)
@@ -113,55 +119,61 @@ class ActiveViews:
         fine = _objective(scene, target, square_camera(config.side_px, config.fov_deg), config)
         search = Search(fine, scene.clearance, target.distance_m, weight, config)
         starts = input_starts(scene, target, config)
-        scanned = [coarse.scan(start) for start in starts]
-        fine.fronts = coarse.fronts = _fronts(scene, target, np.array([c[0] for c, _ in scanned]))
+        seen = [coarse.scan(start)[0][0] for start in starts[::_FRONTS_FROM]]
+        fine.fronts = coarse.fronts = _fronts(scene, target, np.array(seen))
         if config.starts == "around":
             starts = np.concatenate([starts, starts_around(scene, target, config)])
-        scanned = [coarse.scan(start) for start in starts]
-        shown, depths = np.array([c for c, _ in scanned]), np.array([z for _, z in scanned])
+        scanned = [_scan(coarse, start, target, fine.camera) for start in starts]
+        shown = np.array([contributions for contributions, _ in scanned])
         if self._with_depth:
-            starts, scale = _at_target_distance(starts, depths, scene, target, config)
-            shown = shown * scale[:, None, None]
+            starts = _at_target_distance(starts, np.array([z for _, z in scanned]), scene, target, config)
         fixed = np.array([search.loss_of_place(start[:3, 3])[0] for start in starts])
-        finer = (config.side_px / config.scan_side_px) ** 2
-        coverage, out = _coverage(scene, target, shown.max(axis=0) * finer, config), []
+        coverage, out = _coverage(scene, target, shown.max(axis=0), config), []
         while len(out) < config.views:
             information = np.einsum("ksm,sm->k", shown, coverage.worth)
-            coarse.reference_px = max(float(information.max()), _LEAST_PX)
-            fine.reference_px = coarse.reference_px * finer
-            gains = np.array([coverage.remaining - coverage.after(c * finer).remaining for c in shown])
-            scores = gains / max(gains.max(), 1e-9) + _BY_PIXELS * information / coarse.reference_px - fixed
+            fine.reference_px = max(float(information.max()), _LEAST_PX)
+            gains = np.array([coverage.gain(contributions) for contributions in shown])
+            scores = gains / max(gains.max(), 1e-9) + _BY_PIXELS * information / fine.reference_px - fixed
             rows = _apart(starts, -scores, config.restarts)
-            found = search.best_of([starts[row] for row in rows], coverage.worth)
+            found = search.best_of(starts[rows], coverage.worth)
             if found is None:
                 break
-            after = coverage.after(fine.scan(found.pose)[0])
-            gain, coverage = coverage.remaining - after.remaining, after
+            pose, contributions = found.pose, _scan(fine, found.pose, target, fine.camera)[0]
+            for row in rows:  # what counts is what is seen anew: more pixels of less are no progress
+                if fixed[row] == 0.0 and coverage.gain(shown[row]) > _BETTER * coverage.gain(contributions):
+                    pose, contributions = starts[row], _scan(fine, starts[row], target, fine.camera)[0]
+            gain, coverage = coverage.gain(contributions), coverage.after(contributions)
             if gain < config.min_gain:
                 break
-            out.append(Viewpoint(found.pose, fine.camera, "optimized", gain))
+            origin = "optimized" if pose is found.pose else "start"
+            out.append(Viewpoint(pose, fine.camera, origin, gain))
             if coverage.remaining < config.remaining_share:
                 break
         return out
 
 
+def _scan(objective: Objective, pose: np.ndarray, target: Target, camera: Camera) -> tuple[np.ndarray, float]:
+    """Return what a pose shows of each side of the target's Gaussians (2, m), and at which depth.
+
+    In pixels of `camera`, from the target distance: so they say how well a side is seen, not how close the camera is.
+    """
+    contributions, depth = objective.scan(pose)
+    return contributions * (depth / target.distance_m * camera.fx / objective.camera.fx) ** 2, depth
+
+
 def _at_target_distance(
     starts: np.ndarray, depths: np.ndarray, scene: ViewScene, target: Target, config: AvoConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the starts moved along their view to the target distance, as far as is free, and how pixels grow by that.
-
-    Starts are compared by what they show, not by where they happen to be.
-    """
-    out, scale = starts.copy(), np.ones(len(starts))
+) -> np.ndarray:
+    """Return the starts (n, 4, 4) moved along their view to the target distance, as far as is free."""
+    out = starts.copy()
     for row in np.flatnonzero(depths > 0):
         forward = depths[row] - target.distance_m
         for share in (1.0, 0.8, 0.6, 0.4, 0.2):
             eye = starts[row, :3, 3] + share * forward * starts[row, :3, 2]
             if scene.clearance.at(eye) >= config.clearance_m:
                 out[row, :3, 3] = eye
-                scale[row] = (depths[row] / max(depths[row] - share * forward, 1e-6)) ** 2
                 break
-    return out, scale
+    return out
 
 
 def _fronts(scene: ViewScene, target: Target, shown: np.ndarray) -> np.ndarray:
@@ -170,11 +182,11 @@ def _fronts(scene: ViewScene, target: Target, shown: np.ndarray) -> np.ndarray:
     Args:
         scene: with the input cameras.
         target: its Gaussians.
-        shown: (inputs, m) what each Gaussian gives to each of them.
+        shown: what each Gaussian (m,) gives to every second of them.
     """
     packed = scene.packed[target.rows].astype(np.float64)
     normals = matrix_from_quat(packed[:, 3:7])[:, :, 2]
-    toward = scene.inputs[:, None, :3, 3] - packed[None, :, :3]
+    toward = scene.inputs[::_FRONTS_FROM, None, :3, 3] - packed[None, :, :3]
     facing = np.einsum("kmc,mc->km", toward, normals) / np.linalg.norm(toward, axis=2)
     side = ((shown + 1e-9) * facing).sum(axis=0)
     return normals * np.where(side < 0, -1.0, 1.0)[:, None]
@@ -202,12 +214,11 @@ class InputFrames:
         scale = config.side_px / max(scene.camera.width, scene.camera.height)
         camera = scene.camera.resized(round(scene.camera.width * scale), round(scene.camera.height * scale))
         objective = _objective(scene, target, camera, config)
-        shown = np.array([objective.scan(pose)[0] for pose in scene.inputs])
+        shown = np.array([_scan(objective, pose, target, camera)[0] for pose in scene.inputs])
         coverage, out = _coverage(scene, target, shown.max(axis=0), config), []
         while len(out) < config.views:
             row = int(np.argmax(np.einsum("ksm,sm->k", shown, coverage.worth)))
-            after = coverage.after(shown[row])
-            gain, coverage = coverage.remaining - after.remaining, after
+            gain, coverage = coverage.gain(shown[row]), coverage.after(shown[row])
             if gain < config.min_gain:
                 break
             out.append(Viewpoint(scene.inputs[row], camera, f"input frame {scene.frames[row]}", gain))
@@ -234,11 +245,10 @@ class Orbit:
             away = np.append(flat, math.sin(pitch))
             eye = target.center + (target.distance_m + target.radius_m) * away
             poses.append(look_at(eye, target.center, config.max_pitch_deg))
-        shown = np.array([objective.scan(pose)[0] for pose in poses])
+        shown = np.array([_scan(objective, pose, target, camera)[0] for pose in poses])
         coverage, out = _coverage(scene, target, shown.max(axis=0), config), []
         for number, pose in enumerate(poses):
-            after = coverage.after(shown[number])
-            gain, coverage = coverage.remaining - after.remaining, after
+            gain, coverage = coverage.gain(shown[number]), coverage.after(shown[number])
             out.append(Viewpoint(pose, camera, f"orbit at {360 * number // config.views} degrees", gain))
         return out
 
