@@ -25,7 +25,7 @@ a first run:
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the parser of all verbs."""
-    from reconstruction.commands import doctor, evaluate, marker, reconstruct, report, scenes
+    from reconstruction.commands import doctor, evaluate, export, marker, reconstruct, report, scenes
 
     parser = argparse.ArgumentParser(
         prog="simrecon",
@@ -39,6 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
     scenes.add_parsers(verbs)
     evaluate.add_parser(verbs)
     report.add_parser(verbs)
+    export.add_parser(verbs)
     marker.add_parser(verbs)
     doctor.add_parser(verbs)
     return parser

@@ -4,6 +4,7 @@ Everything that may crash or hang (drivers, compiled wheels) is tried in other p
 all at the same time, so that the whole takes seconds.
 """
 
+import contextlib
 import importlib.metadata
 import json
 import os
@@ -154,7 +155,16 @@ def run_checks() -> list[Check]:
         "CUDA (optional)": _start(_CUDA_CODE),
     }
     learned = _start(_LEARNED_CODE.format(root=str(Path(__file__).parents[1])))
-    checks = [_python(), *_packages(), _opencv(), _numba_cache(), _machine(), _disk(), _registry()]
+    checks = [
+        _python(),
+        *_packages(),
+        _exports(),
+        _opencv(),
+        _numba_cache(),
+        _machine(),
+        _disk(),
+        _registry(),
+    ]
     reinstall = f"{sys.executable} -m pip install --force-reinstall "
     fixes = {
         "video decoding": (reinstall + "av", True),
@@ -226,6 +236,17 @@ def _packages() -> list[Check]:
         )
     ]
     return checks
+
+
+def _exports() -> Check:
+    """Look for what reads the exports; only USD cannot be written without."""
+    found = []
+    for name in ("mujoco", "usd-core"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found.append(f"{name} {importlib.metadata.version(name)}")
+    detail = ", ".join(found) or "neither mujoco nor usd-core is installed"
+    fix = f"{sys.executable} -m pip install 'simrecon[exports]', to export USD and to load MJCF"
+    return Check("exports (optional)", len(found) == 2, detail, fix, False)
 
 
 def _too_old(name: str, version: str) -> list[str]:

@@ -376,6 +376,20 @@ def _finite(pose: np.ndarray) -> np.ndarray:
 
 def convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) -> Any:
     """Cook one convex piece; pieces that are flat get a minimal thickness first."""
+    points = cookable_points(part)
+    try:
+        return physx.PhysxCollisionShapeConvexMesh(
+            vertices=points.astype(np.float32), scale=np.ones(3, np.float32), material=material
+        )
+    except RuntimeError as error:
+        raise SimReconError(
+            f"physics: PhysX cannot use a convex piece of '{spec.name}' (id {spec.id}, {len(points)} points, "
+            f"extents {np.round(np.ptp(points, axis=0), 4).tolist()} m): {error}"
+        ) from error
+
+
+def cookable_points(part: np.ndarray) -> np.ndarray:
+    """Return the points (v, 3) of a convex piece that are cooked: at least 1 mm thick, at most 255."""
     points = np.asarray(part, np.float64)
     center = points.mean(0)
     _, _, axes = np.linalg.svd(points - center, full_matrices=False)
@@ -387,15 +401,7 @@ def convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) ->
         points = np.concatenate([flat - half, flat + half])
     if len(points) > _MAX_PART_VERTICES:
         points = _most_extreme(points, _MAX_PART_VERTICES)
-    try:
-        return physx.PhysxCollisionShapeConvexMesh(
-            vertices=points.astype(np.float32), scale=np.ones(3, np.float32), material=material
-        )
-    except RuntimeError as error:
-        raise SimReconError(
-            f"physics: PhysX cannot use a convex piece of '{spec.name}' (id {spec.id}, {len(points)} points, "
-            f"extents {np.round(np.ptp(points, axis=0), 4).tolist()} m): {error}"
-        ) from error
+    return points
 
 
 def _most_extreme(points: np.ndarray, count: int) -> np.ndarray:

@@ -32,6 +32,7 @@ from registry.geometry import (
 
 # The same shapes and masses as in the report card that the bundle carries.
 from registry.simulation import BodySpec, convex_shape, set_inertial
+from registry.welding import moving_ids, welded_to
 from simrecon_envs.occupancy import ConvexSolid, base_slab, glb_vertices, read_obj_vertices, slab_corners
 
 BASE_FRICTION = 0.5
@@ -214,22 +215,10 @@ class _BodyBuilder(ActorBuilder):
 def bodies_of(bundle: SceneBundle) -> list[Body]:
     """Group the bundle's objects into actors: what is attached to a dynamic object belongs to its actor."""
     items = {item.id: item for item in bundle.objects}
-    edge_of = {edge.child: edge for edge in bundle.edges}
-
-    def attached_parent(key: int) -> int | None:
-        edge = edge_of.get(key)
-        return edge.parent if edge is not None and edge.relation == "attached_to" else None
-
-    def moves(key: int) -> bool:
-        """Tell whether an object can move; one that is attached moves if what it is attached to does."""
-        if key not in items:
-            return False
-        parent = attached_parent(key)
-        return items[key].dynamic if parent is None else moves(parent)
+    moving, welds = moving_ids(bundle), welded_to(bundle)
 
     def root_of(key: int) -> int:
-        parent = attached_parent(key)
-        return root_of(parent) if parent is not None and moves(parent) else key
+        return root_of(welds[key]) if key in welds else key
 
     members: dict[int, list[int]] = {}
     for key in items:
@@ -250,7 +239,12 @@ def bodies_of(bundle: SceneBundle) -> list[Body]:
         )
         bodies.append(
             Body(
-                root, f"{items[root].label}_{root}", specs, visuals, np.asarray(world_from_root), moves(root)
+                root,
+                f"{items[root].label}_{root}",
+                specs,
+                visuals,
+                np.asarray(world_from_root),
+                root in moving,
             )
         )
     return bodies

@@ -1,0 +1,139 @@
+"""GLB: `scene.glb` of the whole scene, a named node for every object and base surface with its facts as extras."""
+
+import json
+import struct
+from pathlib import Path
+
+from reconstruction.exports.scene import ExportBody, ExportScene
+from registry.errors import BundleError
+from registry.geometry import GLTF_FROM_WORLD, WORLD_FROM_GLTF, quat_from_matrix
+
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+# The lists of a glTF document that are joined, in this order in the file.
+_LISTS = ("nodes", "meshes", "materials", "textures", "images", "samplers", "accessors", "bufferViews")
+
+
+def write_glb_scene(scene: ExportScene, folder: Path) -> list[str]:
+    """Write `scene.glb`, +y up as glTF has it; return its path in the folder."""
+    document: dict = {
+        "asset": {"version": "2.0", "generator": "SimRecon"},
+        "scene": 0,
+        "scenes": [{"name": scene.id, "nodes": []}],
+        **{name: [] for name in _LISTS},
+    }
+    binary = bytearray()
+    for body in scene.bodies:
+        _append(document, binary, body)
+    document["buffers"] = [{"byteLength": len(binary)}]
+    document = {key: value for key, value in document.items() if value != []}
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    with (folder / "scene.glb").open("wb") as file:
+        file.write(struct.pack("<3I", _MAGIC, 2, 12 + 8 + len(text) + 8 + len(binary)))
+        file.write(struct.pack("<2I", len(text), _JSON) + text)
+        file.write(struct.pack("<2I", len(binary), _BIN) + binary)
+    return ["scene.glb"]
+
+
+def _append(document: dict, binary: bytearray, body: ExportBody) -> None:
+    """Add the meshes of one file under a node of their own; nothing is decoded, so nothing is lost."""
+    part, data = _read(body.visual)
+    first = {name: len(document[name]) for name in _LISTS}
+    for view in part.get("bufferViews", []):
+        document["bufferViews"].append({**view, "byteOffset": view.get("byteOffset", 0) + len(binary)})
+    binary += data + b"\0" * (-len(data) % 4)
+    for item in part.get("accessors", []):
+        document["accessors"].append(_shifted(item, {"bufferView": first["bufferViews"]}))
+    for item in part.get("images", []):
+        document["images"].append(_shifted(item, {"bufferView": first["bufferViews"]}))
+    document["samplers"] += part.get("samplers", [])
+    for item in part.get("textures", []):
+        document["textures"].append(_shifted(item, {"source": first["images"], "sampler": first["samplers"]}))
+    document["materials"] += [
+        {**_textures_shifted(item, first["textures"]), "name": body.name}
+        for item in part.get("materials", [])
+    ]
+    for item in part["meshes"]:
+        primitives = [_primitive(p, first) for p in item["primitives"]]
+        document["meshes"].append({**item, "name": body.name, "primitives": primitives})
+    _add_nodes(document, part, first, body)
+
+
+def _add_nodes(document: dict, part: dict, first: dict, body: ExportBody) -> None:
+    roots = part["scenes"][part.get("scene", 0)]["nodes"]
+    nodes = part["nodes"]
+    top = {"name": body.name, "extras": _facts(body), **_pose(body)}
+    document["scenes"][0]["nodes"].append(first["nodes"])
+    # A file of ours is one node with one mesh: that becomes the named node itself.
+    if len(nodes) == 1 and nodes[roots[0]].keys() <= {"mesh", "name"}:
+        document["nodes"].append({**top, "mesh": nodes[0]["mesh"] + first["meshes"]})
+        return
+    document["nodes"].append({**top, "children": [root + first["nodes"] + 1 for root in roots]})
+    for node in nodes:
+        kept = {key: value for key, value in node.items() if key not in ("skin", "camera")}
+        kept = _shifted(kept, {"mesh": first["meshes"]})
+        if "children" in kept:
+            kept["children"] = [child + first["nodes"] + 1 for child in kept["children"]]
+        document["nodes"].append(kept)
+
+
+def _facts(body: ExportBody) -> dict:
+    facts = {"id": body.id, "label": body.label, "kind": "base" if body.base else "object"}
+    if not body.base:
+        facts |= {"mass_kg": body.mass_kg, "friction": body.friction, "dynamic": body.moves}
+    if body.relation is not None:
+        facts["relation"], facts["parent"] = body.relation
+    return facts
+
+
+def _pose(body: ExportBody) -> dict:
+    if body.base:
+        return {}
+    pose = GLTF_FROM_WORLD @ body.world_from_object @ WORLD_FROM_GLTF
+    w, x, y, z = quat_from_matrix(pose[:3, :3]).tolist()
+    return {"translation": pose[:3, 3].tolist(), "rotation": [x, y, z, w]}
+
+
+def _primitive(primitive: dict, first: dict) -> dict:
+    out = _shifted(primitive, {"indices": first["accessors"], "material": first["materials"]})
+    shift = first["accessors"]
+    out["attributes"] = {name: number + shift for name, number in primitive["attributes"].items()}
+    return out
+
+
+def _shifted(item: dict, shifts: dict[str, int]) -> dict:
+    """Return a copy whose references are moved on."""
+    return {key: value + shifts[key] if key in shifts else value for key, value in item.items()}
+
+
+def _textures_shifted(material: dict, shift: int) -> dict:
+    """Return a copy of a material whose `...Texture` entries refer to moved textures."""
+    out = {}
+    for key, value in material.items():
+        if isinstance(value, dict):
+            value = _textures_shifted(value, shift)
+            if key.endswith("Texture"):
+                value["index"] += shift
+        out[key] = value
+    return out
+
+
+def _read(path: Path) -> tuple[dict, bytes]:
+    """Return the JSON and the binary chunk of a .glb whose parts can be joined as they are."""
+    try:
+        raw = path.read_bytes()
+        magic, _, _, length, kind = struct.unpack("<5I", raw[:20])
+        if magic != _MAGIC or kind != _JSON:
+            raise ValueError("not a binary glTF 2.0 file")
+        document = json.loads(raw[20 : 20 + length])
+        if document.get("extensionsUsed") or any("sparse" in a for a in document.get("accessors", [])):
+            raise ValueError("it uses glTF extensions or sparse accessors")
+        if not document["meshes"] or not document["scenes"][document.get("scene", 0)]["nodes"]:
+            raise ValueError("it shows nothing")
+        size = document["buffers"][0]["byteLength"]
+        data = raw[28 + length : 28 + length + size]
+        if len(document["buffers"]) != 1 or len(data) != size:
+            raise ValueError("its buffer is not inside it")
+    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
+        raise BundleError(f"{path}: cannot be joined into a scene ({error})") from error
+    return document, data

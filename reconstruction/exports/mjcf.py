@@ -1,0 +1,111 @@
+"""MJCF: `scene.xml` for MuJoCo, with options under which what rests in the bundle rests there, too."""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.exports.meshes import FOLDER, collision_obj, texture_png, visual_obj
+from reconstruction.exports.numbers import text_of
+from reconstruction.exports.scene import ExportBody, ExportScene
+from registry.geometry import invert_rigid, quat_from_matrix
+
+VISUAL_GROUP, COLLISION_GROUP = 2, 3
+# An elliptic cone and a high ratio of frictional to normal impedance keep things from creeping; noslip stops the rest.
+# Contacts as stiff as the time step allows (time constant 2 steps) keep them from sinking in.
+OPTIONS = {
+    "timestep": "0.002",
+    "integrator": "implicitfast",
+    "solver": "Newton",
+    "cone": "elliptic",
+    "impratio": "10",
+    "iterations": "100",
+    "tolerance": "1e-10",
+    "noslip_iterations": "3",
+    "gravity": "0 0 -9.81",
+}
+CONTACT = {"solref": "0.004 1", "solimp": "0.95 0.99 0.001 0.5 2", "condim": "4"}
+_TORSION_M, _ROLLING_M = 0.002, 0.0001  # radii of contact patches; MuJoCo's own defaults are 5 mm and 0.1 mm
+
+
+def write_mjcf(scene: ExportScene, folder: Path) -> list[str]:
+    """Write `scene.xml` beside `meshes/`; return its path in the folder."""
+    root = ET.Element("mujoco", model=scene.id)
+    ET.SubElement(root, "compiler", angle="radian", meshdir=FOLDER, texturedir=FOLDER, autolimits="true")
+    option = ET.SubElement(root, "option", OPTIONS)
+    ET.SubElement(option, "flag", multiccd="enable", nativeccd="enable")
+    visual = ET.SubElement(root, "visual")
+    ET.SubElement(visual, "headlight", ambient="0.5 0.5 0.5", diffuse="0.5 0.5 0.5", specular="0 0 0")
+    ET.SubElement(visual, "map", znear="0.01", zfar="50")
+    defaults = ET.SubElement(root, "default")
+    looks = ET.SubElement(defaults, "default", {"class": "visual"})
+    ET.SubElement(looks, "geom", type="mesh", group=str(VISUAL_GROUP), contype="0", conaffinity="0", mass="0")
+    touch = ET.SubElement(defaults, "default", {"class": "collision"})
+    ET.SubElement(
+        touch,
+        "geom",
+        {"type": "mesh", "group": str(COLLISION_GROUP), "mass": "0", "rgba": "0.6 0.7 0.8 0.5"} | CONTACT,
+    )
+    assets, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
+    ET.SubElement(world, "light", pos="0 0 4", dir="0 0 -1", directional="true", castshadow="false")
+    elements: dict[int, ET.Element] = {}
+    for body in scene.bodies:
+        _add_assets(assets, body)
+    for body in _parents_first(scene):
+        parent = world if body.weld is None else elements[body.weld]
+        world_from_parent = np.eye(4) if body.weld is None else scene.body(body.weld).world_from_object
+        elements[body.id] = _add_body(parent, body, invert_rigid(world_from_parent) @ body.world_from_object)
+    ET.indent(root)
+    ET.ElementTree(root).write(folder / "scene.xml", encoding="utf-8", xml_declaration=True)
+    return ["scene.xml"]
+
+
+def _parents_first(scene: ExportScene) -> list[ExportBody]:
+    """Order bodies so that what others are welded to comes before them."""
+
+    def depth(body: ExportBody) -> int:
+        return 0 if body.weld is None else 1 + depth(scene.body(body.weld))
+
+    return sorted(scene.bodies, key=depth)
+
+
+def _add_assets(assets: ET.Element, body: ExportBody) -> None:
+    # inertia="shell": looks need no volume; mass and inertia come from <inertial>.
+    file = Path(visual_obj(body)).name
+    ET.SubElement(assets, "mesh", name=f"{body.name}_visual", file=file, inertia="shell")
+    ET.SubElement(assets, "texture", name=body.name, type="2d", file=Path(texture_png(body)).name)
+    ET.SubElement(assets, "material", name=body.name, texture=body.name, specular="0", shininess="0")
+    for number in range(len(body.parts)):
+        file = Path(collision_obj(body, number)).name
+        ET.SubElement(assets, "mesh", name=f"{body.name}_{number:03d}", file=file, inertia="convex")
+
+
+def _add_body(parent: ET.Element, body: ExportBody, parent_from_body: np.ndarray) -> ET.Element:
+    element = ET.SubElement(
+        parent,
+        "body",
+        name=body.name,
+        pos=text_of(parent_from_body[:3, 3]),
+        quat=text_of(quat_from_matrix(parent_from_body[:3, :3])),
+    )
+    if body.moves and body.weld is None:
+        ET.SubElement(element, "freejoint", name=f"{body.name}_free")
+    if not body.base:
+        i = body.inertia
+        full = text_of([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]])
+        ET.SubElement(
+            element,
+            "inertial",
+            pos=text_of(body.center_of_mass),
+            mass=text_of([body.mass_kg]),
+            fullinertia=full,
+        )
+    mesh = {"class": "visual", "name": f"{body.name}_visual", "mesh": f"{body.name}_visual"}
+    ET.SubElement(element, "geom", mesh | {"material": body.name})
+    for number in range(len(body.parts)):
+        name = f"{body.name}_{number:03d}"
+        friction = text_of([body.friction, _TORSION_M, _ROLLING_M])
+        ET.SubElement(
+            element, "geom", {"class": "collision", "name": name, "mesh": name, "friction": friction}
+        )
+    return element

@@ -1,0 +1,151 @@
+"""What every format is written from: the bodies of a bundle with closed convex pieces and a possible inertia."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.types import ConvexPart
+from registry import SceneBundle
+from registry.errors import BundleError
+from registry.simulation import cookable_points, specs_from_bundle
+from registry.welding import moving_ids, welded_to
+
+# The shares of the largest moment below which PhysX is not given the smaller ones (registry/simulation.py).
+_LEAST_MOMENT = 1e-3
+
+
+@dataclass(frozen=True)
+class ExportBody:
+    """One object or base surface. Meshes, centre of mass and inertia are in object space (base: world space)."""
+
+    id: int
+    label: str
+    name: str  # unique, letters, digits and underscores, starts with a letter
+    base: bool
+    moves: bool
+    weld: int | None  # id of the moving body that it is fixed to
+    relation: tuple[str, int] | None  # (relation, id of the parent) of the scene graph
+    world_from_object: np.ndarray  # float64 (4, 4) rigid
+    visual: Path  # textured .glb
+    parts: tuple[ConvexPart, ...]  # closed, faces outward
+    mass_kg: float  # 0 for base surfaces
+    center_of_mass: np.ndarray  # float64 (3,)
+    inertia: np.ndarray  # float64 (3, 3) about the centre of mass, object axes
+    friction: float
+    restitution: float
+
+
+@dataclass(frozen=True)
+class ExportScene:
+    """All bodies of a scene, base surfaces first."""
+
+    id: str
+    revision: str
+    bodies: tuple[ExportBody, ...]
+    notes: tuple[str, ...]  # what could not be written exactly as the bundle has it
+
+    def body(self, key: int) -> ExportBody:
+        """Return the body with an id."""
+        return next(body for body in self.bodies if body.id == key)
+
+
+def read_scene(bundle: SceneBundle) -> ExportScene:
+    """Read what the exporters need.
+
+    Raises:
+        BundleError: a base surface has no collision slab, or a piece has no volume.
+    """
+    scene = bundle.scene
+    entries = {item["id"]: item for item in (*scene["base"], *scene["objects"])}
+    moving, welds = moving_ids(bundle), welded_to(bundle)
+    relations = {edge.child: (edge.relation, edge.parent) for edge in bundle.edges}
+    bodies, notes = [], []
+    for spec in specs_from_bundle(bundle):
+        entry = entries[spec.id]
+        parts = tuple(closed_part(points, spec.name) for points in spec.parts)
+        name = safe_name(entry["label"], spec.id)
+        inertia = np.zeros((3, 3))
+        if not spec.base:
+            wanted = spec.inertia if spec.inertia is not None else uniform_inertia(parts, spec.mass_kg)
+            inertia, changed = possible_inertia(wanted)
+            if changed:
+                notes.append(f"{name}: no real body has its inertia; the nearest possible one is written")
+        bodies.append(
+            ExportBody(
+                id=spec.id,
+                label=entry["label"],
+                name=name,
+                base=spec.base,
+                moves=spec.id in moving,
+                weld=welds.get(spec.id),
+                relation=relations.get(spec.id),
+                world_from_object=np.asarray(spec.world_from_object, np.float64),
+                visual=bundle.resolve(entry["mesh" if spec.base else "visual"]),
+                parts=parts,
+                mass_kg=spec.mass_kg,
+                center_of_mass=spec.center_of_mass,
+                inertia=inertia,
+                friction=spec.friction,
+                restitution=spec.restitution,
+            )
+        )
+    return ExportScene(scene["id"], bundle.revision, tuple(bodies), tuple(notes))
+
+
+def safe_name(label: str, key: int) -> str:
+    """Return a name that XML, USD and Blender take, unique by the id: `coffee_cup_12`."""
+    words = re.sub(r"[^A-Za-z0-9]+", "_", label).strip("_")
+    return f"{words if words[:1].isalpha() else f'thing_{words}'.rstrip('_')}_{key}"
+
+
+def closed_part(points: np.ndarray, name: str) -> ConvexPart:
+    """Return the hull of a convex piece's points (v, 3); a flat piece is as thick as in the physics of the bundle."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = cookable_points(points)
+    try:
+        hull = ConvexHull(points)
+    except QhullError as error:
+        raise BundleError(
+            f"'{name}': a collision piece of extents {np.ptp(points, axis=0)} m is not solid"
+        ) from error
+    number = np.full(len(points), -1, np.int32)
+    number[hull.vertices] = np.arange(len(hull.vertices))
+    corner = points[hull.simplices]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    inward = np.einsum("fk,fk->f", normal, hull.equations[:, :3]) < 0
+    faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+    return ConvexPart(points[hull.vertices], number[faces])
+
+
+def uniform_inertia(parts: tuple[ConvexPart, ...], mass_kg: float) -> np.ndarray:
+    """Return the inertia (3, 3) about the common centre of pieces of one density, for bundles that have none."""
+    import trimesh
+
+    solids = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts]
+    volume = sum(solid.volume for solid in solids)
+    center = sum(solid.volume * solid.center_mass for solid in solids) / volume
+    out = np.zeros((3, 3))
+    for solid in solids:
+        arm = solid.center_mass - center
+        out += solid.moment_inertia + solid.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return out * mass_kg / volume
+
+
+def possible_inertia(inertia: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return an inertia that a real body can have, and whether it differs from the given one.
+
+    No principal moment may exceed the sum of the others; too small ones are raised, as thin rods have them.
+    """
+    symmetric = 0.5 * (inertia + inertia.T)
+    moments, axes = np.linalg.eigh(symmetric)  # ascending
+    least = max(_LEAST_MOMENT * moments[2], 1e-9)
+    raised = np.maximum(moments, least)
+    missing = raised[2] - raised[0] - raised[1]
+    if missing > 0:
+        raised[:2] += 0.5 * missing * (1 + 1e-6)
+    if np.array_equal(raised, moments):
+        return symmetric, False
+    return (axes * raised) @ axes.T, True

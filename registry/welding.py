@@ -1,0 +1,32 @@
+"""Which objects of a bundle can move, and which are one body with another: the same for the environment and exports.
+
+| in the bundle                         | in a simulator                        |
+|---------------------------------------|---------------------------------------|
+| `dynamic: false`                      | static                                |
+| attached to what is static            | static                                |
+| attached to what can move             | welded to it, whatever `dynamic` says |
+| everything else                       | dynamic                               |
+"""
+
+from registry.bundle import SceneBundle
+
+
+def moving_ids(bundle: SceneBundle) -> set[int]:
+    """Return the ids of the objects that can move, welded ones among them."""
+    attached = _attached(bundle)
+    dynamic = {item.id: item.dynamic for item in bundle.objects}
+
+    def moves(key: int) -> bool:
+        return moves(attached[key]) if key in attached else dynamic.get(key, False)
+
+    return {key for key in dynamic if moves(key)}
+
+
+def welded_to(bundle: SceneBundle) -> dict[int, int]:
+    """Return {id: id of the object that can move and to which it is fixed}, by the edges of the scene graph."""
+    moving = moving_ids(bundle)
+    return {child: parent for child, parent in _attached(bundle).items() if parent in moving}
+
+
+def _attached(bundle: SceneBundle) -> dict[int, int]:
+    return {edge.child: edge.parent for edge in bundle.edges if edge.relation == "attached_to"}
