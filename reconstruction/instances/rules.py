@@ -10,7 +10,7 @@ from reconstruction.instances.feet import merge_feet
 from reconstruction.instances.flats import cut_flats
 from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.pictures import find_pictures
-from reconstruction.instances.scraps import without_fragments
+from reconstruction.instances.scraps import without_fragments, without_skirts
 from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.stacks import cut_stacks
 from reconstruction.instances.stands import merge_stands
@@ -47,6 +47,7 @@ def cut_by_rules(
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)
     things = cut_stacks(graph, surface, things, posed, depth, config, progress)
+    things = without_skirts(graph, things, progress)
     things = without_fragments(graph, things, shell.base[0].observed, config, progress)
     for thing in things:
         if thing.attached:

@@ -2,13 +2,25 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
+from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.convexity import bulge
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import InstanceSet
+
+_SKIRT_M, _SKIRT_BULGE, _SKIRT_TOP = (
+    0.08,
+    0.45,
+    0.4,
+)  # height, shape, and share of the outline that is a top, at most
+_UP, _TOP_M = 0.6, 0.012
+_TOUCH_M, _BESIDE_M = 0.015, 0.06  # from a larger thing: its nearest, and four fifths of it
 
 
 def without_fragments(
@@ -32,6 +44,48 @@ def without_fragments(
             f"{len(things) - len(kept)} scraps of surface, tiny or in mid-air, are not kept as things"
         )
     return kept
+
+
+def without_skirts(graph: MeshGraph, things: list[Thing], progress: Progress) -> list[Thing]:
+    """Leave out what depth smeared behind and beside things: low sheets without a top, close to something larger."""
+    carriers = {id(thing.rests_on) for thing in things}
+    kept = [
+        thing
+        for thing in things
+        if thing.attached
+        or thing.container
+        or thing.rests_on is None
+        or id(thing) in carriers
+        or not _is_skirt(graph, thing, things)
+    ]
+    if len(kept) < len(things):
+        progress.note(f"{len(things) - len(kept)} skirts of smeared surface beside things are not kept")
+    return kept
+
+
+def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
+    points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
+    low, middle, high = quantiles(points[:, 2], areas, (0.02, 0.5, 0.98))
+    if high - low > _SKIRT_M or bulge(graph, thing.vertices) > _SKIRT_BULGE:
+        return False
+    hull = cv2.convexHull(points[:, :2].astype(np.float32))
+    top = (graph.normals[thing.vertices, 2] > _UP) & (points[:, 2] > high - _TOP_M)
+    if areas[top].sum() > _SKIRT_TOP * cv2.contourArea(hull):
+        return False
+    for other in things:
+        if other is thing or other.attached or graph.areas[other.vertices].sum() < areas.sum():
+            continue
+        reach = quantiles(graph.points[other.vertices, 2], graph.areas[other.vertices], (0.98,))[0]
+        if (middle > reach - _TOP_M) if other is thing.rests_on else (high > reach + _TOP_M):
+            continue  # on it, or higher than it
+        gap = cKDTree(graph.points[other.vertices]).query(points, distance_upper_bound=_TOUCH_M)[0]
+        if not np.isfinite(gap).any():
+            continue
+        outline = cv2.convexHull(graph.points[other.vertices, :2].astype(np.float32))
+        away = [-cv2.pointPolygonTest(outline, (float(x), float(y)), True) for x, y in points[:, :2]]
+        if quantiles(np.array(away), areas, (0.8,))[0] < _BESIDE_M:
+            return True
+    return False
 
 
 def without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progress) -> InstanceSet:

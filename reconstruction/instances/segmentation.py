@@ -29,6 +29,9 @@ class Thing:
     rests_on: "Thing | None" = None
     depth: int = 0
     attached: bool = False
+    container: bool = (
+        False  # an open one, whole by its rim: slats and rims of other colors are no things on it
+    )
     notes: list[str] = field(default_factory=list)
 
 
@@ -131,7 +134,7 @@ def _container(
     if not own:
         return found
     carrier = found[under[0]] if under else rests_on
-    shell = Thing(np.sort(np.concatenate([found[k].vertices for k in own])), carrier, depth)
+    shell = Thing(np.sort(np.concatenate([found[k].vertices for k in own])), carrier, depth, container=True)
     within = {id(found[k]) for k in own + under}
     for k in contents:
         if found[k].rests_on is rests_on or id(found[k].rests_on) in within:

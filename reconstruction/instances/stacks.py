@@ -77,7 +77,8 @@ def cut_stacks(
     small = [
         thing
         for thing in things
-        if not thing.attached and np.ptp(graph.points[thing.vertices], axis=0).max() < _LARGEST_M
+        if not (thing.attached or thing.container)
+        and np.ptp(graph.points[thing.vertices], axis=0).max() < _LARGEST_M
     ]
     if not small:
         return things

@@ -7,6 +7,9 @@ from surfaces import floor_sheet, frames_of, merged, sheet, solid_box, surface_f
 
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.hollows import clings_to, hollows_on, looks_like
+from reconstruction.instances.scraps import without_skirts
+from reconstruction.instances.segmentation import Thing, segment
+from reconstruction.instances.stacks import cut_stacks
 from reconstruction.instances.supports import find_supports
 from reconstruction.instances.tops import cut_between_tops
 from reconstruction.progress import NO_PROGRESS
@@ -102,3 +105,35 @@ def test_tables_with_a_gap_between_them_are_two(gap_m, parts):
             (-1.0,),
             (1.0,),
         }
+
+
+def test_a_ragged_sheet_beside_a_box_is_a_skirt_and_a_small_box_there_is_none():
+    """A sheet that slopes from the top of the box down to the ground behind it, as smeared depth does."""
+    parts = {
+        "box": solid_box((-0.1, -0.1, 0.0), (0.1, 0.1, 0.12), RED),
+        "sheet": sheet((-0.08, 0.102, 0.06), (0.16, 0, 0), (0, 0.05, -0.05), WOOD),
+        "small": solid_box((0.105, -0.04, 0.0), (0.16, 0.04, 0.04), WHITE),
+    }
+    graph = MeshGraph.from_surface(surface_from(merged(floor_sheet(WOOD), *parts.values())))
+    ground = Thing(np.flatnonzero(graph.points[:, 2] < 1e-3))
+    things = {name: Thing(_vertices_of(graph, part), ground) for name, part in parts.items()}
+    kept = without_skirts(graph, [ground, *things.values()], NO_PROGRESS)
+    assert [id(one) for one in kept] == [id(ground), id(things["box"]), id(things["small"])]
+    on_it = Thing(things["small"].vertices, things["sheet"])
+    assert len(without_skirts(graph, [ground, things["box"], things["sheet"], on_it], NO_PROGRESS)) == 4
+
+
+def test_a_container_is_not_cut_into_stacks():
+    """Its rim may be narrower than its lower part, and of another color."""
+    lower = tray((-0.13, -0.11, 0.4), (0.13, 0.11, 0.44), 0.022, WOOD)
+    upper = tray((-0.12, -0.1, 0.44), (0.12, 0.1, 0.5), 0.012, GREEN)[1:]
+    surface = fused([TABLE, *lower, *upper], voxel_m=0.007, half_m=0.45, top_m=0.6)
+    graph = MeshGraph.from_surface(surface)
+    body = np.flatnonzero(graph.points[:, 2] > 0.01)
+    things = segment(graph, body, InstancesConfig())
+    assert [thing.container for thing in things] == [False, True]
+    before = len(things[1].vertices)
+    posed, depth = frames_of(surface, 320, 240)
+    after = cut_stacks(graph, surface, things, posed, depth, InstancesConfig(), NO_PROGRESS)
+    assert len(after) == 2
+    assert len(after[1].vertices) == before
