@@ -80,7 +80,7 @@ class AvoConfig:
     transmittance_stop: float = 1e-4
     """Share of light at which a pixel is finished while views are optimized."""
 
-    picture_side_px: int = 512
+    picture_side_px: int = 256
     """Side of the pictures that are returned."""
 
     inpainting: Literal["telea", "navier-stokes"] = "telea"
