@@ -22,7 +22,7 @@ _EPILOG = """formats:
 examples:
   simrecon export my_room --to mjcf --out my_room_mjcf
   python -m mujoco.viewer --mjcf=my_room_mjcf/scene.xml
-  simrecon export my_room --to urdf usd glb --out my_room_export
+  simrecon export my_room --to urdf,usd,glb --out my_room_export
 
 Collision shapes are the convex pieces of the scene; objects can move unless the scene has them fixed; what hangs
 on something is fixed to it. Units are metres and kilograms, +z is up (in scene.glb +y, as glTF has it).
@@ -44,12 +44,11 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
     parser.add_argument(
         "--to",
-        nargs="+",
+        type=_formats,
         action="extend",
-        choices=_FORMATS,
         required=True,
-        metavar="FORMAT",
-        help=f"one or several of {', '.join(_FORMATS)}",
+        metavar="FORMAT[,FORMAT]",
+        help=f"one or several of {', '.join(_FORMATS)}, with commas between them",
     )
     parser.add_argument(
         "--out",
@@ -60,6 +59,14 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     )
     add_common(parser)
     parser.set_defaults(run=run)
+
+
+def _formats(text: str) -> list[str]:
+    names = text.split(",")
+    unknown = [name for name in names if name not in _FORMATS]
+    if unknown:
+        raise argparse.ArgumentTypeError(f"there is no format {unknown[0]!r}, only {', '.join(_FORMATS)}")
+    return names
 
 
 def run(arguments: argparse.Namespace) -> int:

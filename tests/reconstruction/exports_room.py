@@ -6,6 +6,9 @@ import numpy as np
 import trimesh
 
 from reconstruction.assets.gltf import read_glb, write_glb, write_obj
+from reconstruction.exports.scene import ExportBody, ExportScene, closed_part, safe_name, uniform_inertia
+from reconstruction.synthetic.checks import bodies
+from reconstruction.synthetic.procedural import RoomSpec, build_procedural_room
 from reconstruction.types import ConvexPart, TexturedMesh
 from registry import SceneBundle, seal_bundle
 from registry.geometry import matrix_from_quat, rigid, transform_points
@@ -148,8 +151,6 @@ def _scene(scene_id: str, writer: _Writer) -> dict:
 
 def names(bundle: SceneBundle) -> dict[int, str]:
     """Return {id: name in the exports}."""
-    from reconstruction.exports.scene import safe_name
-
     return {item.id: safe_name(item.label, item.id) for item in (*bundle.base, *bundle.objects)}
 
 
@@ -171,3 +172,33 @@ def _pose(item: object) -> np.ndarray:
 
 def _bounds(points: np.ndarray) -> np.ndarray:
     return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def generated_room(folder: Path, seed: int, objects: int) -> ExportScene:
+    """Return a procedural room with stacks and containers as it is exported; all that stands in it is free."""
+    room = build_procedural_room(RoomSpec(seed=seed, objects=objects, step_m=0.3))
+    exported = []
+    for spec in bodies(room, {entity.id: entity.mesh() for entity in room.entities}):
+        parts = tuple(closed_part(points, spec.name) for points in spec.parts)
+        hull = trimesh.convex.convex_hull(np.concatenate([part.vertices for part in parts]))
+        write_glb(_textured(hull), folder / f"{spec.id}.glb")
+        exported.append(
+            ExportBody(
+                id=spec.id,
+                label=spec.name,
+                name=safe_name(spec.name, spec.id),
+                base=spec.base,
+                moves=spec.dynamic,
+                weld=None,
+                relation=None,
+                world_from_object=spec.world_from_object,
+                visual=folder / f"{spec.id}.glb",
+                parts=parts,
+                mass_kg=spec.mass_kg,
+                center_of_mass=spec.center_of_mass,
+                inertia=np.zeros((3, 3)) if spec.base else uniform_inertia(parts, spec.mass_kg),
+                friction=spec.friction,
+                restitution=spec.restitution,
+            )
+        )
+    return ExportScene(f"generated_{seed}", "", tuple(exported), ())

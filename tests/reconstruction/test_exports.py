@@ -95,8 +95,8 @@ def test_formats_gather_in_one_folder_and_a_new_revision_replaces_them(bundle, t
 
 
 def test_the_same_bundle_gives_the_same_bytes(bundle, tmp_path):
-    formats = [name for name in FORMATS if name != "usd"]
-    first, second = (export_scene(bundle, formats, tmp_path / name).folder for name in "ab")
+    pytest.importorskip("pxr", reason="needs simrecon[exports]")
+    first, second = (export_scene(bundle, list(FORMATS), tmp_path / name).folder for name in "ab")
     for path in first.rglob("*"):
         if path.is_file():
             assert path.read_bytes() == (second / path.relative_to(first)).read_bytes(), path.name
@@ -116,7 +116,7 @@ def test_folders_of_others_are_left_alone(bundle, tmp_path):
 
 
 def test_the_command_writes_and_says_what_to_open(registry, tmp_path, capsys):
-    arguments = ["export", "room", "--to", "mjcf", "glb", "--out", str(tmp_path / "out")]
+    arguments = ["export", "room", "--to", "mjcf,glb", "--out", str(tmp_path / "out")]
     assert main([*arguments, "--registry", str(registry)]) == 0
     said = capsys.readouterr().out
     assert str(tmp_path / "out" / "scene.xml") in said
