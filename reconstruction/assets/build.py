@@ -6,7 +6,7 @@ import numpy as np
 
 from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
-from reconstruction.assets.collision import collision_parts
+from reconstruction.assets.collision import collision_parts, end_decomposer
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.fused import fused_points, without_strays
 from reconstruction.assets.generation.complete import SurfaceColors, generated_shape
@@ -95,6 +95,7 @@ def build_assets(
         )
         hulls += len(objects[-1].collision)
         progress.advance()
+    end_decomposer()
     base = build_base(posed, depth, instances, tuple(objects), pixels, config)
     progress.advance(len(instances.base))
     return AssetSet(base, tuple(objects))

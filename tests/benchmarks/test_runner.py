@@ -107,12 +107,14 @@ def test_a_damaged_result_is_named(broken, capsys):
 
 def test_a_command_that_takes_too_long_is_stopped_with_its_children(tmp_path):
     code = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import time; time.sleep(60)'])"
+    before = set(psutil.Process().children(recursive=True))
     began = time.perf_counter()
     exit_code, error = run_command([sys.executable, "-c", code], tmp_path, tmp_path / "log", timeout_s=1.0)
     assert exit_code == 124
     assert "--timeout-s" in error
     assert time.perf_counter() - began < 20
-    assert not [p for p in psutil.Process().children(recursive=True) if p.status() != psutil.STATUS_ZOMBIE]
+    started = set(psutil.Process().children(recursive=True)) - before
+    assert not [process for process in started if process.status() != psutil.STATUS_ZOMBIE]
 
 
 def test_the_last_lines_of_a_failed_command_are_kept(tmp_path):

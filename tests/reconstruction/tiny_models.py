@@ -22,9 +22,15 @@ def one_thread():
         torch.set_num_threads(before)
 
 
-def random_weights(model, seed: int = 0):
-    """Give a model weights under which its outputs differ from pixel to pixel, unlike initial ones."""
+def random_model(kind, config, seed: int = 0):
+    """Make a model with weights under which its outputs differ from pixel to pixel, unlike initial ones.
+
+    Always the same ones: also those that keep their initial values are drawn from a generator of their own.
+    """
     torch = pytest.importorskip("torch")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = kind(config)
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         if parameter.dim() > 1:
@@ -37,7 +43,7 @@ def _save(model, folder: Path, mean: list[float], processor: str) -> str:
 
     folder.mkdir(parents=True, exist_ok=True)
     # Not save_pretrained: that of transformers 5.23 doubles a prefix of SAM 3's names, which the hub's weights do not.
-    weights = {name: value.contiguous().clone() for name, value in random_weights(model).state_dict().items()}
+    weights = {name: value.contiguous().clone() for name, value in model.state_dict().items()}
     save_file(weights, folder / "model.safetensors", metadata={"format": "pt"})
     model.config.save_pretrained(folder)
     size = {"height": SIDE, "width": SIDE}
@@ -78,7 +84,12 @@ def save_sam2(folder: Path) -> str:
         memory_encoder_hidden_size=16, memory_encoder_output_channels=8, mask_downsampler_embed_dim=16,
         memory_fuser_embed_dim=16, memory_fuser_intermediate_dim=16,
     )  # fmt: skip
-    return _save(transformers.Sam2VideoModel(config), folder, [0.485, 0.456, 0.406], "Sam2ImageProcessorFast")
+    return _save(
+        random_model(transformers.Sam2VideoModel, config),
+        folder,
+        [0.485, 0.456, 0.406],
+        "Sam2ImageProcessorFast",
+    )
 
 
 def save_tokenizer(folder: Path) -> None:
@@ -135,7 +146,9 @@ def save_sam3(folder: Path) -> str:
     }  # fmt: skip
     config = transformers.Sam3VideoConfig(detector_config=detector, tracker_config=tracker)
     save_tokenizer(folder)
-    return _save(transformers.Sam3VideoModel(config), folder, [0.5] * 3, "Sam3ImageProcessorFast")
+    return _save(
+        random_model(transformers.Sam3VideoModel, config), folder, [0.5] * 3, "Sam3ImageProcessorFast"
+    )
 
 
 def save_mask2former(folder: Path) -> str:
@@ -149,7 +162,7 @@ def save_mask2former(folder: Path) -> str:
         backbone_config=backbone, feature_size=32, mask_feature_size=32, hidden_dim=32, encoder_feedforward_dim=16,
         encoder_layers=1, decoder_layers=2, num_attention_heads=2, dim_feedforward=16, num_queries=10, num_labels=4,
     )  # fmt: skip
-    random_weights(transformers.Mask2FormerForUniversalSegmentation(config)).save_pretrained(folder)
+    random_model(transformers.Mask2FormerForUniversalSegmentation, config).save_pretrained(folder)
     size = {"shortest_edge": SIDE, "longest_edge": 2 * SIDE}
     settings = {
         "image_processor_type": "Mask2FormerImageProcessor",
@@ -168,7 +181,7 @@ def save_clip(folder: Path) -> str:
         "num_attention_heads": 2, "image_size": 32, "patch_size": 8,
     }  # fmt: skip
     config = transformers.CLIPConfig(text_config=_TEXT, vision_config=vision, projection_dim=16)
-    random_weights(transformers.CLIPModel(config)).save_pretrained(folder)
+    random_model(transformers.CLIPModel, config).save_pretrained(folder)
     save_tokenizer(folder)
     size, crop = {"shortest_edge": 32}, {"height": 32, "width": 32}
     settings = {

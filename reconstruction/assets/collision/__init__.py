@@ -1,5 +1,6 @@
 """Collision shapes: convex parts within the visual bounds, hollow things hollow, what carries level."""
 
 from reconstruction.assets.collision.build import collision_parts
+from reconstruction.assets.collision.decomposition import end_decomposer
 
-__all__ = ("collision_parts",)
+__all__ = ("collision_parts", "end_decomposer")

@@ -88,6 +88,11 @@ _decomposer = Decomposer()
 atexit.register(_decomposer.close)
 
 
+def end_decomposer() -> None:
+    """End the process that parts are decomposed in; the next part starts another."""
+    _decomposer.close()
+
+
 def decompose(solid: Solid, threshold: float, budget: int, config: AssetsConfig) -> list[np.ndarray] | None:
     """Run CoACD on the normalized, decimated mesh; return the vertices of each part, None where it failed."""
     light = lighten(solid, config.collision_faces, 0.004 * float(solid.extents.max()))
