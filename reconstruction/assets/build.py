@@ -9,13 +9,14 @@ from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts, end_decomposer
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.fused import fused_points, without_strays
-from reconstruction.assets.generation.complete import SurfaceColors, generated_shape
+from reconstruction.assets.generation.complete import Attempt, SurfaceColors, generated_shape
 from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
 from reconstruction.assets.hanging import hanging_slab
 from reconstruction.assets.hanging_relief import relief
-from reconstruction.assets.physics import MaterialChoice, physical_attributes
 from reconstruction.assets.physics.base import choice_for
 from reconstruction.assets.physics.load import load_physicist
+from reconstruction.assets.physics.mass import physical_attributes
+from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
@@ -29,12 +30,30 @@ from reconstruction.types import (
     InstanceSet,
     ObjectAsset,
     PosedFrames,
-    SpaceGrid,
     Surface,
+    TexturedMesh,
 )
+from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
 
 _COVERED_SHARE = 0.75  # of what was seen, along each axis
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that objects are built from; prepared once a scene."""
+
+    posed: PosedFrames
+    depth: DepthMaps  # of `posed`, metres
+    surface: Surface
+    found: InstanceSet
+    pixels: ScenePixels
+    stands: Stands
+    said: dict[
+        int, MaterialChoice
+    ]  # by object: what it is made of, where something better than the table says
+    fetched: Fetched | None  # meshes by a generator
+    config: AssetsConfig
 
 
 @dataclass(frozen=True)
@@ -44,15 +63,19 @@ class Shape:
     body: Solid  # in the grid frame
     frame: ObjectFrame
     how: str
-    colors: SurfaceColors | None = None  # of what no frame saw, in world space
+    attempt: Attempt | None = None  # what came of generating it, whether it was used or not
+    is_box: bool = False  # because too little was seen of it
 
+    @property
+    def colors(self) -> SurfaceColors | None:
+        """Return the colors of what no frame saw, in world space."""
+        return None if self.attempt is None else self.attempt.colors
 
-@dataclass(frozen=True)
-class Generated:
-    """What a generator made, and what its meshes are held against."""
-
-    fetched: Fetched
-    space: SpaceGrid | None
+    @property
+    def provenance(self) -> str:
+        """Say how the shape was made, and what became of a generated one."""
+        unused = self.attempt is not None and self.attempt.body is None
+        return f"{self.how}; {self.attempt.how}" if unused else self.how
 
 
 def build_assets(
@@ -76,100 +99,108 @@ def build_assets(
         All assets, in the order of `instances`.
     """
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
-    pixels = prepare_pixels(posed, depth, instances.id_maps)
-    pixels = without_strays(pixels, posed, depth.camera, surface, instances)
-    stands = find_stands(posed, depth, pixels, instances)
-    fetched = fetch_meshes(instances, posed, stands.seen, config, progress)
-    generated = None if fetched is None else Generated(fetched, surface.space)
-    progress.advance()
-    physicist = load_physicist(config)
-    said = physicist.choose(instances, posed, progress=progress) if physicist else {}
+    scene = gather_evidence(posed, depth, surface, instances, config, progress)
     objects: list[ObjectAsset] = []
     hulls = 0
     for left, item in zip(range(len(instances.objects) - 1, -1, -1), instances.objects):
         own = config.with_hulls(config.hulls_scene - hulls - left * LEAST_HULLS)
-        objects.append(
-            build_object(
-                item, posed, depth, surface, pixels, instances, stands, said, own, progress, generated
-            )
-        )
+        objects.append(build_object(item, replace(scene, config=own), progress))
         hulls += len(objects[-1].collision)
         progress.advance()
     end_decomposer()
-    base = build_base(posed, depth, instances, tuple(objects), pixels, config)
+    base = build_base(posed, depth, instances, tuple(objects), scene.pixels, config)
     progress.advance(len(instances.base))
     return AssetSet(base, tuple(objects))
 
 
-def build_object(
-    item: Instance, posed: PosedFrames, depth: DepthMaps, surface: Surface, pixels: ScenePixels, found: InstanceSet,
-    stands: Stands, said: dict[int, MaterialChoice], config: AssetsConfig, progress: Progress,
-    generated: Generated | None = None,
-) -> ObjectAsset:  # fmt: skip
+def gather_evidence(
+    posed: PosedFrames, depth: DepthMaps, surface: Surface, found: InstanceSet, config: AssetsConfig,
+    progress: Progress,
+) -> Evidence:  # fmt: skip
+    """Prepare what all objects share; asks the generator and whoever knows materials, if there are any."""
+    pixels = prepare_pixels(posed, depth, found.id_maps)
+    pixels = without_strays(pixels, posed, depth.camera, surface, found)
+    stands = find_stands(posed, depth, pixels, found)
+    fetched = fetch_meshes(found, posed, stands.seen, config, progress)
+    progress.advance()
+    physicist = load_physicist(config)
+    said = physicist.choose(found, posed, progress=progress) if physicist else {}
+    return Evidence(posed, depth, surface, found, pixels, stands, said, fetched, config)
+
+
+def build_object(item: Instance, scene: Evidence, progress: Progress) -> ObjectAsset:
     """Build one asset: shape, looks, collision, physics. What fails on one shape is done again with a box."""
     name = f"object {item.id} ({item.label})"
     try:
-        shape = object_shape(item, posed, depth, surface, pixels, found, stands, config, generated)
-        if shape.how == "box-fallback":
+        shape = object_shape(item, scene)
+        if shape.is_box:
             progress.note(f"{name}: too little was seen of it, it became a box")
-        if " rejected: " in shape.how:
-            progress.note(f"{name}: {shape.how.split('; ', 1)[1]}; the embedded completion stands in")
-        return _finish_object(item, shape, posed, depth, pixels, stands, said, config, progress)
+        if shape.attempt is not None and shape.attempt.rejected:
+            progress.note(f"{name}: {shape.attempt.how}; the embedded completion stands in")
+        return _finish_object(item, shape, scene, progress)
     # Compiled geometry libraries raise whatever they like on a degenerate shape, and one object must not cost the
-    # scene; running out of memory is no property of the object.
-    except MemoryError:
+    # scene; running out of memory, or of what the machine must have, is no property of the object.
+    except (MemoryError, EnvironmentMissing):
         raise
     except Exception as error:
         progress.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
-    return _finish_object(
-        item, box_fallback(item, np.zeros((0, 3))), posed, depth, pixels, stands, said, config, progress
-    )
+    return _finish_object(item, box_fallback(item, np.zeros((0, 3))), scene, progress)
 
 
-def _finish_object(
-    item: Instance, shape: Shape, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, stands: Stands,
-    said: dict[int, MaterialChoice], config: AssetsConfig, progress: Progress,
-) -> ObjectAsset:  # fmt: skip
+def _finish_object(item: Instance, shape: Shape, scene: Evidence, progress: Progress) -> ObjectAsset:
     """Give a solid its looks, collision shape and mass."""
     body, world_from_object = to_object_space(shape.body, shape.frame)
-    levels = [s.level_m - float(world_from_object[2, 3]) for s in stands.on(item.id) if s.known]
-    mapping, faces, uvs = texture.unwrap(body.vertices, body.faces)
-    vertices = body.vertices[mapping]
-    distance = np.linalg.norm(posed.world_from_camera[:, :3, 3] - world_from_object[:3, 3], axis=1).min()
-    tolerance = float(0.006 + 3 * pixels.noise_relative * distance + 0.01 * body.extents.max())
-    baked = texture.bake_object(
-        transform_points(world_from_object, vertices),
-        faces,
-        uvs,
-        item.id,
-        posed,
-        depth.camera,
-        pixels,
-        config,
-        tolerance,
-        shape.colors,
-    )
-    choice = choice_for(item, said, baked.mean_rgb, body.extents)
+    levels = [s.level_m - float(world_from_object[2, 3]) for s in scene.stands.on(item.id) if s.known]
+    visual, baked = _looks(item, body, world_from_object, shape.colors, scene)
+    choice = choice_for(item, scene.said, baked.mean_rgb, body.extents)
     return ObjectAsset(
         id=item.id,
         label=item.label,
         label_confidence=float(item.label_confidence),
         world_from_object=world_from_object,
-        visual=texture.textured(vertices, faces, uvs, baked.texture),
+        visual=visual,
         collision=collision_parts(
-            body, config, levels=tuple(levels), progress=progress, name=f"object {item.id} ({item.label})"
+            body,
+            scene.config,
+            levels=tuple(levels),
+            progress=progress,
+            name=f"object {item.id} ({item.label})",
         ),
         physics=physical_attributes(body, choice),
         provenance=AssetProvenance(
-            geometry=shape.how,
+            geometry=shape.provenance,
             appearance=_appearance(baked, shape),
-            physics=choice.reason if item.id in said else f"material table by {choice.reason}",
+            physics=choice.reason if item.id in scene.said else f"material table by {choice.reason}",
             observed_fraction=baked.seen_share,
         ),
-        views=posed.indices[baked.frames].astype(np.int32),
+        views=scene.posed.indices[baked.frames].astype(np.int32),
         support_hint=int(item.support_hint),
         attached_hint=bool(item.attached_hint),
     )
+
+
+def _looks(
+    item: Instance, body: Solid, world_from_object: np.ndarray, colors: SurfaceColors | None, scene: Evidence
+) -> tuple[TexturedMesh, texture.Baked]:
+    """Bake a solid's texture."""
+    mapping, faces, uvs = texture.unwrap(body.vertices, body.faces)
+    vertices = body.vertices[mapping]
+    away = scene.posed.world_from_camera[:, :3, 3] - world_from_object[:3, 3]
+    distance = np.linalg.norm(away, axis=1).min()
+    tolerance = float(0.006 + 3 * scene.pixels.noise_relative * distance + 0.01 * body.extents.max())
+    baked = texture.bake_object(
+        transform_points(world_from_object, vertices),
+        faces,
+        uvs,
+        item.id,
+        scene.posed,
+        scene.depth.camera,
+        scene.pixels,
+        scene.config,
+        tolerance,
+        colors,
+    )
+    return texture.textured(vertices, faces, uvs, baked.texture), baked
 
 
 def _appearance(baked: texture.Baked, shape: Shape) -> str:
@@ -184,40 +215,36 @@ def to_object_space(body: Solid, frame: ObjectFrame) -> tuple[Solid, np.ndarray]
     return Solid(body.vertices - origin, body.faces), frame.world_from_grid @ rigid(translation=origin)
 
 
-def object_shape(
-    item: Instance, posed: PosedFrames, depth: DepthMaps, surface: Surface, pixels: ScenePixels, found: InstanceSet,
-    stands: Stands, config: AssetsConfig, generated: Generated | None = None,
-) -> Shape:  # fmt: skip
+def object_shape(item: Instance, scene: Evidence) -> Shape:
     """Return an object's closed shape in its grid frame, that frame, and how the shape was made."""
+    config, stands = scene.config, scene.stands
     seen = stands.seen[item.id]
     if len(seen.points) < config.min_points:
         return box_fallback(item, seen.points)
-    frame = frame_object(item, seen, stands.level(item.id), found)
-    hanging = hanging_slab(item.id, frame, posed, depth.camera, found, config)
+    frame = frame_object(item, seen, stands.level(item.id), scene.found)
+    hanging = hanging_slab(item.id, frame, scene.posed, scene.depth.camera, scene.found, config)
     if hanging is not None:
         return Shape(hanging.body, frame, "observed+slab" + ("+completed" if hanging.completed else ""))
-    noise = object_noise(posed, depth, pixels, seen, item.id)
-    volume = fuse_volume(item.id, frame, noise, posed, depth, pixels, config)
-    size = np.ptp(frame.points, axis=0)
-    furniture = float(size.max()) > config.furniture_m
+    noise = object_noise(scene.posed, scene.depth, scene.pixels, seen, item.id)
+    volume = fuse_volume(item.id, frame, noise, scene.posed, scene.depth, scene.pixels, config)
+    furniture = float(np.ptp(frame.points, axis=0).max()) > config.furniture_m
     # A container's rim may be close to what it holds; a table has none.
     grow = max(2.0 * volume.noise_m, volume.voxel_m, 0.012 if furniture else 0.004)
     volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))
     attempt = None
-    if generated is not None:
-        attempt = generated_shape(
-            item.id, generated.fetched, frame, volume, generated.space, config, furniture=furniture
-        )
+    if scene.fetched is not None:
+        space = scene.surface.space
+        attempt = generated_shape(item.id, scene.fetched, frame, volume, space, config, furniture=furniture)
         if attempt is not None and attempt.body is not None:
-            return Shape(attempt.body, frame, attempt.how, attempt.colors)
+            return Shape(attempt.body, frame, attempt.how, attempt)
     body, how = embedded_solid(volume, frame, config, furniture=furniture)
     if frame.wall_y is not None:
-        fused = fused_points(item.id, frame, surface, found)
+        fused = fused_points(item.id, frame, scene.surface, scene.found)
         if len(fused) and not _covers(body, fused):
             body, how = relief(fused, frame.wall_y, config), "observed+relief"
     if body is None:
         return box_fallback(item, seen.points)
-    return Shape(body, frame, how if attempt is None else f"{how}; {attempt.how}")
+    return Shape(body, frame, how, attempt)
 
 
 def embedded_solid(
@@ -261,4 +288,4 @@ def box_fallback(item: Instance, points: np.ndarray) -> Shape:
     box = solid.box_solid(np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], size[2]]))
     local = (points - bottom) @ rotation
     frame = ObjectFrame(rigid(rotation, bottom), local, np.zeros_like(local), False, None)
-    return Shape(box, frame, "box-fallback")
+    return Shape(box, frame, "box-fallback", is_box=True)

@@ -35,6 +35,7 @@ class Attempt:
     how: str  # who made it and how well it fits, or why it is not used; for the asset's provenance
     body: Solid | None = None  # in the grid frame; None where it is not used
     colors: SurfaceColors | None = None  # in world space
+    rejected: bool = False  # a mesh was made, and disagrees with what was seen
 
 
 def generated_shape(
@@ -58,16 +59,16 @@ def generated_shape(
     try:
         mesh = read_generated(fetched.meshes[number], config.seed)
     except GenerationError as error:
-        return Attempt(f"{fetched.by} rejected: {error}")
+        return Attempt(f"{fetched.by} rejected: {error}", rejected=True)
     seen = believed_surface(frame, volume)
     fit = register(mesh.points, mesh.normals, seen, free_space(frame, volume, space))
     fault = fit.fault(config.generator_missed, config.generator_intruding)
     if fault:
-        return Attempt(f"{fetched.by} rejected: {fault}")
+        return Attempt(f"{fetched.by} rejected: {fault}", rejected=True)
     placed = mesh.moved(fit.scale, fit.rotation, fit.translation)
     body = closed_solid(placed, config, config.faces_furniture if furniture else config.faces_small)
     if body is None:
-        return Attempt(f"{fetched.by} rejected: its mesh cannot be closed to a solid")
+        return Attempt(f"{fetched.by} rejected: its mesh cannot be closed to a solid", rejected=True)
     return Attempt(_description(fetched.by, fit), body, _colors(placed, frame))
 
 
