@@ -1,5 +1,8 @@
 """Collision shapes of hollow things and furniture: what is dropped into them stays, and rests on their true floor."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
@@ -12,6 +15,7 @@ from reconstruction.assets.solid import Solid, box_solid, from_manifold
 from reconstruction.synthetic import containers, furnishing
 from reconstruction.synthetic.furniture import Workshop
 from reconstruction.synthetic.things import Place, Thing
+from registry.errors import EnvironmentMissing
 from registry.simulation import BodySpec, Physics
 
 manifold3d = pytest.importorskip("manifold3d")
@@ -121,30 +125,49 @@ def test_a_ring_is_told_from_a_cup_and_a_slab():
         assert find_hole(solid) is None
 
 
-def test_a_crash_of_the_decomposer_costs_only_its_part():
+OPTIONS = {"threshold": 0.1, "budget": 4, "hull_vertices": 48, "seed": 0}
+
+
+@pytest.fixture
+def decomposer():
+    made = Decomposer()
+    yield made
+    made.close()
+
+
+def test_a_crash_of_the_decomposer_costs_only_its_part(decomposer):
     solid = box_solid(np.zeros(3), np.ones(3))
-    options = {"threshold": 0.1, "budget": 4, "hull_vertices": 48, "seed": 0}
-    decomposer = Decomposer()
-    try:
-        assert decomposer.run(solid.vertices, solid.faces + 1_000_000, options) is None
-        assert len(decomposer.run(solid.vertices, solid.faces, options)) == 1
-    finally:
-        decomposer.close()
+    assert decomposer.run(solid.vertices, solid.faces + 1_000_000, OPTIONS) is None
+    assert len(decomposer.run(solid.vertices, solid.faces, OPTIONS)) == 1
 
 
-def test_a_decomposer_that_does_not_end_is_ended():
-    decomposer = Decomposer(limit_s=0.01)
-    try:
-        assert (
-            decomposer.run(
-                np.eye(3),
-                np.array([[0, 1, 2]]),
-                {"threshold": 0.1, "budget": 4, "hull_vertices": 48, "seed": 0},
-            )
-            is None
-        )
-    finally:
-        decomposer.close()
+def test_a_decomposer_that_does_not_end_is_ended(decomposer):
+    solid = box_solid(np.zeros(3), np.ones(3))
+    decomposer.run(solid.vertices, solid.faces, OPTIONS)
+    decomposer._limit_s = 0.3
+    os.kill(decomposer._child.pid, signal.SIGSTOP)  # it hangs
+    assert decomposer.run(solid.vertices, solid.faces, OPTIONS) is None
+    decomposer._limit_s = 60
+    assert len(decomposer.run(solid.vertices, solid.faces, OPTIONS)) == 1
+
+
+def test_the_decomposer_starts_where_nothing_is_installed_but_coacd(decomposer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", "")
+    (tmp_path / "coacd.py").write_text("raise ImportError('not this one')")
+    solid = box_solid(np.zeros(3), np.ones(3))
+    assert len(decomposer.run(solid.vertices, solid.faces, OPTIONS)) == 1
+
+
+def test_a_machine_without_coacd_is_told_so(tmp_path, monkeypatch):
+    (tmp_path / "coacd.py").write_text("raise ImportError('libgomp.so.1 is not there')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    solid = box_solid(np.zeros(3), np.ones(3))
+    with pytest.raises(EnvironmentMissing, match=r"libgomp.so.1 is not there.*pip install coacd"):
+        Decomposer().run(solid.vertices, solid.faces, OPTIONS)
+    for python, why in ((str(tmp_path / "python"), "No such file"), ("/bin/false", "status 1")):
+        with pytest.raises(EnvironmentMissing, match=why):
+            Decomposer(python=python).run(solid.vertices, solid.faces, OPTIONS)
 
 
 def test_a_full_scene_leaves_an_object_fewer_parts_but_some():

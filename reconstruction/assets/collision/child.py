@@ -1,18 +1,52 @@
-"""The process that CoACD runs in: questions on stdin, answers on stdout (see `decomposition`)."""
+"""The process that CoACD runs in: questions on stdin, answers on stdout (see `decomposition`).
 
+It is started by its path and needs nothing of this project, so that it starts at once and from anywhere.
+"""
+
+import io
 import os
+import struct
 import sys
+from typing import BinaryIO
 
-from reconstruction.assets.collision.decomposition import receive, send
+import numpy as np
+
+_LENGTH = struct.Struct("<q")
+
+
+def send(stream: BinaryIO, arrays: dict) -> None:
+    """Write named arrays."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    stream.write(_LENGTH.pack(buffer.getbuffer().nbytes))
+    stream.write(buffer.getbuffer())
+    stream.flush()
+
+
+def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
+    """Read named arrays.
+
+    Raises:
+        EOFError: the other side is gone.
+    """
+    head = stream.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        raise EOFError
+    data = stream.read(_LENGTH.unpack(head)[0])
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return dict(arrays)
 
 
 def main() -> None:
-    """Answer until the other side is gone."""
-    import coacd
-    import numpy as np
-
+    """Say whether CoACD is there, then answer until the other side is gone."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # CoACD prints
+    try:
+        import coacd
+    except (ImportError, OSError) as error:
+        send(answers, {"missing": np.array(f"{type(error).__name__}: {error}")})
+        return
+    send(answers, {})
     coacd.set_log_level("error")
     while True:
         try:

@@ -1,38 +1,43 @@
 """CoACD in a process of its own: on some meshes it crashes or does not end, and neither must cost the scene."""
 
 import atexit
-import io
-import struct
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 
+from reconstruction.assets.collision import child as child_module
+from reconstruction.assets.collision.child import receive, send
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid, lighten
+from registry.errors import EnvironmentMissing
 
-_LIMIT_S = 60.0
-_LENGTH = struct.Struct("<q")
+_LIMIT_S = 300.0  # only what hangs takes so long, however busy the machine: a part takes a second or two
 
 
 class Decomposer:
     """Runs CoACD in a child that is started at the first question and after each crash."""
 
-    def __init__(self, limit_s: float = _LIMIT_S) -> None:
+    def __init__(self, limit_s: float = _LIMIT_S, python: str = sys.executable) -> None:
         """Nothing is started yet."""
         self._limit_s = limit_s
+        self._python = python
         self._child: subprocess.Popen | None = None
         self._lock = threading.Lock()
 
     def run(
         self, vertices: np.ndarray, faces: np.ndarray, options: dict[str, float]
     ) -> list[np.ndarray] | None:
-        """Return the vertices (k, 3) of each part of a closed mesh; None where CoACD failed on it."""
+        """Return the vertices (k, 3) of each part of a closed mesh; None where CoACD failed on it.
+
+        Raises:
+            EnvironmentMissing: CoACD cannot be run at all.
+        """
         with self._lock:
             child = self._started()
-            timer = threading.Timer(self._limit_s, child.kill)
-            timer.start()
+            timer = self._guard(child)
             try:
                 send(child.stdin, {"vertices": vertices, "faces": faces, **options})
                 answer = receive(child.stdout)
@@ -43,13 +48,42 @@ class Decomposer:
                 timer.cancel()
         return [answer[str(number)] for number in range(len(answer))]
 
+    def _guard(self, child: subprocess.Popen) -> threading.Timer:
+        timer = threading.Timer(self._limit_s, child.kill)
+        timer.daemon = True
+        timer.start()
+        return timer
+
     def _started(self) -> subprocess.Popen:
-        if self._child is None or self._child.poll() is not None:
+        if self._child is not None and self._child.poll() is None:
+            return self._child
+        self.close()
+        try:
             self._child = subprocess.Popen(
-                [sys.executable, "-m", "reconstruction.assets.collision.child"],
+                [self._python, str(Path(child_module.__file__).resolve())],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             )  # fmt: skip
+        except OSError as error:
+            raise self._missing(str(error)) from error
+        timer = self._guard(self._child)
+        try:
+            missing = receive(self._child.stdout).get("missing")
+        except (OSError, EOFError) as error:
+            status = self._child.wait()
+            self.close()
+            raise self._missing(f"its process ended with status {status}") from error
+        finally:
+            timer.cancel()
+        if missing is not None:
+            self.close()
+            raise self._missing(str(missing))
         return self._child
+
+    def _missing(self, why: str) -> EnvironmentMissing:
+        return EnvironmentMissing(
+            f"assets: collision shapes need CoACD in a process of its own, which {self._python} cannot start ({why}); "
+            "install it with `pip install coacd`, then `simrecon doctor`"
+        )
 
     def close(self) -> None:
         """End the child."""
@@ -59,29 +93,6 @@ class Decomposer:
             child.wait()
             child.stdin.close()
             child.stdout.close()
-
-
-def send(stream, arrays: dict) -> None:
-    """Write named arrays."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    stream.write(_LENGTH.pack(buffer.getbuffer().nbytes))
-    stream.write(buffer.getbuffer())
-    stream.flush()
-
-
-def receive(stream) -> dict[str, np.ndarray]:
-    """Read named arrays.
-
-    Raises:
-        EOFError: the other side is gone.
-    """
-    head = stream.read(_LENGTH.size)
-    if len(head) < _LENGTH.size:
-        raise EOFError
-    data = stream.read(_LENGTH.unpack(head)[0])
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return dict(arrays)
 
 
 _decomposer = Decomposer()
