@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from masses import mass_entry
 
 from reconstruction.assets.gltf import read_glb, write_glb, write_obj
 from reconstruction.exports.scene import ExportBody, ExportScene, closed_part, safe_name, uniform_inertia
@@ -61,14 +62,6 @@ class _Writer:
     def add(self, key: int, label: str, parts: list, pose: np.ndarray, edge: tuple, **facts: object) -> None:
         stem = f"objects/{key:03d}/"
         names = self._write(stem, f"{stem}visual.glb", parts)
-        solids = [part for part in parts if part.volume > 1e-9]
-        volume = sum(part.volume for part in solids)
-        center = sum(part.volume * part.center_mass for part in solids) / volume
-        inertia = np.zeros((3, 3))
-        for part in solids:
-            arm = part.center_mass - center
-            inertia += part.moment_inertia + part.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        mass = facts.pop("mass", 0.4)
         entry = {
             "id": key,
             "label": label,
@@ -78,10 +71,7 @@ class _Writer:
             "visual": f"{stem}visual.glb",
             "collision": names,
             "material": "wood",
-            "density_kg_m3": mass / volume,
-            "mass_kg": mass,
-            "center_of_mass": center.tolist(),
-            "inertia": (0.5 * (inertia + inertia.T) * mass / volume).tolist(),
+            **mass_entry(parts, facts.pop("mass", 0.4)),
             "friction": 0.6,
             "restitution": 0.1,
             "dynamic": True,

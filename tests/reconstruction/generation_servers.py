@@ -1,12 +1,10 @@
 """Servers that speak the protocols of Rodin and of Hunyuan3D, or break them as they are told, and a mesh to send."""
 
 import base64
-import json
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import trimesh
+from local_server import LocalServer, reply
 
 from reconstruction.synthetic.furniture import Workshop
 from registry.geometry import GLTF_FROM_WORLD
@@ -34,45 +32,21 @@ def as_glb(mesh: trimesh.Trimesh, scale: float = 1.0, yaw: float = 0.0, color=(2
     return made.export(file_type="glb")
 
 
-class Server:
+class Server(LocalServer):
     """Answers by `respond(method, path, body)`; `broken` takes the place of single answers, by path."""
 
     def __init__(self, mesh: bytes = b"") -> None:
         self.mesh = mesh
         self.requests: list[tuple[str, str, bytes]] = []
         self.keys: list[str | None] = []
-        self.broken: dict[
-            str, list
-        ] = {}  # path -> answers before the good ones: (status, headers, bytes) or "hang"
-        outer, self._released = self, threading.Event()
+        self.broken: dict[str, list] = {}  # path -> answers before the good ones
+        super().__init__()
 
-        class Handler(BaseHTTPRequestHandler):
-            def _answer(self) -> None:
-                body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
-                outer.requests.append((self.command, self.path, body))
-                outer.keys.append(self.headers.get("Authorization"))
-                waiting = outer.broken.get(self.path)
-                answer = waiting.pop(0) if waiting else outer.respond(self.command, self.path, body)
-                if answer == "hang":
-                    outer._released.wait(5)
-                    return
-                status, headers, data = answer
-                self.send_response(status)
-                for name, value in headers.items():
-                    self.send_header(name, value)
-                self.send_header("Content-Length", str(len(data)))
-                self.end_headers()
-                self.wfile.write(data)
-
-            do_GET = do_POST = _answer
-
-            def log_message(self, *args) -> None:
-                return
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self._server.server_port}"
-        threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True).start()
+    def answer(self, method: str, path: str, headers: dict, body: bytes):
+        self.requests.append((method, path, body))
+        self.keys.append(headers.get("Authorization"))
+        waiting = self.broken.get(path)
+        return waiting.pop(0) if waiting else self.respond(method, path, body)
 
     def respond(self, method: str, path: str, body: bytes):
         raise NotImplementedError
@@ -80,22 +54,6 @@ class Server:
     def sent(self, path: str) -> list[bytes]:
         """Return the bodies that were sent to a path."""
         return [body for _, asked, body in self.requests if asked == path]
-
-    def close(self) -> None:
-        self._released.set()
-        self._server.shutdown()
-        self._server.server_close()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error) -> None:
-        self.close()
-
-
-def reply(document: dict, status: int = 200) -> tuple[int, dict, bytes]:
-    """Return a JSON answer."""
-    return status, {"Content-Type": "application/json"}, json.dumps(document).encode()
 
 
 class RodinServer(Server):

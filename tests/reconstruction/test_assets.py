@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gltf_validator import gltf_issues
+from notes import Notes
 
 from reconstruction.assets import AssetsConfig, build_assets
 from reconstruction.assets.gltf import write_glb
 from reconstruction.assets.solid import Solid, to_manifold
-from reconstruction.progress import NoProgress
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.geometry import transform_points
 
@@ -17,14 +17,6 @@ CONFIG = AssetsConfig(
     cells_along_longest=40, max_voxels=150_000, texture_max_px=128, texture_frames=4, base_texel_m=0.05
 )
 EMPTY = Surface(*(np.zeros(0),) * 5, voxel_size_m=0.01, space=None)
-
-
-class Notes(NoProgress):
-    def __init__(self):
-        self.lines = []
-
-    def note(self, message):
-        self.lines.append(message)
 
 
 def instances_of(capture, names):
@@ -136,7 +128,7 @@ def test_what_was_never_seen_becomes_a_noted_box(built, small_capture):
     )
     (item,) = assets.objects
     assert item.provenance.geometry == "box-fallback"
-    assert any("999" in line for line in notes.lines)
+    assert any("999" in line for line in notes.notes)
     np.testing.assert_allclose(np.ptp(item.visual.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-6)
 
 

@@ -1,6 +1,7 @@
 """What all formats share: bodies, folders, the command."""
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -16,15 +17,10 @@ from registry.welding import moving_ids, welded_to
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("exports") / "bundle")
-
-
-@pytest.fixture(scope="module")
-def registry(tmp_path_factory):
+def registry(bundle, tmp_path_factory):
     root = tmp_path_factory.mktemp("exports_registry")
     folder = tmp_path_factory.mktemp("staged") / "bundle"
-    make_room(folder)
+    shutil.copytree(bundle.root, folder)
     registry = SceneRegistry(root, create=True)
     registry.publish(folder, "room")
     return root

@@ -6,16 +6,11 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from exports_room import FREE, KNOB, make_room, names, world_box
+from exports_room import FREE, KNOB, names, world_box
 from gltf_validator import gltf_issues
 
 from reconstruction.exports import export_scene
 from registry.geometry import GLTF_FROM_WORLD, transform_points
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("glb") / "bundle")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from exports_room import (
     MOVING,
     MUG,
     generated_room,
-    make_room,
     names,
     solid_box,
     world_box,
@@ -23,11 +22,6 @@ from registry.geometry import matrix_from_quat, rigid
 from registry.simulation import pose_change
 
 mujoco = pytest.importorskip("mujoco", reason="needs simrecon[exports]")
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("mjcf") / "bundle")
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from exports_room import BOOK, FREE, KNOB, LEAF, make_room, names, solid_box, world_box
+from exports_room import BOOK, FREE, KNOB, LEAF, names, solid_box, world_box
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,11 +11,6 @@ from reconstruction.exports.numbers import roll_pitch_yaw
 from registry.geometry import matrix_from_quat
 
 yourdfpy = pytest.importorskip("yourdfpy", reason="a test dependency")
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("urdf") / "bundle")
 
 
 @pytest.fixture(scope="module")

@@ -2,18 +2,13 @@
 
 import numpy as np
 import pytest
-from exports_room import BOOK, FLOOR, KNOB, LEAF, MOVING, make_room, names, solid_box, world_box
+from exports_room import BOOK, FLOOR, KNOB, LEAF, MOVING, names, solid_box, world_box
 
 from reconstruction.exports import export_scene
 from registry.geometry import matrix_from_quat
 
 pytest.importorskip("pxr", reason="needs simrecon[exports]")
 from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return make_room(tmp_path_factory.mktemp("usd") / "bundle")
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,8 @@ import socket
 
 import numpy as np
 import pytest
-from generation_servers import HunyuanServer, RodinServer, as_glb, reply, thing_mesh
+from generation_servers import HunyuanServer, RodinServer, as_glb, thing_mesh
+from local_server import reply
 
 from reconstruction import doctor_learned
 from reconstruction.assets import AssetsConfig

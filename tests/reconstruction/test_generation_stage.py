@@ -5,7 +5,9 @@ import re
 
 import numpy as np
 import pytest
-from generation_servers import RodinServer, as_glb, reply, thing_mesh
+from generation_servers import RodinServer, as_glb, thing_mesh
+from local_server import reply
+from notes import Notes
 from scipy.spatial import cKDTree
 
 from reconstruction.assets import AssetsConfig, build_assets
@@ -16,7 +18,6 @@ from reconstruction.assets.generation.meshes import read_generated
 from reconstruction.assets.solid import to_manifold
 from reconstruction.assets.views import lift_object, prepare_pixels
 from reconstruction.config import PipelineConfig
-from reconstruction.progress import NoProgress
 from reconstruction.publish import _completion
 from reconstruction.synthetic.containers import make_bowl, make_mug
 from reconstruction.synthetic.furnishing import make_chair
@@ -25,14 +26,6 @@ from registry.geometry import transform_points
 
 NAMES = ("can", "bowl", "book")
 EMPTY = Surface(*(np.zeros(0),) * 5, voxel_size_m=0.01, space=None)
-
-
-class Notes(NoProgress):
-    def __init__(self):
-        self.lines = []
-
-    def note(self, message):
-        self.lines.append(message)
 
 
 class ByPrompt(RodinServer):
@@ -108,14 +101,14 @@ def fetch(capture, seen, config):
     names = {item.id: item.label for item in found.objects}
     fetched = fetch_meshes(found, capture.posed, seen, config, notes)
     meshes = {names[number]: mesh for number, mesh in fetched.meshes.items()}
-    return meshes, {names[number]: why for number, why in fetched.refused.items()}, notes.lines
+    return meshes, {names[number]: why for number, why in fetched.refused.items()}, notes.notes
 
 
 def test_what_agrees_is_used_and_what_does_not_is_rejected(small_capture, server):
     notes, found = Notes(), instances_of(small_capture)
     config = config_of(server, generator_budget=1.5)
     assets = build_assets(small_capture.posed, small_capture.depth, EMPTY, found, config, progress=notes)
-    items, lines = {item.label: item for item in assets.objects}, notes.lines
+    items, lines = {item.label: item for item in assets.objects}, notes.notes
     said = "\n".join(lines)
     assert lines[0] == (
         f"rodin: 3 objects are generated, 0 are kept from before; pictures of them go to {server.url}; "

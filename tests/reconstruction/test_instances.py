@@ -4,28 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notes import Notes
 from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from, with_planes
 
 from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig, find_instances
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.types import InstanceSet, Surface
-
-
-class Notes:
-    """Collects what a stage tells the user."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def start(self, total: int, label: str) -> None:
-        """Ignore."""
-
-    def advance(self, n: int = 1) -> None:
-        """Ignore."""
-
-    def note(self, message: str) -> None:
-        """Keep the line."""
-        self.lines.append(message)
 
 
 def run(surface: Surface, progress=NO_PROGRESS) -> InstanceSet:
@@ -126,7 +110,7 @@ def test_empty_room_is_legal_and_noted():
     found = run(surface_from(floor_sheet((200, 200, 190))), notes)
     assert found.objects == ()
     assert [b.label for b in found.base] == ["floor"]
-    assert any("empty room" in line for line in notes.lines)
+    assert any("empty room" in line for line in notes.notes)
 
 
 def test_missing_floor_is_assumed():
@@ -139,7 +123,7 @@ def test_missing_floor_is_assumed():
     outline = found.base[0].surface.polygon
     assert (outline[:, :2].min(axis=0) < 0.0).all()
     assert (outline[:, :2].max(axis=0) > 0.3).all()
-    assert any("assumed" in line for line in notes.lines)
+    assert any("assumed" in line for line in notes.notes)
     assert len(found.objects) == 1
 
 

@@ -4,26 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notes import Notes
 
 from reconstruction.poses import PosesConfig, estimate_poses
 from reconstruction.poses.components import label_parts, propose_bridges
 from reconstruction.poses.consistency import reject_look_alikes
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
-from reconstruction.progress import NoProgress
 from reconstruction.synthetic.film import film_room, handheld_path, phone_camera, prepare
 from reconstruction.synthetic.procedural import RoomSpec, build_procedural_room
-
-
-class Notes(NoProgress):
-    """Keeps what the stage says."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
-
 
 SIZE = (640, 480)
 POINTS, PERIOD = 60, 20  # point k and point k + PERIOD look alike

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from notes import Notes
 
 from reconstruction.evaluation.surfaces import sample
 from reconstruction.surface import SurfaceConfig, fuse_surface
@@ -165,19 +166,12 @@ def test_fusion_is_deterministic(scene, surface) -> None:
 
 
 def test_large_scenes_are_coarsened_with_a_note(scene) -> None:
-    notes: list[str] = []
-
-    class Notes:
-        def start(self, total: int, label: str) -> None: ...
-        def advance(self, n: int = 1) -> None: ...
-        def note(self, message: str) -> None:
-            notes.append(message)
-
     config = SurfaceConfig(voxel_size_m=0.01, max_blocks=300, space_voxel_m=0.02, max_space_cells=20_000)
-    surface = fuse_surface(scene[0], scene[1], config, progress=Notes())
+    said = Notes()
+    surface = fuse_surface(scene[0], scene[1], config, progress=said)
     assert surface.voxel_size_m > 0.01
     assert surface.space.voxel_size_m > 0.02
-    assert sum("since the scene is large" in note for note in notes) == 2
+    assert sum("since the scene is large" in note for note in said.notes) == 2
 
 
 def test_no_depth_is_an_input_error(scene) -> None:

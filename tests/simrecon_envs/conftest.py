@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from masses import mass_entry
 
 from registry import SceneRegistry, seal_bundle
 from registry.geometry import GLTF_FROM_WORLD
@@ -89,12 +90,6 @@ class BundleWriter:
         for number, part in enumerate(parts):
             names.append(f"{stem}/collision_{number:03d}.obj")
             _obj(part, self.folder / names[-1])
-        volume = sum(part.volume for part in parts)
-        center = sum(part.volume * part.center_mass for part in parts) / volume
-        inertia = np.zeros((3, 3))
-        for part in parts:
-            arm = part.center_mass - center
-            inertia += part.moment_inertia + part.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         self.objects.append(
             {
                 "id": key,
@@ -105,10 +100,7 @@ class BundleWriter:
                 "visual": f"{stem}/visual.glb",
                 "collision": names,
                 "material": "wood",
-                "density_kg_m3": mass / volume,
-                "mass_kg": mass,
-                "center_of_mass": center.tolist(),
-                "inertia": (0.5 * (inertia + inertia.T) * mass / volume).tolist(),
+                **mass_entry(parts, mass),
                 "friction": friction,
                 "restitution": 0.05,
                 "dynamic": dynamic,
