@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from reconstruction.assembly import ASSEMBLY_PRESETS, AssemblyConfig
 from reconstruction.assets import ASSETS_PRESETS, AssetsConfig
+from reconstruction.avo.config import AVO_PRESETS, AvoConfig
 from reconstruction.depth import DEPTH_PRESETS, DepthConfig
 from reconstruction.frames import FRAMES_PRESETS, FramesConfig
 from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig
@@ -40,6 +41,7 @@ class PipelineConfig:
     gaussians: GaussiansConfig = field(default_factory=GaussiansConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     instances: InstancesConfig = field(default_factory=InstancesConfig)
+    avo: AvoConfig = field(default_factory=AvoConfig)
     assets: AssetsConfig = field(default_factory=AssetsConfig)
     scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
     assembly: AssemblyConfig = field(default_factory=AssemblyConfig)
@@ -57,6 +59,7 @@ class PipelineConfig:
             gaussians=GAUSSIANS_PRESETS[name],
             surface=SURFACE_PRESETS[name],
             instances=INSTANCES_PRESETS[name],
+            avo=AVO_PRESETS[name],
             assets=ASSETS_PRESETS[name],
             scene_graph=SCENE_GRAPH_PRESETS[name],
             assembly=ASSEMBLY_PRESETS[name],

@@ -1,12 +1,13 @@
 """From a video to a registered scene: the stages in order, wired, cached and measured. The first file to read.
 
     frames -> poses -> depth -> world -> gaussians -> surface
-    -> instances -> assets -> scene_graph -> assembly -> publish
+    -> instances (-> views) -> assets -> scene_graph -> assembly -> publish
 
 Each stage is a function from artifacts to an artifact (`reconstruction.types`) with its own config. Depth comes before
 the world frame because the depth maps' normals are what tells gravity. Gaussians are fitted in the space of the
 poses, so that another scale does not ask for another fit, and correct the depth maps; from `surface` on everything is
-in metres, +z up, floor at z = 0. `Run` remembers each stage's result under the fingerprint of what went into it.
+in metres, +z up, floor at z = 0. `views` is done only where something asks for it: a generator, a vision-language
+model, `simrecon show --views`. `Run` remembers each stage's result under the fingerprint of what went into it.
 """
 
 import importlib
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from reconstruction.avo import SceneViews
 from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, fingerprint
 from reconstruction.compiling import compilation_shown
 from reconstruction.config import PipelineConfig
@@ -44,6 +46,7 @@ from registry import SceneRecord, SceneRegistry
 from registry.errors import InputError, UsageError
 
 if TYPE_CHECKING:
+    from reconstruction.avo import ViewScene
     from reconstruction.oracle import Oracle
 
 logger = logging.getLogger(__name__)
@@ -60,6 +63,8 @@ class Stage:
     module: str
     produces: type
     needs: tuple[str, ...]
+    options: str = ""  # name of its config, where it is not that of the stage
+    on_demand: bool = False  # done only where a stage's `wants_views` or a command asks for it
 
 
 STAGES: tuple[Stage, ...] = (
@@ -71,12 +76,17 @@ STAGES: tuple[Stage, ...] = (
     Stage("surface", "reconstruction.surface", Surface, ("poses", "gaussians", "world")),
     Stage("instances", "reconstruction.instances", InstanceSet, ("poses", "gaussians", "world", "surface")),
     Stage(
+        "views", "reconstruction.avo", SceneViews, ("poses", "gaussians", "world", "surface", "instances"),
+        options="avo", on_demand=True,
+    ),
+    Stage(
         "assets", "reconstruction.assets", AssetSet, ("poses", "gaussians", "world", "surface", "instances")
     ),
     Stage("scene_graph", "reconstruction.scene_graph", SceneGraph, ("assets",)),
     Stage("assembly", "reconstruction.assembly", AssembledScene, ("assets", "scene_graph")),
-)
+)  # fmt: skip
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
+DEFAULT_STAGE_NAMES = tuple(stage.name for stage in STAGES if not stage.on_demand)
 
 
 @dataclass
@@ -102,15 +112,49 @@ class Run:
         self.input_digest = self.input_digest or digest_input(self.video)
 
     def execute(self, until: str = STAGE_NAMES[-1]) -> None:
-        """Run or load every stage up to and including `until`."""
-        for number, stage in enumerate(STAGES, start=1):
-            self._execute_stage(number, stage)
+        """Run or load every stage up to and including `until`, and of those on demand what is asked for."""
+        wanted = self.wanted_stages()
+        if until not in wanted:
+            wanted = tuple(name for name in STAGE_NAMES if name in (*wanted, until))
+        for stage in STAGES:
+            if stage.name in wanted:
+                self._execute_stage(stage, wanted)
             if stage.name == until:
                 return
 
-    def _execute_stage(self, number: int, stage: Stage) -> None:
-        config = getattr(self.config, stage.name)
-        upstream = tuple(self.keys[name] for name in stage.needs) or (self.input_digest,)
+    def complete(self, name: str) -> None:
+        """Run or load one stage whose inputs are among the results already."""
+        self._execute_stage(next(stage for stage in STAGES if stage.name == name), (name,))
+
+    def wanted_stages(self) -> tuple[str, ...]:
+        """Return the stages that make this scene, in order."""
+        asked = {name for stage in STAGES for name in self.needs_of(stage)}
+        return tuple(stage.name for stage in STAGES if not stage.on_demand or stage.name in asked)
+
+    def needs_of(self, stage: Stage) -> tuple[str, ...]:
+        """Return which stages a stage reads under this config."""
+        wants_views = getattr(importlib.import_module(stage.module), "wants_views", None)
+        wanted = wants_views is not None and wants_views(self.options_of(stage))
+        return (*stage.needs, "views") if wanted else stage.needs
+
+    def options_of(self, stage: Stage) -> Any:
+        """Return a stage's config."""
+        return getattr(self.config, stage.options or stage.name)
+
+    def view_scene(self) -> "ViewScene":
+        """Return what `reconstruction.avo.find_views` looks at, for views of any things or regions of them."""
+        from reconstruction.avo import prepare_scene
+
+        done = self.results
+        gaussians = done["gaussians"].in_world(done["world"])
+        return prepare_scene(gaussians, done["surface"], done["instances"], done["poses"].camera)
+
+    def _execute_stage(self, stage: Stage, wanted: tuple[str, ...]) -> None:
+        number = (
+            STAGE_NAMES.index(stage.name) + 1
+        )  # of its folder; people are told its place among those wanted
+        config = self.options_of(stage)
+        upstream = tuple(self.keys[name] for name in self.needs_of(stage)) or (self.input_digest,)
         options = ()
         if stage.name == "poses" and config.import_path and Path(config.import_path).exists():
             options += (digest_input(Path(config.import_path)),)
@@ -126,7 +170,7 @@ class Run:
         corrections = self.overrides.fingerprint_of_stage(stage.name)
         key = self.keys[stage.name] = key_with(corrections)
         cached = self.store.has(number, stage.name, key)
-        self.listener.begin_stage(stage.name, number, len(STAGES), cached)
+        self.listener.begin_stage(stage.name, wanted.index(stage.name) + 1, len(wanted), cached)
         if not cached:
             with compilation_shown(self.listener) as shown:
                 if corrections:
@@ -158,13 +202,13 @@ class Run:
         with UsageMeter() as meter:
             result = make(_NoteTaker(shown, notes))
         usage = meter.usage if before is None else Usage(**before["usage"]).followed_by(meter.usage)
-        config = getattr(self.config, stage.name)
+        config = self.options_of(stage)
         record = {"stage": stage.name, "key": key, "usage": asdict(usage), "notes": notes, "config": config}
         self.store.save(result, number, stage.name, key, record)
 
     def _keep_corrected(self, number: int, stage: Stage, plain_key: str, key: str, shown: Progress) -> None:
         """Correct a stage's result as the user says; the result before that is kept too, for the next correction."""
-        config = getattr(self.config, stage.name)
+        config = self.options_of(stage)
         if not self.store.has(number, stage.name, plain_key):
             self._keep(number, stage, plain_key, lambda noted: self._compute(stage, config, noted), shown)
         plain = self.store.load(stage.produces, number, stage.name, plain_key)
@@ -215,13 +259,16 @@ class Run:
             return module.infer_scene_graph(done["assets"], config, progress=progress)
         if stage.name == "assembly":
             return module.assemble(done["assets"], done["scene_graph"], config, progress=progress)
+        if stage.name == "views":
+            return module.make_views(self.view_scene(), done["instances"], config, progress=progress)
         posed, depth = self.in_world()
         if stage.name == "surface":
             return module.fuse_surface(posed, depth, config, progress=progress)
         if stage.name == "instances":
             return module.make_instances(posed, depth, done["surface"], config, progress=progress)
+        views = done["views"] if "views" in self.needs_of(stage) else None
         return module.build_assets(
-            posed, depth, done["surface"], done["instances"], config, progress=progress
+            posed, depth, done["surface"], done["instances"], config, views=views, progress=progress
         )
 
     def _ask_oracle(self, stage: Stage, config: Any, progress: Progress) -> Any:

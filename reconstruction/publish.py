@@ -276,6 +276,8 @@ def _backends(run: "Run") -> dict[str, str]:
         "physics": physics_backend(run.config.assets),
         "relations": "geometry",
     }
+    if "views" in run.keys:
+        backends["views"] = run.config.avo.strategy
     if run.oracle is not None:
         if "instances" in run.oracle.stages:
             del backends["masks"], backends["labels"]

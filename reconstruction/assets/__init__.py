@@ -2,19 +2,25 @@
 
 from reconstruction.assets.config import ASSETS_PRESETS, AssetsConfig
 from reconstruction.assets.physics.load import outside_inputs
+from reconstruction.avo import SceneViews
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, Surface
 
-__all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets", "outside_inputs")
+__all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets", "outside_inputs", "wants_views")
 
-VERSION = 9
+VERSION = 10
 
 
 def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
-    progress: Progress = NO_PROGRESS,
+    views: SceneViews | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
     """Build every asset; see `reconstruction.assets.build.build_assets` (compiled code is imported on use)."""
     from reconstruction.assets.build import build_assets as build
 
-    return build(posed, depth, surface, instances, config, progress=progress)
+    return build(posed, depth, surface, instances, config, views=views, progress=progress)
+
+
+def wants_views(config: AssetsConfig) -> bool:
+    """Tell whether objects are shown to anyone: a generator, or a vision-language model."""
+    return config.generator != "none" or config.physics == "vlm"

@@ -21,6 +21,7 @@ from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, frame_object, fuse_volume
+from reconstruction.avo import SceneViews
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import (
     AssetProvenance,
@@ -80,7 +81,7 @@ class Shape:
 
 def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
-    progress: Progress = NO_PROGRESS,
+    views: SceneViews | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
     """Build a complete asset for every object, and textured surfaces for floor and walls.
 
@@ -93,13 +94,14 @@ def build_assets(
         surface: The fused surface; objects are fused again, finer, from the depth maps. Of it, the free space counts.
         instances: The things and which pixels show them.
         config: Resolution, budgets and limits.
+        views: What a generator and a vision-language model are shown of the objects; None: keyframes.
         progress: Told of every object.
 
     Returns:
         All assets, in the order of `instances`.
     """
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
-    scene = gather_evidence(posed, depth, surface, instances, config, progress)
+    scene = gather_evidence(posed, depth, surface, instances, config, progress, views)
     objects: list[ObjectAsset] = []
     hulls = 0
     for left, item in zip(range(len(instances.objects) - 1, -1, -1), instances.objects):
@@ -115,16 +117,16 @@ def build_assets(
 
 def gather_evidence(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, found: InstanceSet, config: AssetsConfig,
-    progress: Progress,
+    progress: Progress, views: SceneViews | None = None,
 ) -> Evidence:  # fmt: skip
     """Prepare what all objects share; asks the generator and whoever knows materials, if there are any."""
     pixels = prepare_pixels(posed, depth, found.id_maps)
     pixels = without_strays(pixels, posed, depth.camera, surface, found)
     stands = find_stands(posed, depth, pixels, found)
-    fetched = fetch_meshes(found, posed, stands.seen, config, progress)
+    fetched = fetch_meshes(found, posed, stands.seen, config, progress, views)
     progress.advance()
     physicist = load_physicist(config)
-    said = physicist.choose(found, posed, progress=progress) if physicist else {}
+    said = physicist.choose(found, posed, views=views, progress=progress) if physicist else {}
     return Evidence(posed, depth, surface, found, pixels, stands, said, fetched, config)
 
 

@@ -96,3 +96,10 @@ class AvoConfig:
                 raise ValueError(f"avo.{name} must lie in [0, 1], not {getattr(self, name)}")
         if not 5.0 <= self.fov_deg <= 140.0:
             raise ValueError(f"avo.fov_deg must lie in [5, 140], not {self.fov_deg}")
+
+
+AVO_PRESETS = {
+    "fast": AvoConfig(views=3, steps=16),
+    "default": AvoConfig(),
+    "quality": AvoConfig(steps=36, restarts=3, picture_side_px=512),
+}

@@ -33,7 +33,9 @@ def find_views(
 
     Args:
         scene: of `prepare_scene`, shared by all targets.
-        targets: an instance id each, or the ids of a region that is looked at as one thing.
+        targets: an instance id each, or the ids of a region, such as (7, 12, 15): the information of all of them
+            counts together, one target distance shows them all, and `View.mask` is where any of them is seen. One view
+            of a region: `config` with `views=1`.
         config: how; the strategy is part of it.
         progress: told of targets, and of those that cannot be seen.
 
@@ -62,7 +64,16 @@ def find_views(
                 round(point.camera.width * scale), round(point.camera.height * scale)
             )
             views.append(
-                draw_view(scene, target, camera, point.world_from_camera, point.origin, point.gain, inpainter)
+                draw_view(
+                    scene,
+                    target,
+                    camera,
+                    point.world_from_camera,
+                    point.origin,
+                    point.gain,
+                    point.fronts,
+                    inpainter,
+                )
             )
         if not views:
             progress.note(f"{_named(target.ids)} can be seen from nowhere in free space: no views of it.")

@@ -29,7 +29,11 @@ class View:
     color: np.ndarray  # uint8 (h, w, 3) RGB of the whole scene, black where nothing is known
     alpha: np.ndarray  # float32 (h, w) the target's own opacity, behind what hides it
     depth: np.ndarray  # float32 (h, w) z-depth of the target where alpha > 0.5, else 0
-    visibility: float  # share of the target's outline in this picture that nothing hides
+    outline: np.ndarray  # bool (h, w) where the target would be seen if nothing hid it
+    visibility: float  # share of the outline that nothing hides
+    fronts: (
+        float  # share of what is seen of it that frames saw; the rest are backs, through sides that none saw
+    )
     clean: np.ndarray  # uint8 (h, w, 3) without what hides the target, holes inpainted
     inpainted: np.ndarray  # bool (h, w) which pixels of `clean` are made up
 
@@ -37,6 +41,25 @@ class View:
     def mask(self) -> np.ndarray:
         """Where the target is seen, bool (h, w)."""
         return self.alpha > _OPAQUE
+
+    def cleared(self, margin: float = 0.25) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return `clean`, uint8 (h, w, 3), and where the target is in it, bool (h, w), cropped to the target.
+
+        Args:
+            margin: of what is around it, as a share of its box on each side.
+
+        Returns:
+            None where nothing of it is in the picture.
+        """
+        whole = _filled(self.outline)
+        if not whole.any():
+            return None
+        window = []
+        for axis in (1, 0):
+            rows = np.flatnonzero(whole.any(axis=axis))
+            pad = round(margin * (rows[-1] - rows[0] + 1)) + 2
+            window.append(slice(max(0, rows[0] - pad), rows[-1] + 1 + pad))
+        return np.ascontiguousarray(self.clean[tuple(window)]), whole[tuple(window)]
 
 
 def draw_view(
@@ -46,6 +69,7 @@ def draw_view(
     pose: np.ndarray,
     origin: str,
     gain: float,
+    fronts: float,
     inpainter: Inpainter,
 ) -> View:
     """Draw a view.
@@ -57,6 +81,7 @@ def draw_view(
         pose: (4, 4) world_from_camera.
         origin: as in `View`.
         gain: as in `View`.
+        fronts: as in `View`.
         inpainter: for `clean`.
     """
     own = np.zeros(len(scene.packed), bool)
@@ -82,6 +107,8 @@ def draw_view(
         color=_uint8(whole[..., :3]),
         alpha=alpha,
         depth=np.where(alpha > _OPAQUE, depth, 0.0).astype(np.float32),
+        outline=outline > _OPAQUE,
+        fronts=fronts,
         visibility=min(float(alpha.sum()) / total, 1.0) if total > 0 else 0.0,
         clean=inpainter.inpaint(clean, holes),
         inpainted=holes,
@@ -141,6 +168,14 @@ def _covered(
     columns = np.arange(small.width) * camera.width // small.width
     inside = outline[np.ix_(rows_v, columns)]
     return float((opacity[inside] > _OPAQUE).mean()) if inside.any() else 0.0
+
+
+def _filled(outline: np.ndarray) -> np.ndarray:
+    """Return an outline with what it surrounds and is thin or small: gaps between Gaussians, which are inpainted."""
+    import cv2
+
+    closed = cv2.morphologyEx(outline.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    return closed.astype(bool)
 
 
 def _grown(holes: np.ndarray) -> np.ndarray:

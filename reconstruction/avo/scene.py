@@ -9,7 +9,6 @@ import numpy as np
 from reconstruction.avo.clearance import Clearance, measure_clearance
 from reconstruction.avo.config import AvoConfig
 from reconstruction.gaussians.model import Gaussians
-from reconstruction.instances.gaussian_ids import gaussian_instances
 from reconstruction.types import Camera, InstanceSet, Surface
 from registry.errors import UsageError
 
@@ -56,6 +55,8 @@ def prepare_scene(
     Raises:
         UsageError: the Gaussians carry no cameras.
     """
+    from reconstruction.instances.gaussian_ids import gaussian_instances
+
     poses = np.asarray(gaussians.world_from_camera, np.float64)
     if not len(poses):
         raise UsageError(

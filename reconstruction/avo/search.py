@@ -3,13 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reconstruction.avo.cameras import moved, step_gradient
 from reconstruction.avo.clearance import Clearance
 from reconstruction.avo.config import AvoConfig
-from reconstruction.avo.objective import Objective, Value
+
+if TYPE_CHECKING:
+    from reconstruction.avo.objective import Objective, Value
 
 _DECAYS, _EPSILON = (0.8, 0.95), 1e-8  # Adam, with memories as short as the search
 _LAST_RATE = 0.1
@@ -22,7 +25,7 @@ class Found:
     """A viewpoint and what it is worth."""
 
     pose: np.ndarray  # float64 (4, 4) world_from_camera
-    value: Value  # of the objective, without the terms of the place
+    value: "Value"  # of the objective, without the terms of the place
     loss: float  # with them
     steps: int
 
@@ -31,7 +34,7 @@ class Found:
 class Search:
     """Descends from a start; see `AvoConfig` for the weights."""
 
-    objective: Objective
+    objective: "Objective"
     clearance: Clearance
     distance_m: float  # the target distance
     depth_weight: float

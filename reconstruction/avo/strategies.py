@@ -3,19 +3,21 @@
 import math
 from copy import copy
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from reconstruction.avo.cameras import look_at, square_camera
 from reconstruction.avo.config import AvoConfig
-from reconstruction.avo.objective import Objective
 from reconstruction.avo.scene import Target, ViewScene, reach_of
 from reconstruction.avo.search import Search
 from reconstruction.avo.starts import input_starts, starts_around
 from reconstruction.types import Camera
 from registry.errors import UsageError
 from registry.geometry import matrix_from_quat
+
+if TYPE_CHECKING:
+    from reconstruction.avo.objective import Objective
 
 _APART_DEG = 25.0  # starts that are optimized look from directions at least this far apart
 _CANONICAL_PITCH_DEG = 25.0
@@ -34,6 +36,9 @@ class Viewpoint:
     camera: Camera  # field of view; its size is the working resolution
     origin: str  # how it was found, for people
     gain: float  # share of the target's opacity that it showed for the first time
+    fronts: float = (
+        1.0  # share of what is seen that frames saw, not backs; 1 where the strategy does not tell them
+    )
 
 
 class Strategy(Protocol):
@@ -101,7 +106,9 @@ def _coverage(scene: ViewScene, target: Target, most: np.ndarray, config: AvoCon
     return Coverage(opacities, most, config.back_weight)
 
 
-def _objective(scene: ViewScene, target: Target, camera: Camera, config: AvoConfig) -> Objective:
+def _objective(scene: ViewScene, target: Target, camera: Camera, config: AvoConfig) -> "Objective":
+    from reconstruction.avo.objective import Objective
+
     reach = reach_of(scene.packed, config.sigma_cutoff)
     return Objective(scene.packed, reach, target.rows, camera, config)
 
@@ -146,13 +153,16 @@ class ActiveViews:
             if gain < config.min_gain:
                 break
             origin = "optimized" if pose is found.pose else "start"
-            out.append(Viewpoint(pose, fine.camera, origin, gain))
+            fronts = float(contributions[0].sum() / max(contributions.sum(), 1e-9))
+            out.append(Viewpoint(pose, fine.camera, origin, gain, fronts))
             if coverage.remaining < config.remaining_share:
                 break
         return out
 
 
-def _scan(objective: Objective, pose: np.ndarray, target: Target, camera: Camera) -> tuple[np.ndarray, float]:
+def _scan(
+    objective: "Objective", pose: np.ndarray, target: Target, camera: Camera
+) -> tuple[np.ndarray, float]:
     """Return what a pose shows of each side of the target's Gaussians (2, m), and at which depth.
 
     In pixels of `camera`, from the target distance: so they say how well a side is seen, not how close the camera is.

@@ -31,7 +31,29 @@ def add_parsers(verbs: argparse._SubParsersAction) -> None:
         "numbered things, and a picture of each thing",
     )
     show.add_argument(
-        "--out", type=Path, metavar="DIR", help="where contact sheets go (default: SCENE_instances here)"
+        "--views",
+        action="store_true",
+        help="write contact sheets of the views that show most of every thing (docs/avo.md): as it is, and without "
+        "what hides it; made from the work folder of the scene, and kept there",
+    )
+    show.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="avo.OPTION=VALUE",
+        help="with --views: an option of the views, for example avo.strategy=canonical",
+    )
+    show.add_argument(
+        "--work-dir",
+        type=Path,
+        metavar="DIR",
+        help="with --views: the folder that `simrecon reconstruct --work-dir` was given, if it was",
+    )
+    show.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where contact sheets go (default: SCENE_instances or SCENE_views here)",
     )
     show.add_argument(
         "--overrides-template",
@@ -73,10 +95,20 @@ def run_show(arguments: argparse.Namespace) -> int:
     registry = SceneRegistry(arguments.registry)
     record = registry.get(arguments.scene)
     bundle = registry.load(arguments.scene)
+    if arguments.instances and arguments.views:
+        raise UsageError("--instances and --views write different sheets; ask for one of them")
+    if (arguments.set or arguments.work_dir) and not arguments.views:
+        raise UsageError("--set and --work-dir belong to: simrecon show SCENE --views")
+    if arguments.overrides_template and not arguments.instances:
+        raise UsageError("--overrides-template belongs to: simrecon show SCENE --instances")
     if arguments.instances:
         return _show_instances(arguments, bundle)
-    if arguments.out or arguments.overrides_template:
-        raise UsageError("--out and --overrides-template belong to: simrecon show SCENE --instances")
+    if arguments.views:
+        from reconstruction.commands.views import show_views
+
+        return show_views(arguments, bundle, registry.root)
+    if arguments.out:
+        raise UsageError("--out belongs to: simrecon show SCENE --instances, or --views")
     if arguments.json:
         from reconstruction.profiling import costs_json
 

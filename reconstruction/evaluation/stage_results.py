@@ -43,6 +43,8 @@ class StageResults:
         for number, stage in enumerate(STAGES, start=1):
             key = keys.get(stage.name)
             place = folder / f"{number:02d}_{stage.name}-{key}"
+            if key is None and stage.on_demand:
+                continue
             if key is None:
                 missing[stage.name] = "this scene was made without the stage"
             elif not (place / _MANIFEST).is_file():

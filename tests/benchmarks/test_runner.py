@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.results import load_result, load_results
 from benchmarks.run import main, run_command
-from reconstruction.pipeline import STAGE_NAMES
+from reconstruction.pipeline import DEFAULT_STAGE_NAMES
 from reconstruction.synthetic.capture import write_ground_truth
 from reconstruction.synthetic.film import film_room, handheld_path, phone_camera, prepare
 from reconstruction.synthetic.room import build_room
@@ -156,7 +156,7 @@ def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
     process = subprocess.Popen(line, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     deadline = time.monotonic() + 120
     log = out / "room" / "fast.log"
-    while not (log.is_file() and f"[2/{len(STAGE_NAMES)}]" in log.read_text()):
+    while not (log.is_file() and f"[2/{len(DEFAULT_STAGE_NAMES)}]" in log.read_text()):
         assert time.monotonic() < deadline
         assert process.poll() is None
         time.sleep(0.1)
@@ -192,7 +192,7 @@ def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
     repeated = load_results(out)[0]
     assert "assembly: already done" in log.read_text()
     assert repeated.wall_s["reconstruct"] < 0.5 * repeated.metrics["time_s"]
-    for stage in STAGE_NAMES:
+    for stage in DEFAULT_STAGE_NAMES:
         assert repeated.report["timings_s"][stage] == result.report["timings_s"][stage]
     for key in ("psnr_db", "ssim", "coverage", "stable_rate", "registered_share", "objects"):
         assert repeated.metrics[key] == result.metrics[key], key

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruction.pipeline import STAGE_NAMES
+from reconstruction.pipeline import DEFAULT_STAGE_NAMES
 from reconstruction.synthetic.videos import HARD_VIDEOS, standard_film, write_video
 from registry import SceneRegistry
 from registry.geometry import transform_points, umeyama
@@ -67,7 +67,7 @@ def test_the_scene_is_whole_and_verified(undisturbed):
     scene = registry.load("room", check_hashes=True).scene
     assert len(scene["objects"]) >= 4
     assert {e["child"] for e in scene["graph"]["edges"]} == {o["id"] for o in scene["objects"]}
-    assert set(scene["report"]["timings_s"]) == {*STAGE_NAMES, "publish", "other"}
+    assert set(scene["report"]["timings_s"]) == {*DEFAULT_STAGE_NAMES, "publish", "other"}
     for item in scene["objects"]:
         assert item["mass_kg"] > 0
         assert item["collision"]
@@ -75,10 +75,10 @@ def test_the_scene_is_whole_and_verified(undisturbed):
 
 def test_killed_in_every_stage_and_resumed_gives_the_same_bundle(video, undisturbed, tmp_path):
     line, environment = command(video, tmp_path, "--scene", "room")
-    for number, stage in enumerate(STAGE_NAMES, start=1):
+    for number, stage in enumerate(DEFAULT_STAGE_NAMES, start=1):
         process = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment)
         for text in process.stderr:
-            if text.startswith(f"[{number}/{len(STAGE_NAMES)}] {stage}: ..."):
+            if text.startswith(f"[{number}/{len(DEFAULT_STAGE_NAMES)}] {stage}: ..."):
                 time.sleep(0.3)
                 break
         process.send_signal(signal.SIGKILL)
@@ -93,10 +93,10 @@ def test_killed_in_every_stage_and_resumed_gives_the_same_bundle(video, undistur
 
 def test_a_second_run_costs_nothing_and_a_changed_option_redoes_what_depends_on_it(video, undisturbed):
     done = run(video, undisturbed, "--scene", "room")
-    assert done.stderr.count("already done") == len(STAGE_NAMES), done.stderr
+    assert done.stderr.count("already done") == len(DEFAULT_STAGE_NAMES), done.stderr
     done = run(video, undisturbed, "--scene", "other", "--set", "assembly.settle_s=2.1")
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("already done") == len(STAGE_NAMES) - 1, done.stderr
+    assert done.stderr.count("already done") == len(DEFAULT_STAGE_NAMES) - 1, done.stderr
 
 
 def test_two_runs_of_the_same_scene_at_once(video, undisturbed):

@@ -128,6 +128,8 @@ def publish(home: Path, results: dict, config: PipelineConfig) -> None:
     store = StageStore(home / "work" / digest[:16])
     run = Run(Path("video.mp4"), config, store, input_digest=digest, results=results)
     for number, stage in enumerate(STAGES, start=1):
+        if stage.name not in results:  # on demand
+            continue
         key = f"{number:016x}"
         usage = Usage(wall_s=number * 1.5, cpu_s=number * 2.0, peak_memory_mb=100.0 * number)
         store.save(results[stage.name], number, stage.name, key, {"usage": asdict(usage)})

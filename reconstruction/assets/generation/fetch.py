@@ -14,6 +14,7 @@ from reconstruction.assets.generation.load import load_generator, records_folder
 from reconstruction.assets.generation.pictures import object_pictures
 from reconstruction.assets.generation.records import Records
 from reconstruction.assets.views import SeenPoints
+from reconstruction.avo import SceneViews
 from reconstruction.progress import Progress
 from reconstruction.types import InstanceSet, PosedFrames
 
@@ -28,7 +29,8 @@ class Fetched:
 
 
 def fetch_meshes(
-    found: InstanceSet, posed: PosedFrames, seen: dict[int, SeenPoints], config: AssetsConfig, progress: Progress
+    found: InstanceSet, posed: PosedFrames, seen: dict[int, SeenPoints], config: AssetsConfig, progress: Progress,
+    views: SceneViews | None = None,
 ) -> Fetched | None:  # fmt: skip
     """Have every object generated that stands and was seen well enough to be registered.
 
@@ -38,6 +40,7 @@ def fetch_meshes(
         seen: Their seen points, by id.
         config: Which generator, and what it may cost.
         progress: Is told what will be sent and spent before it is, and what failed.
+        views: Of the objects; without them, keyframes are shown.
 
     Returns:
         None where no generator is asked for.
@@ -52,7 +55,7 @@ def fetch_meshes(
         if not item.attached_hint and len(seen[item.id].points) >= config.min_points
     ]
     count = min(config.generator_views, backend.most_pictures)
-    pictures = object_pictures(found, posed, wanted, max(1, count))
+    pictures = object_pictures(found, posed, wanted, max(1, count), views)
     # Those that were seen most first: they gain most where not all can be paid.
     order = sorted(pictures, key=lambda number: (-len(seen[number].points), number))
     allowed, refused = _within_budget([pictures[number] for number in order], records, backend, config)

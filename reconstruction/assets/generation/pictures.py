@@ -1,28 +1,52 @@
 """Which pictures of an object a generator is shown, and what they are sent as."""
 
 import hashlib
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
 from reconstruction.assets.generation.base import ObjectPictures, Picture
+from reconstruction.avo import SceneViews, View
 from reconstruction.types import Instance, InstanceSet, PosedFrames
 
 _LABEL_BELIEVED = 0.5
+_LEAST_FRONTS = 0.6  # of what a view shows; of the inside of a shell no generator is to be told
 _SPECK_SHARE = 0.1  # of an object's largest part in the picture
 
 
 def object_pictures(
-    found: InstanceSet, posed: PosedFrames, wanted: list[Instance], count: int
+    found: InstanceSet,
+    posed: PosedFrames,
+    wanted: list[Instance],
+    count: int,
+    views: SceneViews | None = None,
 ) -> dict[int, ObjectPictures]:
-    """Return up to `count` pictures of each wanted object that some keyframe shows, by its id."""
-    views = keyframe_pictures(found, posed, count)  # the one place to choose other views
+    """Return up to `count` pictures of each wanted object that anything shows, by its id.
+
+    Args:
+        found: the objects and which pixels show them.
+        posed: the keyframes.
+        wanted: objects.
+        count: of pictures.
+        views: what the stage `views` chose: its pictures, without what hides the object; keyframes stand in for an
+            object without views, and for all where it is None.
+    """
+    chosen = {} if views is None else {item.id: view_pictures(views.of(item.id), count) for item in wanted}
+    frames = {} if all(chosen.get(item.id) for item in wanted) else keyframe_pictures(found, posed, count)
     out = {}
     for item in wanted:
-        if views.get(item.id):
+        pictures = chosen.get(item.id) or frames.get(item.id)
+        if pictures:
             label = item.label if item.label_confidence >= _LABEL_BELIEVED and item.label != "unknown" else ""
-            out[item.id] = ObjectPictures(item.id, label, tuple(views[item.id]))
+            out[item.id] = ObjectPictures(item.id, label, tuple(pictures))
     return out
+
+
+def view_pictures(views: Sequence[View], count: int) -> list[Picture]:
+    """Return pictures of an object from its views, without what hides it; none from where backs are seen most."""
+    shown = [view.cleared() for view in views if view.fronts >= _LEAST_FRONTS]
+    return [Picture(color, _without_specks(mask)) for color, mask in filter(None, shown)][:count]
 
 
 def keyframe_pictures(found: InstanceSet, posed: PosedFrames, count: int) -> dict[int, list[Picture]]:

@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 
 from reconstruction.assets.physics.materials import MaterialChoice, choose_material
+from reconstruction.avo import SceneViews
 from reconstruction.progress import Progress
 from reconstruction.types import Instance, InstanceSet, PosedFrames
 
@@ -15,13 +16,14 @@ class Physicist(Protocol):
     name: str
 
     def choose(
-        self, found: InstanceSet, posed: PosedFrames, *, progress: Progress
+        self, found: InstanceSet, posed: PosedFrames, *, views: SceneViews | None = None, progress: Progress
     ) -> dict[int, MaterialChoice]:
         """Return a choice for each object, by its id, of which anything is known; the table decides on the others.
 
         Args:
             found: The things and which pixels show them.
             posed: The frames they show in.
+            views: Of each thing, where they were made.
             progress: Told of what went wrong.
         """
         ...

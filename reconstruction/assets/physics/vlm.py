@@ -1,11 +1,13 @@
 """Material and mass by a vision-language model: asked object by object, with pictures from up to three sides."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from reconstruction.assets.physics.materials import MATERIALS, MaterialChoice
+from reconstruction.avo import SceneViews, View
 from reconstruction.instances.naming.views import ObjectView, best_views, collage
 from reconstruction.progress import Progress
 from reconstruction.types import Instance, InstanceSet, PosedFrames
@@ -13,6 +15,7 @@ from reconstruction.vlm import VlmClient, VlmError, VlmUnavailable
 
 _HEAVIEST_KG_M3 = 8000.0  # a block of steel that fills the box
 _LIGHTEST_KG_M3 = 2.0  # a wire basket
+_FRAMES_BESIDE = 2  # keyframes beside a drawn view
 _MOST_APART = 100.0  # a range wider than that says nothing
 
 
@@ -38,16 +41,17 @@ class VlmPhysicist:
         self.name = client.name
 
     def choose(
-        self, found: InstanceSet, posed: PosedFrames, *, progress: Progress
+        self, found: InstanceSet, posed: PosedFrames, *, views: SceneViews | None = None, progress: Progress
     ) -> dict[int, MaterialChoice]:
         """See `Physicist.choose`; questions that fail are noted, and asked no more once the endpoint is away."""
-        views = best_views(found, posed)
+        frames = best_views(found, posed)
         said: dict[int, MaterialChoice] = {}
         for number, item in enumerate(found.objects):
-            if not views[item.id]:
+            pictures = shown_pictures(frames[item.id], () if views is None else views.of(item.id))
+            if not pictures:
                 continue
             try:
-                said[item.id] = self._ask(item, views[item.id])
+                said[item.id] = self._ask(item, pictures)
             except VlmUnavailable as error:
                 left = len(found.objects) - number
                 progress.note(f"physics: {error}; the table decides on {left} objects")
@@ -71,6 +75,17 @@ class VlmPhysicist:
             f"{self.name}: {answer.material}, {answer.filling}",
             mass_kg=(answer.lightest_kg, answer.heaviest_kg),
         )
+
+
+def shown_pictures(frames: list[ObjectView], views: Sequence[View]) -> list[ObjectView]:
+    """Return the pictures that the model is shown: the view that shows most, without what hides the thing, first.
+
+    A drawn view shows the whole of a thing, a photograph what it is made of: two of those stay.
+    """
+    drawn = next(filter(None, (view.cleared() for view in views)), None)
+    if drawn is None:
+        return frames
+    return [ObjectView(-1, *drawn), *frames[:_FRAMES_BESIDE]]
 
 
 def _check(answer: Described, item: Instance) -> None:

@@ -1,0 +1,91 @@
+"""`simrecon show SCENE --views`: views of every thing, made from what the work folder holds, as contact sheets."""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from reconstruction.cache import StageStore
+from reconstruction.commands.reporting import make_listener
+from reconstruction.config import PipelineConfig
+from reconstruction.evaluation.stage_results import StageResults
+from reconstruction.pipeline import STAGES, Run
+from reconstruction.report.view_sheet import write_view_sheets
+from registry import SceneBundle
+from registry.errors import EnvironmentMissing, UsageError
+
+
+def show_views(arguments: argparse.Namespace, bundle: SceneBundle, registry_root: Path) -> int:
+    """Choose views of every thing of a scene, or take them from the work folder, and write their sheets."""
+    from reconstruction.avo import AvoConfig
+
+    results = StageResults.find(bundle, registry_root, arguments.work_dir)
+    stage = next(s for s in STAGES if s.name == "views")
+    for name in stage.needs:
+        if results.get(name) is None:
+            raise UsageError(
+                f"{arguments.scene}: views are made from the stage {name}, but {results.missing[name]}. Was it made "
+                f"with --work-dir? Then name that folder here, too."
+            )
+    kept = bundle.scene["report"]["config"].get("avo")
+    config = replace(PipelineConfig(), avo=AvoConfig(**kept) if kept else AvoConfig())
+    for text in arguments.set:
+        if not text.strip().startswith("avo."):
+            raise UsageError(
+                f"--set {text}: `show --views` takes options of avo alone, as in avo.strategy=canonical"
+            )
+        config = config.with_option(text)
+    run = Run(
+        Path(bundle.scene["source"]["file"]),
+        config,
+        StageStore(results.work_dir),
+        listener=make_listener(quiet=arguments.json),
+        results={name: results.get(name) for name in stage.needs},
+        keys={name: results.folders[name].name.rpartition("-")[2] for name in stage.needs},
+        input_digest=bundle.scene["report"]["volatile"]["work"]["input_digest"],
+    )
+    run.complete(stage.name)
+    views = run.results[stage.name]
+    names = {item["id"]: item["label"] for item in bundle.scene["objects"]}
+    folder = arguments.out or Path(f"{arguments.scene}_views")
+    try:
+        files = write_view_sheets(views, names, folder)
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"cannot write {error.filename}: {error.strerror}; choose another --out"
+        ) from error
+    if arguments.json:
+        print(
+            json.dumps(
+                {"strategy": views.strategy, "things": _facts(views), "files": [str(f) for f in files]}
+            )
+        )
+        return 0
+    for target in views.targets:
+        seen = (
+            ", ".join(f"{view.visibility:.0%}" for view in target.views) or "nothing: it is seen from nowhere"
+        )
+        print(f"{target.ids[0]:4d}  {names.get(target.ids[0], ''):<22} visible in its views: {seen}")
+    print(
+        f"contact sheets ({views.strategy}): {', '.join(str(file) for file in files) or 'none, there are no things'}"
+    )
+    return 0
+
+
+def _facts(views: object) -> list[dict]:
+    return [
+        {
+            "id": target.ids[0],
+            "views": [
+                {
+                    "world_from_camera": view.world_from_camera.tolist(),
+                    "visibility": view.visibility,
+                    "gain": view.gain,
+                    "fronts": view.fronts,
+                    "origin": view.origin,
+                }
+                for view in target.views
+            ],
+        }
+        for target in views.targets
+    ]
