@@ -63,6 +63,13 @@ class Index:
             query = f"SELECT {_COLUMNS} FROM scenes ORDER BY scene_id"
             return [_row(values) for values in connection.execute(query)]
 
+    def revisions(self) -> dict[str, str]:
+        """Return {scene id: current revision}, ordered by scene id, and read nothing else."""
+        if not self.exists():
+            return {}
+        with self._reading() as connection:
+            return dict(connection.execute("SELECT scene_id, revision FROM scenes ORDER BY scene_id"))
+
     def row(self, scene_id: str) -> SceneRow | None:
         """Return one row, or None."""
         if not self.exists():

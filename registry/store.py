@@ -105,6 +105,10 @@ class SceneRegistry:
         """Return all scenes, ordered by id. Opens no bundle."""
         return [self._record(row) for row in self._index.rows()]
 
+    def revisions(self) -> dict[str, str]:
+        """Return {scene id: current revision} of all scenes, ordered by id; cheaper than `list`."""
+        return self._index.revisions()
+
     def get(self, scene_id: str) -> SceneRecord:
         """Return one scene.
 

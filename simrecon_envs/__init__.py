@@ -5,6 +5,7 @@ the registry's index:
 
     import gymnasium as gym, simrecon_envs
     env = gym.make("SimRecon/scene0001")         # batched torch tensors, as every ManiSkill environment
+    env = gym.make("SimRecon/scene0001-pick_mug-v0")          # a task of `list_tasks("scene0001")`
     env = simrecon_envs.make_cpu("scene0001")    # unbatched NumPy, for stable-baselines3 and the like
 
 Nothing heavy (torch, sapien, mani_skill) is loaded before the first `make`.
@@ -12,17 +13,31 @@ Nothing heavy (torch, sapien, mani_skill) is loaded before the first `make`.
 
 from typing import TYPE_CHECKING, Any
 
-from simrecon_envs.errors import SceneAssetsMissing
-from simrecon_envs.registration import env_id, make, make_cpu, register_default_scenes, register_scenes
+from simrecon_envs.catalog import TaskEntry, list_scenes, list_tasks
+from simrecon_envs.errors import EnvNotFound, SceneAssetsMissing
+from simrecon_envs.registration import (
+    env_id,
+    make,
+    make_cpu,
+    register_default_scenes,
+    register_scenes,
+    teach_gymnasium,
+)
 
 if TYPE_CHECKING:
+    from simrecon_envs.oracle import Oracle
     from simrecon_envs.rollout import record_rollout, render_scene_picture
     from simrecon_envs.scene_env import SceneEnv
 
 __all__ = [
+    "EnvNotFound",
+    "Oracle",
     "SceneAssetsMissing",
     "SceneEnv",
+    "TaskEntry",
     "env_id",
+    "list_scenes",
+    "list_tasks",
     "make",
     "make_cpu",
     "record_rollout",
@@ -31,6 +46,7 @@ __all__ = [
 ]
 
 _LAZY = {
+    "Oracle": "simrecon_envs.oracle",
     "SceneEnv": "simrecon_envs.scene_env",
     "record_rollout": "simrecon_envs.rollout",
     "render_scene_picture": "simrecon_envs.rollout",
@@ -46,4 +62,5 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_LAZY[name]), name)
 
 
+teach_gymnasium()
 register_default_scenes()

@@ -68,6 +68,19 @@ class Placement:
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + self.position
 
+    def reaches(self, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
+        """Return which world points (n, 3) are within the hand's reach (n,)."""
+        return within_reach(self.position, points, traits)
+
+
+def within_reach(root: np.ndarray, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
+    """Return which points (n, 3) a robot whose root is at (3,) reaches: in a ring, at heights it works at."""
+    away = np.linalg.norm(points[:, :2] - root[:2], axis=1)
+    height = points[:, 2] - root[2]
+    low, high = traits.work_height_m
+    least, _, most = traits.reach_m
+    return (away >= least) & (away <= most) & (height >= low) & (height <= high)
+
 
 def describe_target(bundle: SceneBundle, item: BundleObject, solids: list[ConvexSolid]) -> Target:
     """Measure an object as something to pick up (without regard to any robot)."""
@@ -157,16 +170,27 @@ def place_robot(
     shape: RobotShape,
     traits: RobotTraits,
     config: PlacementConfig,
+    interests: list[np.ndarray] | None = None,
 ) -> Placement:
     """Find where the robot stands free and reaches a target; the earlier targets are preferred.
 
     Where none can be reached, the robot stands free as near as can be, and the placement's note says so.
+
+    Args:
+        solids: Everything in the scene.
+        floor_ids: Which of them are floors.
+        wall_ids: Which of them are walls.
+        targets: What to reach, the best first.
+        shape: The robot at rest.
+        traits: What the robot can do.
+        config: How the place is searched.
+        interests: Places (k, 3) each; of every array one must be within reach, too.
     """
     upright = [s for s in solids if s.owner not in floor_ids]
     clean = [t for t in targets if not t.problem]
     for group in (clean, [t for t in targets if t.problem]):
         for target in group:
-            placement = _place_near(upright, wall_ids, target, shape, traits, config)
+            placement = _place_near(upright, wall_ids, target, shape, traits, config, interests or [])
             if placement is not None:
                 return placement
     return _place_anywhere(upright, targets[0] if targets else None, shape, traits, config)
@@ -179,6 +203,7 @@ def _place_near(
     shape: RobotShape,
     traits: RobotTraits,
     config: PlacementConfig,
+    interests: list[np.ndarray],
 ) -> Placement | None:
     reach = traits.reach_m[2] + 1.2
     lower = np.array([*(target.center[:2] - reach), -0.1])
@@ -193,8 +218,15 @@ def _place_near(
         heights = [0.0]
     else:
         heights = [max(target.bottom_m, 0.0)]
+        for goals in interests:
+            # Between two heights, where one of them is too far up or down from the other.
+            between = (target.bottom_m + float(np.median(goals[:, 2]))) / 2
+            if abs(between - target.bottom_m) > 0.1:
+                heights.append(max(between, 0.0))
     for position, yaw in _ring(target, heights, traits, config, others):
         placement = Placement(position, yaw, 0.0, target, "")
+        if not all(placement.reaches(goals, traits).any() for goals in interests):
+            continue
         if not _sees_over_walls(walls, placement, target):
             continue
         pedestal = _stands(grid, solids, placement, shape, traits, config)
@@ -298,7 +330,9 @@ def _support_top(solids: list[ConvexSolid], disk: np.ndarray, height: float) -> 
 def _buried_share(target: Target, solids: list[ConvexSolid]) -> float:
     """Return which share of the space that a gripper needs around and above the target is filled."""
     lower, upper = target.center - 0.3, np.array([*(target.center[:2] + 0.3), target.top_m + 0.3])
-    grid = OccupancyGrid([s for s in solids if s.owner != target.id], lower, upper, margin_m=0.0)
+    # What it stands on is below it, and no obstacle: the cells' size would make it one for low things.
+    others = [s for s in solids if s.owner != target.id and s.upper[2] > target.bottom_m + 0.01]
+    grid = OccupancyGrid(others, lower, upper, margin_m=0.0)
     heights = np.linspace(target.top_m + 0.03, target.top_m + 0.22, 6)
     disk = _disk(0.05)
     above = np.array([[*(target.center[:2] + p[:2]), z] for z in heights for p in disk])

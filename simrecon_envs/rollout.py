@@ -8,20 +8,21 @@ import gymnasium as gym
 import numpy as np
 
 from registry import UsageError
+from simrecon_envs.oracle import CONTROL_MODE, Oracle
 from simrecon_envs.registration import make
-from simrecon_envs.scripted import PickScript
 
-POLICIES = ("pick", "random", "still")
+POLICIES = ("scripted", "random", "still")
 
 
 def record_rollout(
     scene: str,
     out_mp4: Path | str,
     steps: int = 100,
-    policy: str = "pick",
+    policy: str = "scripted",
     seed: int = 0,
     *,
     robot: str = "panda",
+    task: str = "pick",
     registry: Path | str | None = None,
     size_px: int = 512,
 ) -> dict[str, Any]:
@@ -31,27 +32,29 @@ def record_rollout(
         scene: `scene0001` or `SimRecon/scene0001`.
         out_mp4: The video's file; written whole or not at all.
         steps: Control steps, 1/20 s each; one picture a step.
-        policy: "pick" (a script reaches for the target, grips and lifts it), "random" or "still".
+        policy: "scripted" (the oracle does the task), "random" or "still".
         seed: Of the reset and of the random actions.
         robot: A robot of ManiSkill.
+        task: A kind of task or a task's name.
         registry: The registry's folder; the default registry where None.
         size_px: Width and height of the pictures.
 
     Returns:
         {"steps", "success", "return", "target_id", "instruction", "task_note", "policy"}; `policy` is the one
-        that was used: "random" where there is nothing to pick up.
+        that was used: "random" where there is no task.
 
     Raises:
         EnvironmentMissing: nothing can render here.
     """
     if policy not in POLICIES:
         raise UsageError(f"policy {policy!r} is not one of {', '.join(POLICIES)}")
-    kwargs = {"control_mode": "pd_ee_delta_pose"} if policy == "pick" else {}
+    kwargs = {"control_mode": CONTROL_MODE} if policy == "scripted" else {}
     env = make(
         scene,
         registry=registry,
         render_mode="rgb_array",
         robot_uids=robot,
+        task=task,
         max_episode_steps=steps + 1,
         human_render_camera_configs={"width": size_px, "height": size_px},
         **kwargs,
@@ -68,9 +71,9 @@ def _record(env: gym.Env, out_mp4: Path, steps: int, policy: str, seed: int) -> 
     scene_env = env.unwrapped
     env.reset(seed=seed)
     env.action_space.seed(seed)
-    if policy == "pick" and scene_env.target is None:
+    if policy == "scripted" and scene_env.task_object is None:
         policy = "random"
-    script = PickScript(scene_env) if policy == "pick" else None
+    script = Oracle(scene_env) if policy == "scripted" else None
     still = np.zeros(env.action_space.shape, np.float32)
     out_mp4.parent.mkdir(parents=True, exist_ok=True)
     partial = out_mp4.with_name(f".{out_mp4.stem}-{os.getpid()}.mp4")

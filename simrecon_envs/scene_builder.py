@@ -78,6 +78,11 @@ class SceneBuilder:
         self.bodies = bodies_of(bundle)
         self.movable_ids = {body.root for body in self.bodies if body.dynamic}
         self.objects: dict[int, PlacedObject] = {}
+        self._base_actors: dict[int, list[Actor]] = {}
+
+    def carrying_actors(self, key: int) -> list[Actor]:
+        """Return the actors of an object or base entity; the plane below a floor is a part of it."""
+        return self._base_actors[key] if key in self._base_actors else [self.objects[key].actor]
 
     @property
     def movable_actors(self) -> list[PlacedObject]:
@@ -127,12 +132,18 @@ class SceneBuilder:
                 rotation = (
                     matrix_from_quat(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)) @ rotation
                 )
-            self.objects[body.root].actor.set_pose(
-                Pose.create_from_pq(
-                    torch.as_tensor(position, dtype=torch.float32, device=device),
-                    torch.as_tensor(quat_from_matrix(rotation), dtype=torch.float32, device=device),
-                )
-            )
+            self._set_pose(body.root, position, quat_from_matrix(rotation), device)
+
+    def shift(self, key: int, env_idx: torch.Tensor, moved: np.ndarray, device: torch.device) -> None:
+        """Move an object of the environments `env_idx` (b,) by (b, 3) from where the bundle has it."""
+        body = next(body for body in self.bodies if body.root == key)
+        position = body.world_from_root[None, :3, 3] + moved
+        quat = np.repeat(quat_from_matrix(body.world_from_root[None, :3, :3]), len(position), axis=0)
+        self._set_pose(key, position, quat, device)
+
+    def _set_pose(self, key: int, position: np.ndarray, quat: np.ndarray, device: torch.device) -> None:
+        p, q = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in (position, quat))
+        self.objects[key].actor.set_pose(Pose.create_from_pq(p, q))
 
     def _build_base(self, scene: object) -> None:
         ground = scene.create_actor_builder()
@@ -170,6 +181,7 @@ class SceneBuilder:
             visual = ((str(self.bundle.resolve(base.mesh)), np.eye(4)),)
             body = Body(base.id, spec.name, (spec,), visual, np.eye(4), False)
             actor = _BodyBuilder(scene, body).build(name=spec.name)
+            self._base_actors[base.id] = [actor, drivable[0]] if base.label == "floor" else [actor]
             if base.label == "floor":
                 drivable.append(actor)
         for actor in drivable:

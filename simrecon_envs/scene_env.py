@@ -20,21 +20,19 @@ from registry import BundleError, SceneBundle, SceneNotFound, SceneRegistry, Usa
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import Viewpoint, room_view, workspace_view
 from simrecon_envs.errors import SceneAssetsMissing
+from simrecon_envs.measures import Measures
 from simrecon_envs.occupancy import scene_solids
-from simrecon_envs.pick_task import MAX_DENSE_REWARD, PickTaskConfig, dense_pick_reward, evaluate_pick
-from simrecon_envs.placement import (
-    Placement,
-    PlacementConfig,
-    candidate_targets,
-    choose_targets,
-    place_robot,
-)
+from simrecon_envs.placement import Placement, Target
+from simrecon_envs.planning import Plan, plan_task
 from simrecon_envs.robots import RobotShape, check_robot, rest_qpos, robot_shape, traits_of
 from simrecon_envs.scene_builder import SceneBuilder, scene_extent
+from simrecon_envs.tasks import PickTaskConfig, kind_of
+from simrecon_envs.tasks.facts import SceneFacts
 
 logger = logging.getLogger(__name__)
 
-TASKS = ("pick", "none")
+# What observations with pictures keep of a task's own: touch, and what the robot was told.
+PUBLIC = ("is_grasped", "goal_position", "stage")
 
 
 class SceneEnv(BaseEnv):
@@ -49,10 +47,12 @@ class SceneEnv(BaseEnv):
     | agent/qpos                   | (b, d)       | float32 | joint | rad, m | there is a robot   |
     | agent/qvel                   | (b, d)       | float32 | joint | rad/s, m/s | there is a robot |
     | extra/tcp_pose               | (b, 7)       | float32 | world | m, - | the robot has a hand |
-    | extra/is_grasped             | (b, 1)       | bool    | -     | -    | task "pick"          |
-    | extra/target_pose            | (b, 7)       | float32 | world | m, - | task "pick", state   |
-    | extra/tcp_to_target          | (b, 3)       | float32 | world | m    | task "pick", state   |
-    | extra/target_lift            | (b, 1)       | float32 | world | m    | task "pick", state   |
+    | extra/is_grasped             | (b, 1)       | bool    | -     | -    | tasks that lift      |
+    | extra/goal_position          | (b, 3)       | float32 | world | m    | tasks with a goal    |
+    | extra/target_pose            | (b, 7)       | float32 | world | m, - | tasks of the hand, state |
+    | extra/tcp_to_target          | (b, 3)       | float32 | world | m    | tasks of the hand, state |
+    | extra/target_to_goal         | (b, 3)       | float32 | world | m    | tasks with a goal, state |
+    | extra/target_lift            | (b, 1)       | float32 | world | m    | "pick", state        |
     | extra/object_poses           | (b, 7 n)     | float32 | world | m, - | n > 0 movable objects, state |
 
     `target_pose` is that of the target's box centre (with the object's orientation); `object_poses` are the
@@ -102,8 +102,9 @@ class SceneEnv(BaseEnv):
                 used, with a warning and a text in `revision_note`: the old files are gone with it.
             registry: The registry's folder; the default registry where None.
             strict_revision: Raise instead of using another revision.
-            task: "pick" (pick up the target) or "none" (no success, reward 0).
-            target: "auto" (what is easiest to pick up), an object's id, or a label.
+            task: A task's name (`list_tasks`), a kind of task ("pick", "stack" ...; the easiest of it that the
+                robot reaches), or "none" (no success, reward 0).
+            target: What a kind of task is about: "auto" (the easiest), an object's id, or a label.
             pose_noise: Standard deviation of a random shift of each movable object at reset (m), or of shift
                 and
                 turn (m, rad). A little noise can make objects overlap where they stand close together.
@@ -121,8 +122,6 @@ class SceneEnv(BaseEnv):
             UsageError: no such robot, task or target; the message lists what there is.
             EnvironmentMissing: pictures were asked for, and nothing can render here.
         """
-        if task not in TASKS:
-            raise UsageError(f"scene {scene_id}: task {task!r} is not one of {', '.join(TASKS)}")
         if not isinstance(robot_uids, str):
             raise UsageError(
                 f"scene {scene_id}: robot_uids: expected the name of one robot, got {robot_uids!r}"
@@ -140,8 +139,9 @@ class SceneEnv(BaseEnv):
         self._shape = (
             robot_shape(robot_uids) if robot_uids != "none" else RobotShape(np.zeros((0, 3)), None, False)
         )
-        self._plan(task, target, robot_uids)
-        self.target_initial_height: torch.Tensor | None = None
+        self.facts = SceneFacts(self.bundle, robot_uids, self._solids)
+        self._apply(plan_task(self.facts, task, target, self._shape))
+        self.measures: Measures | None = None
         super().__init__(
             obs_mode=obs_mode,
             render_mode=render_mode,
@@ -152,54 +152,26 @@ class SceneEnv(BaseEnv):
 
     # ---- What the task and the placement are; decided before anything is built.
 
-    def _plan(self, task: str, target: str | int, robot_uid: str) -> None:
-        config = PlacementConfig()
-        traits = traits_of(robot_uid)
-        candidates = candidate_targets(self.bundle, self._solids, set(self.movable_ids), traits, config)
-        self.task, self.task_note = task, ""
-        if task == "pick" and robot_uid == "none":
-            self.task, self.task_note = "none", "there is no robot"
-        elif task == "pick" and not self._shape.has_gripper:
-            self.task, self.task_note = "none", f"robot {robot_uid!r} cannot tell whether it grasps something"
-        elif task == "pick" and not candidates and target == "auto":
-            self.task, self.task_note = "none", "nothing in this scene can move"
-        chosen = choose_targets(candidates, target, self.bundle) if self.task == "pick" else candidates[:1]
-        self.placement: Placement | None = None
-        if robot_uid != "none":
-            base = self.bundle.base
-            self.placement = place_robot(
-                self._solids,
-                {b.id for b in base if b.label == "floor"},
-                {b.id for b in base if b.label == "wall"},
-                chosen,
-                self._shape,
-                traits,
-                config,
-            )
-        self.target = self.placement.target if self.placement is not None and self.task == "pick" else None
-        self.target_id = self.target.id if self.target is not None else None
-        if self.target is not None:
-            problems = [text for text in (self.target.problem, self.placement.note) if text]
-            self.task_note = "; ".join(problems)
-            item = next(o for o in self.bundle.objects if o.id == self.target_id)
-            # The box centre in object space, so that the target's position is the middle of what is to be
-            # gripped.
-            offset = self.target.center - item.world_from_object[:3, 3]
-            self._target_center = torch.as_tensor(
-                item.world_from_object[:3, :3].T @ offset, dtype=torch.float32
-            )
+    def _apply(self, plan: Plan) -> None:
+        self.placement, self.task_note = plan.placement, plan.note
+        self.task = plan.spec.name if plan.spec is not None else "none"
+        self.task_kind = plan.spec.kind if plan.spec is not None else "none"
+        self.task_object = (
+            kind_of(plan.spec)(self, plan.spec, plan.placement) if plan.spec is not None else None
+        )
+        self.target_id = plan.placement.target.id if self.task_object is not None else None
         if self.task_note:
             logger.info("scene %s: task %r: %s", self.scene_id, self.task, self.task_note)
 
     @property
+    def target(self) -> Target | None:
+        """Return what the task is about, measured as it was captured; None without a task."""
+        return self.placement.target if self.task_object is not None else None
+
+    @property
     def instruction(self) -> str:
         """Return the task in words."""
-        if self.target is None:
-            return ""
-        same = [o for o in self.bundle.objects if o.label == self.target.label]
-        name = self.target.label if self.target.label != "unknown" else "object"
-        which = f" {self.target.id}" if len(same) > 1 or self.target.label == "unknown" else ""
-        return f"Pick up the {name}{which}."
+        return self.task_object.instruction if self.task_object is not None else ""
 
     # ---- Building; once per reconfigure.
 
@@ -236,6 +208,7 @@ class SceneEnv(BaseEnv):
             radius = 0.8 * traits_of(self.robot_uids).footprint_radius_m
             pedestal = (top, self.placement.pedestal_m - 0.004, radius)
         self.builder.build(self.scene, pedestal)
+        self.measures = Measures(self)
 
     def _load_lighting(self, options: dict) -> None:
         # The textures come from a video and carry the room's light already: mostly ambient, a little shape.
@@ -260,11 +233,9 @@ class SceneEnv(BaseEnv):
             qpos = torch.as_tensor(rest_qpos(self.agent), dtype=torch.float32, device=self.device)
             self.agent.reset(qpos.repeat(len(env_idx), 1))
             self.agent.robot.set_pose(Pose.create(self._root_pose(), device=self.device))
-        if self.target is not None:
-            if self.target_initial_height is None or len(self.target_initial_height) != self.num_envs:
-                self.target_initial_height = torch.zeros(self.num_envs, device=self.device)
-            # Shifts are horizontal and turns are about +z, so noise leaves the height as it is.
-            self.target_initial_height[env_idx] = float(self.target.center[2])
+        self.measures.forget(env_idx)
+        if self.task_object is not None:
+            self.task_object.start(env_idx, self._batched_episode_rng)
 
     def get_state_dict(self) -> dict:
         """Return the simulation's state; without a robot there is no controller to ask."""
@@ -273,37 +244,29 @@ class SceneEnv(BaseEnv):
     # ---- Task.
 
     @property
-    def target_actor(self) -> Any:
-        """Return the actor of the target (of what it is welded to, if it is)."""
-        return self.builder.objects[self.target_id].actor
-
-    @property
-    def target_pose(self) -> Pose:
-        """Return the pose of the target's box centre, batched."""
-        return self.target_actor.pose * Pose.create_from_pq(p=self._target_center.to(self.device)[None])
-
-    @property
     def target_position(self) -> torch.Tensor:
         """Return where the target's box centre is (num_envs, 3), world, metres."""
-        return self.target_pose.p
+        return self.measures.position(self.target_id)
 
     def evaluate(self) -> dict:
-        """Return whether the target is picked up, and what that depends on."""
-        return evaluate_pick(self, self.task_config) if self.target is not None else {}
+        """Return whether the task is done, and what that depends on."""
+        self.measures.refresh()
+        return self.task_object.evaluate() if self.task_object is not None else {}
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return the reward (num_envs,) in [0, 5]; 0 without a task."""
-        if self.target is None:
+        """Return the reward (num_envs,) between 0 and the task's `max_reward`; 0 without a task."""
+        if self.task_object is None:
             return torch.zeros(self.num_envs, device=self.device)
-        return dense_pick_reward(info, self.task_config)
+        return self.task_object.reward(info)
 
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (num_envs,) in [0, 1]."""
-        return self.compute_dense_reward(obs, action, info) / MAX_DENSE_REWARD
+        reward = self.compute_dense_reward(obs, action, info)
+        return reward / self.task_object.max_reward if self.task_object is not None else reward
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return 1 where the target is picked up, else 0 (num_envs,)."""
-        if self.target is None:
+        """Return 1 where the task is done, else 0 (num_envs,)."""
+        if self.task_object is None:
             return torch.zeros(self.num_envs, device=self.device)
         return info["success"].float()
 
@@ -315,19 +278,14 @@ class SceneEnv(BaseEnv):
     def _get_obs_extra(self, info: dict) -> dict:
         obs = {}
         if hasattr(self.agent, "tcp"):
-            obs["tcp_pose"] = self.agent.tcp.pose.raw_pose
-        if self.target is not None:
-            obs["is_grasped"] = info["is_grasped"][:, None]
+            obs["tcp_pose"] = self.measures.tcp
+        known = self.task_object.observe(info) if self.task_object is not None else {}
         if not self.obs_mode_struct.use_state:
-            return obs
-        if self.target is not None:
-            pose = self.target_pose
-            obs["target_pose"] = pose.raw_pose
-            obs["tcp_to_target"] = pose.p - self.agent.tcp.pose.p
-            obs["target_lift"] = (pose.p[:, 2] - self.target_initial_height)[:, None]
+            # What a robot knows without being told where things are: its own touch, and the goal it was given.
+            return obs | {key: value for key, value in known.items() if key.endswith(PUBLIC)}
+        obs |= known
         if self.movable_ids:
-            poses = [placed.actor.pose.raw_pose for placed in self.builder.movable_actors]
-            obs["object_poses"] = torch.cat(poses, dim=1)
+            obs["object_poses"] = self.measures.poses.flatten(1)
         return obs
 
 

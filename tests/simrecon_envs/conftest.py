@@ -16,6 +16,7 @@ from registry.geometry import GLTF_FROM_WORLD
 ROOM_M = (4.0, 3.0, 2.4)
 TABLE_TOP_M = 0.60
 BOX, CYLINDER, PICTURE, TABLE, BOOK, KNOB = 10, 11, 12, 13, 14, 15
+CRATE, BLOCK, CUBE, SHELF = 20, 21, 22, 23
 
 
 def _glb(mesh: trimesh.Trimesh, path: Path, color: tuple[int, int, int]) -> None:
@@ -217,16 +218,40 @@ def add_furniture(writer: BundleWriter) -> None:
     )
 
 
+def add_things_to_do(writer: BundleWriter) -> None:
+    """Add a table with a cube, a cup, a block to stack on and an open crate, and a low shelf beside it."""
+    writer.add_object(
+        TABLE, "table", [box((1.2, 0.8, 0.4))], _translation(0, 0.9, 0), 1, mass=20, dynamic=False
+    )
+    shelf = [box((0.4, 0.4, 0.3))]
+    writer.add_object(SHELF, "shelf", shelf, _translation(0.85, 0.6, 0), 1, mass=9, dynamic=False)
+    top = 0.4
+    writer.add_object(CUBE, "cube", [box((0.05, 0.05, 0.06))], _translation(0.30, 0.62, top), TABLE)
+    cup = trimesh.creation.cylinder(0.025, 0.08, sections=24).apply_translation([0, 0, 0.04])
+    writer.add_object(CYLINDER, "cup", [cup], _translation(0.10, 0.70, top), TABLE, color=(50, 90, 170))
+    writer.add_object(
+        BLOCK, "block", [box((0.14, 0.14, 0.05))], _translation(0.45, 0.90, top), TABLE, mass=0.8
+    )
+    wide, high, thick = 0.20, 0.07, 0.01
+    side = (wide - thick) / 2
+    walls = [box((thick, wide, high), at=(s * side, 0)) for s in (-1, 1)]
+    walls += [box((wide, thick, high), at=(0, s * side)) for s in (-1, 1)]
+    crate = [box((wide, wide, thick)), *walls]
+    writer.add_object(CRATE, "crate", crate, _translation(0.10, 0.95, top), TABLE, mass=0.7)
+
+
 @pytest.fixture(scope="session")
 def scenes_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a registry with `room` (all of the above) and `bare` (room and picture: nothing can move)."""
+    """Return a registry with `room` (furniture), `bare` (nothing can move) and `things` (for every kind of task)."""
     root = tmp_path_factory.mktemp("registry")
     registry = SceneRegistry(root, create=True)
-    for scene_id in ("room", "bare"):
+    for scene_id in ("room", "bare", "things"):
         writer = BundleWriter(tmp_path_factory.mktemp(scene_id))
         add_room(writer)
         if scene_id == "room":
             add_furniture(writer)
+        elif scene_id == "things":
+            add_things_to_do(writer)
         else:
             writer.add_object(
                 PICTURE,

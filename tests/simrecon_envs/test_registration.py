@@ -12,14 +12,14 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import simrecon_envs
-from registry import SceneNotFound, SceneRegistry
+from registry import SceneNotFound, SceneRegistry, UsageError
 
 _IMPORT = """
 import sys, time, gymnasium
 start = time.process_time()
 import simrecon_envs
 seconds = time.process_time() - start
-ours = [name for name in gymnasium.registry if name.startswith("SimRecon/")]
+ours = [name for name in gymnasium.registry if name.startswith("SimRecon/") and "-v" not in name]
 unwanted = ("torch", "sapien", "mani_skill", "numba", "pandas", "scipy", "cv2", "reconstruction")
 heavy = [name for name in unwanted if name in sys.modules]
 print(len(ours), seconds, heavy)
@@ -39,18 +39,18 @@ def _import_with(home: Path) -> tuple[int, float, str, str]:
     return int(count), float(seconds), heavy.strip(), run.stderr
 
 
-def test_import_of_a_thousand_scenes_is_fast_and_light(tmp_path: Path) -> None:
+def test_import_of_ten_thousand_scenes_is_fast_and_light(tmp_path: Path) -> None:
     root = tmp_path / "registry"
     SceneRegistry(root, create=True)
     with sqlite3.connect(root / "index.sqlite") as connection:
         columns = "scene_id, revision, schema_version, created_utc, source_file, source_sha256, n_objects"
         rows = [
-            (f"scene{n:04d}", "0" * 16, "simrecon.scene/1", "2026-01-01T00:00:00+00:00", "v.mp4", "0" * 64, 3)
-            for n in range(1000)
+            (f"scene{n:05d}", "0" * 16, "simrecon.scene/1", "2026-01-01T00:00:00+00:00", "v.mp4", "0" * 64, 3)
+            for n in range(10_000)
         ]
         connection.executemany(f"INSERT INTO scenes ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
     count, seconds, heavy, _ = _import_with(tmp_path)
-    assert count == 1000
+    assert count == 10_000
     assert heavy == "[]"
     assert seconds < 0.3
 
@@ -101,11 +101,51 @@ def test_spec_round_trips_through_json(scenes_root: Path) -> None:
 
 
 def test_unknown_scene_lists_what_there_is_and_the_nearest(scenes_root: Path) -> None:
-    with pytest.raises(SceneNotFound, match=r"Did you mean SimRecon/room\?.*SimRecon/bare, SimRecon/room"):
+    expected = r"Did you mean SimRecon/room\?.*SimRecon/bare, SimRecon/room, SimRecon/things"
+    with pytest.raises(SceneNotFound, match=expected):
         simrecon_envs.make("rooms", registry=scenes_root)
     simrecon_envs.register_scenes(scenes_root)
-    with pytest.raises(gym.error.NameNotFound, match="Did you mean: `room`"):
-        gym.make("SimRecon/rooms")
+    for make in (gym.make, gym.spec, gym.make_vec):
+        with pytest.raises(gym.error.NameNotFound, match=expected):
+            make("SimRecon/rooms")
+
+
+def test_ids_outside_our_namespace_are_gymnasiums(scenes_root: Path) -> None:
+    assert gym.spec("CartPole-v1").id == "CartPole-v1"
+    with pytest.raises(gym.error.NameNotFound, match="CartPoleX") as caught:
+        gym.make("CartPoleX-v1")
+    assert "SimRecon" not in str(caught.value)
+
+
+def test_task_ids_are_found_without_being_listed(scenes_root: Path) -> None:
+    simrecon_envs.register_scenes(scenes_root)
+    spec = gym.spec("SimRecon/room-pick_box-v0")
+    assert spec.kwargs["task"] == "pick_box"
+    assert EnvSpec.from_json(spec.to_json()) == spec
+    assert gym.spec("SimRecon/room-reach_box-v0").max_episode_steps == 100
+    assert "SimRecon/room-pick_box-v0" not in gym.registry
+    env = gym.make(spec)
+    assert env.unwrapped.instruction == "Pick up the box."
+    env.close()
+    with pytest.raises(SceneNotFound, match="version of tasks is 0"):
+        gym.make("SimRecon/room-pick_box-v3")
+    with pytest.raises(UsageError, match=r"no task 'pick_bix'. Did you mean 'pick_box'.*Kinds: reach, pick"):
+        gym.make("SimRecon/room-pick_bix-v0")
+
+
+def test_scenes_are_filtered(scenes_root: Path) -> None:
+    def found(*args: object, **kwargs: object) -> list[str]:
+        return [r.scene_id for r in simrecon_envs.list_scenes(*args, registry=scenes_root, **kwargs)]
+
+    assert found() == ["bare", "room", "things"]
+    assert found("?oo*") == ["room"]
+    assert found(min_movable=1) == ["room", "things"]
+    assert found(max_objects=1) == ["bare"]
+    assert found(labels=["Crate", "cup"]) == ["things"]
+    assert found(status="unchecked") == found()
+    assert found(where=lambda record: record.n_objects == 6) == ["room", "things"]
+    with pytest.raises(UsageError, match="stable, unstable"):
+        found(status="good")
 
 
 def test_unknown_scene_of_an_empty_registry_says_how_to_make_one(tmp_path: Path) -> None:

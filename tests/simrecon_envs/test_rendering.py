@@ -68,7 +68,7 @@ def test_rollout_video_has_every_step_and_the_pick_succeeds(scenes_root: Path, t
     out = tmp_path / "rollout.mp4"
     result = record_rollout("room", out, steps=80, registry=scenes_root, size_px=128)
     assert result["success"]
-    assert result["policy"] == "pick"
+    assert result["policy"] == "scripted"
     with av.open(str(out)) as video:
         frames = [f.to_ndarray(format="rgb24") for f in video.decode(video=0)]
     assert len(frames) == 81

@@ -1,0 +1,244 @@
+"""Scripts that do the tasks: for demonstrations, and to show that a task can be done in a scene.
+
+A task says in its `script` what the hand does, in the words of `Hand`; `Oracle` turns that into actions.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from registry import UsageError
+
+CONTROL_MODE = "pd_ee_delta_pose"
+_HOVER_M = 0.09
+_GRIP_DEPTH_M = 0.032  # how far the fingertips go below the target's top
+_TIP_CLEARANCE_M = 0.012  # how far they stay above what it stands on
+_MAX_SHARE = 0.35  # of the largest step that the controller takes
+_POSITION_STEP_M, _ROTATION_STEP_RAD = 0.1, 0.1  # what an action of 1 means to pd_ee_delta_pose
+_CLOSE_STEPS, _OPEN_STEPS = 8, 6
+_PATIENCE_STEPS = 60
+_LOWER_PATIENCE_STEPS = 35
+_TURN_RAD = 0.06
+_PUSH_SHARE = 0.12
+_FINGER_M = 0.022  # half the thickness of closed fingers, along the push
+_TORSO, _FORWARD, _TURN = 9, 10, 11  # places in Fetch's action
+
+Goal = Callable[[], np.ndarray]
+
+
+class Oracle:
+    """The scripted policy of an environment's task. Make a new one after every reset.
+
+    For one environment on the CPU whose robot has ManiSkill's control mode `pd_ee_delta_pose`.
+    """
+
+    def __init__(self, env: Any) -> None:
+        """Start the script; `env` is a `SceneEnv` or a wrapper of one.
+
+        Raises:
+            UsageError: there is no task, or the environment is of another control mode.
+        """
+        scene = env.unwrapped
+        if scene.task_object is None:
+            raise UsageError(
+                f"scene {scene.scene_id}: there is no task to do: {scene.task_note or 'task none'}"
+            )
+        if scene.num_envs != 1 or scene.control_mode != CONTROL_MODE:
+            raise UsageError(
+                f"the oracle needs num_envs=1 and control_mode={CONTROL_MODE!r}, this environment has "
+                f"{scene.num_envs} and {scene.control_mode!r}"
+            )
+        self.hand = Hand(scene)
+        self._actions = scene.task_object.script(self.hand)
+
+    def action(self) -> np.ndarray:
+        """Return the next action (a,) in [-1, 1]; the robot stays where it is when the script has ended."""
+        action = next(self._actions, None)
+        return self.hand.step(self.hand.tip(), 0.0, base=False) if action is None else action
+
+    def actions(self) -> Iterator[np.ndarray]:
+        """Yield the actions until the script ends."""
+        yield from self._actions
+
+
+class Hand:
+    """What a script can do. Every movement is a generator of actions."""
+
+    def __init__(self, env: Any) -> None:
+        """Start with the hand open where it is."""
+        self._env = env
+        self._open = True
+        self.phase = "start"
+        # Fetch: arm (6), gripper (1), head pan, head tilt, torso lift, then the base forward and turning.
+        self._fetch = "torso_lift_joint" in getattr(env.agent, "body_joint_names", ())
+
+    # ---- What it sees.
+
+    def tip(self) -> np.ndarray:
+        """Return the point between the fingers (3,), world."""
+        return self._env.measures.tcp[0, :3].cpu().numpy().astype(np.float64)
+
+    def place(self, key: int) -> np.ndarray:
+        """Return a thing's box centre (3,), world."""
+        return self._env.measures.position(key)[0].cpu().numpy().astype(np.float64)
+
+    # ---- What it does.
+
+    def go(self, goal: Goal, *, within_m: float = 0.012, yaw: float | None = None, base: bool = True,
+           patience: int = _PATIENCE_STEPS, share: float = _MAX_SHARE) -> Iterator[np.ndarray]:  # fmt: skip
+        """Move the fingertips to a point, turned to close along `yaw`; go on after `patience` steps anyway."""
+        for _ in range(patience):
+            turn = 0.0 if yaw is None else self._turn(yaw)
+            if np.linalg.norm(goal() - self.tip()) < within_m and abs(turn) < _TURN_RAD:
+                return
+            yield self.step(goal(), turn, base=base, share=share)
+
+    def grip(self, key: int) -> Iterator[np.ndarray]:
+        """Reach over a thing, go down around its narrow side and close the fingers."""
+        facts = self._env.facts
+        half = facts.height_m(key) / 2
+        yaw = facts.targets[key].grip_yaw_rad + float(self._env.measures.yaw(key)[0])
+        self._open, self.phase = True, "reach"
+        if self.tip()[2] < self.place(key)[2] + half + _HOVER_M - 0.02:
+            above = np.array([*self.tip()[:2], self.place(key)[2] + half + _HOVER_M])
+            yield from self.go(lambda: above, within_m=0.02, base=False, patience=25)
+        yield from self.go(lambda: self.place(key) + _up(half + _HOVER_M), yaw=yaw)
+        self.phase = "lower"
+        depth = max(half - _GRIP_DEPTH_M, _TIP_CLEARANCE_M - half)
+        # A short gripper meets the target's top with its palm first: then that is deep enough.
+        yield from self.go(
+            lambda: self.place(key) + _up(depth), within_m=0.008, yaw=yaw, patience=_LOWER_PATIENCE_STEPS
+        )
+        self.phase, self._open = "grip", False
+        yield from self.wait(_CLOSE_STEPS + 1)
+
+    def lift(self, height_m: float) -> Iterator[np.ndarray]:
+        """Raise the hand straight up."""
+        self.phase = "lift"
+        goal = self.tip() + _up(height_m)
+        yield from self.go(lambda: goal, base=False, within_m=0.02, patience=30)
+
+    def carry(self, key: int, goal: Goal, over_m: float, above_m: float) -> Iterator[np.ndarray]:
+        """Bring what is held over a goal for its centre, then down to just above it."""
+        self.phase = "carry"
+
+        def tip_for(height_m: float) -> Goal:
+            return lambda: goal() + _up(height_m) + self.tip() - self.place(key)
+
+        up = max(goal()[2] + over_m - self.place(key)[2], 0.0)
+        if up > 0.02:
+            yield from self.lift(up)
+        yield from self.go(tip_for(over_m), within_m=0.015, base=True, share=0.25)
+        self.phase = "lower"
+        yield from self.go(tip_for(above_m / 2), within_m=0.008, base=False, share=0.12, patience=50)
+        yield from self.wait(4)
+
+    def let_go(self) -> Iterator[np.ndarray]:
+        """Open the fingers and raise the hand."""
+        self._open, self.phase = True, "let go"
+        yield from self.wait(_OPEN_STEPS)
+        yield from self.lift(0.13)
+
+    def push(self, key: int, goal: Goal, within_m: float) -> Iterator[np.ndarray]:
+        """Push a thing along its support until its centre is at the goal, with closed fingers from behind."""
+        self._open, self.phase = False, "behind"
+        facts = self._env.facts
+        half, radius = facts.height_m(key) / 2, facts.radius_m(key)
+        way = goal() - self.place(key)
+        along = np.array([*way[:2], 0.0]) / max(np.linalg.norm(way[:2]), 1e-6)
+        low = min(-0.2 * half, half - 0.02) if half > 0.02 else 0.0
+        low = max(low, _TIP_CLEARANCE_M + 0.006 - half)
+        yaw = float(np.arctan2(along[0], -along[1]))  # the fingers side by side, across the way
+        behind = self.place(key) - along * (radius + _FINGER_M + 0.03)
+        yield from self.go(lambda: behind + _up(half + _HOVER_M), yaw=yaw)
+        yield from self.go(lambda: behind + _up(low), yaw=yaw, within_m=0.01, patience=40)
+        self.phase = "push"
+        for _ in range(140):
+            left = goal() - self.place(key)
+            left[2] = 0.0
+            if np.linalg.norm(left) < within_m or left @ along < 0:
+                break
+            way = left / np.linalg.norm(left)
+            aside = self.tip() - self.place(key)
+            across = aside - (aside @ way) * way
+            ahead = self.tip() + 0.04 * way - [across[0], across[1], 0]
+            ahead[2] = self.place(key)[2] + low
+            yield self.step(ahead, self._turn(yaw), base=False, share=_PUSH_SHARE)
+        back = self.tip() - 0.03 * along
+        yield from self.go(lambda: back, base=False, patience=8)
+
+    def wait(self, steps: int) -> Iterator[np.ndarray]:
+        """Keep the hand where it is."""
+        still = self.tip()
+        for _ in range(steps):
+            yield self.step(still, 0.0, base=False)
+
+    def drive(self, base: Callable, goal: Goal, within_m: float) -> Iterator[np.ndarray]:
+        """Drive the base to a point (2,) of the floor, turning first."""
+        self.phase = "drive"
+        for _ in range(160):
+            _, ahead, left = self._on_floor(base, goal())
+            if np.linalg.norm(left) < within_m:
+                return
+            off = _signed_angle(ahead, left)
+            speed = np.clip(1.5 * np.linalg.norm(left), 0, 0.5) * max(np.cos(off), 0) ** 4
+            yield self._wheels(speed, np.clip(1.0 * off, -0.5, 0.5))
+
+    def face(self, base: Callable, goal: Goal) -> Iterator[np.ndarray]:
+        """Turn the base towards a point (2,) of the floor."""
+        for _ in range(80):
+            _, ahead, left = self._on_floor(base, goal())
+            off = _signed_angle(ahead, left)
+            if abs(off) < 0.1:
+                return
+            yield self._wheels(0.0, np.clip(1.0 * off, -0.5, 0.5))
+
+    # ---- Actions.
+
+    def step(
+        self, goal: np.ndarray, turn: float, *, base: bool = True, share: float = _MAX_SHARE
+    ) -> np.ndarray:
+        """Return the action (a,) that brings the tips nearer to a point (3,) and turns the hand by up to `turn`."""
+        tip = self.tip()
+        move = np.clip((goal - tip) / _POSITION_STEP_M, -share, share)
+        action = np.zeros(self._env.single_action_space.shape, np.float32)
+        action[:3] = self._to_root(move)
+        # ManiSkill scales rotations by its `rot_lower`, which is negative: +1 means -0.1 rad.
+        action[5] = -np.clip(turn / _ROTATION_STEP_RAD, -1, 1)
+        if self._fetch:
+            # The arm alone does not get far up or down, nor forward with the hand turned down.
+            action[_TORSO] = np.clip((goal - tip)[2] / _POSITION_STEP_M, -share, share)
+            if base:
+                action[_FORWARD] = np.clip(2.0 * self._to_root(goal - tip)[0], -0.15, 0.15)
+        action[6] = 1.0 if self._open else -1.0
+        return action
+
+    def _wheels(self, forward: float, turn: float) -> np.ndarray:
+        action = np.zeros(self._env.single_action_space.shape, np.float32)
+        action[6], action[_FORWARD], action[_TURN] = 1.0, forward, turn
+        return action
+
+    def _on_floor(self, base: Callable, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        here, ahead = (x[0].cpu().numpy().astype(np.float64) for x in base())
+        return here, ahead, goal[:2] - here
+
+    def _turn(self, yaw: float) -> float:
+        """Return by which angle about +z the gripper must turn to close along a direction."""
+        closing = self._env.agent.tcp.pose.to_transformation_matrix()[0, :2, 1].cpu().numpy()
+        error = yaw - np.arctan2(closing[1], closing[0])
+        # A gripper that is turned by half a turn closes the same way.
+        return float((error + np.pi / 2) % np.pi - np.pi / 2)
+
+    def _to_root(self, vector: np.ndarray) -> np.ndarray:
+        yaw = self._env.placement.yaw_rad
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.array([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1], vector[2]])
+
+
+def _up(height_m: float) -> np.ndarray:
+    return np.array([0.0, 0.0, height_m])
+
+
+def _signed_angle(first: np.ndarray, second: np.ndarray) -> float:
+    return float(np.arctan2(first[0] * second[1] - first[1] * second[0], first @ second))

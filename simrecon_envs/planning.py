@@ -1,0 +1,100 @@
+"""From what was asked for to a task and a place for the robot: SceneFacts + names -> Plan. Nothing is built yet."""
+
+from dataclasses import dataclass
+
+from registry import UsageError
+from simrecon_envs.placement import Placement, PlacementConfig, choose_targets, place_robot
+from simrecon_envs.robots import RobotShape
+from simrecon_envs.tasks import KINDS, kind_of, list_specs, parse_task, unknown_task
+from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.spec import TaskSpec
+
+_TRIES = 8  # tasks of a kind that are tried before one out of reach is taken
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the robot shall do, and where it stands."""
+
+    spec: TaskSpec | None
+    placement: Placement | None  # None without a robot
+    note: str  # why the task is not what was asked for, or hard
+
+
+def plan_task(facts: SceneFacts, task: str, target: str | int, shape: RobotShape) -> Plan:
+    """Choose the task and the robot's place.
+
+    Args:
+        facts: The scene, for the robot; its name is "none" where there is no robot.
+        task: A kind (the easiest of it is taken), a task's name, or "none".
+        target: "auto", or the id or label of what a kind shall be about.
+        shape: The robot's; without points where there is no robot.
+
+    Raises:
+        UsageError: there is no such task or target; lists what there is.
+    """
+    if facts.robot == "none":
+        return Plan(None, None, "there is no robot" if task != "none" else "")
+    if task == "none":
+        return Plan(None, _stand(facts, facts.ranked[:1], shape, []), "")
+    if task != "navigate" and not task.startswith("navigate_") and not shape.has_gripper:
+        parse_task(facts, task) if task not in KINDS else None
+        note = f"robot {facts.robot!r} cannot tell whether it grasps something"
+        return Plan(None, _stand(facts, facts.ranked[:1], shape, []), note)
+    if task not in KINDS:
+        return _place(facts, parse_task(facts, task), shape)
+    if task == "pick" and target == "auto" and not facts.ranked:
+        return Plan(None, _stand(facts, [], shape, []), "nothing in this scene can move")
+    specs = _of_kind(facts, task, target)
+    if not specs:
+        raise UsageError(unknown_task(facts, task))
+    plans = []
+    for spec in sorted(specs, key=lambda spec: not spec.feasible)[:_TRIES]:
+        plans.append(_place(facts, spec, shape))
+        if not plans[-1].note:
+            return plans[-1]
+    return min(plans, key=lambda plan: len(plan.spec.problems) + bool(plan.placement.note))
+
+
+def _of_kind(facts: SceneFacts, kind: str, target: str | int) -> list[TaskSpec]:
+    specs = list_specs(facts, kinds=(kind,), hard=True)
+    if target == "auto" or not KINDS[kind].subjects:
+        return specs
+    if kind == "navigate":
+        wanted = {
+            facts.names.get(str(target)),
+            *[o.id for o in facts.bundle.objects if str(o.id) == str(target)],
+        }
+        return [spec for spec in specs if spec.subject in wanted]
+    ids = [found.id for found in choose_targets(facts.ranked, target, facts.bundle)]
+    return sorted((s for s in specs if s.subject in ids), key=lambda s: ids.index(s.subject))
+
+
+def _place(facts: SceneFacts, spec: TaskSpec, shape: RobotShape) -> Plan:
+    """Find where the robot stands for a task."""
+    if any(stage.kind == "navigate" for stage in spec.stages):
+        raise UsageError(f"task {spec.name!r}: navigate cannot be a stage; make an environment of it alone")
+    kind = kind_of(spec)
+    if kind.mobile_only:
+        if not facts.traits.mobile:
+            raise UsageError(
+                f"task {spec.name!r}: robot {facts.robot!r} does not drive; use robot_uids='fetch'"
+            )
+        placement = kind.plan(facts, spec)
+    else:
+        subject = spec.subject if not spec.stages else spec.stages[0].subject
+        interests = kind.interests(facts, spec)
+        if subject is None:  # about several things: the first of them leads
+            targets = [facts.targets[key] for key in kind.things(facts)[:1]]
+        else:
+            targets = [facts.targets[subject]] if subject in facts.targets else []
+        if not targets:
+            raise UsageError(f"scene {facts.scene_id}: task {spec.name!r}: {'; '.join(spec.problems)}")
+        placement = _stand(facts, targets, shape, interests)
+    problems = list(dict.fromkeys([*spec.problems, *([placement.note] if placement.note else [])]))
+    return Plan(spec, placement, "; ".join(problems))
+
+
+def _stand(facts: SceneFacts, targets: list, shape: RobotShape, interests: list) -> Placement:
+    arguments = (facts.floor_ids, facts.wall_ids, targets, shape, facts.traits, PlacementConfig())
+    return place_robot(facts.solids, *arguments, interests=[goals for goals in interests if len(goals)])

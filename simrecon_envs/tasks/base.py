@@ -1,0 +1,110 @@
+"""What a kind of task is. A kind is one class in one module; `simrecon_envs.tasks.KINDS` lists them."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+
+from simrecon_envs.placement import Placement
+from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.spec import TaskSpec
+
+if TYPE_CHECKING:
+    from simrecon_envs.oracle import Hand
+    from simrecon_envs.scene_env import SceneEnv
+
+Info = dict[str, torch.Tensor]
+
+
+class Task:
+    """A task in an environment: when it is done, the reward on the way, and how a script does it.
+
+    Every tensor has the number of parallel environments first. Distances are in metres, world space.
+    """
+
+    kind: ClassVar[str]
+    subjects: ClassVar[bool] = True  # names an object; "rearrange" is about the scene
+    joint: ClassVar[str] = ""  # between subject and place in the task's name
+    max_reward: ClassVar[float]
+    mobile_only: ClassVar[bool] = False
+    lasting: ClassVar[bool] = True  # a stage of a composite must still be done at its end
+
+    @classmethod
+    def options(cls, facts: SceneFacts) -> list[tuple[int | None, int | None]]:
+        """Return the (subject, place) that the scene's graph suggests, the easiest first."""
+        return [(target.id, None) for target in facts.ranked]
+
+    @classmethod
+    def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
+        """Return why a task can hardly be done, from what the bundle says."""
+        return subject_problems(facts, subject)
+
+    @classmethod
+    def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
+        """Return places (k, 3): of each array the robot must reach at least one, besides the subject."""
+        return []
+
+    def __init__(self, env: "SceneEnv", spec: TaskSpec, placement: Placement) -> None:
+        """Plan for a robot at a place; nothing is built yet, so only the scene's facts may be read."""
+        self.env, self.spec, self.placement = env, spec, placement
+        self.facts: SceneFacts = env.facts
+
+    @property
+    def subject(self) -> int:
+        """Return the id of what the task is about."""
+        assert self.spec.subject is not None
+        return self.spec.subject
+
+    @classmethod
+    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
+        """Return the instruction."""
+        raise NotImplementedError
+
+    @property
+    def instruction(self) -> str:
+        """Return the task in words, as it is in this environment."""
+        return self.words(self.facts, self.spec)
+
+    def start(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Prepare an episode in the environments `env_idx`; things stand where the bundle has them."""
+
+    def evaluate(self) -> Info:
+        """Return "success" (b,) and what it depends on."""
+        raise NotImplementedError
+
+    def reward(self, info: Info) -> torch.Tensor:
+        """Return the dense reward (b,) between 0 and `max_reward`, which success gives."""
+        raise NotImplementedError
+
+    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+        """Return what an agent may know of the task, each (b, k)."""
+        return {}
+
+    def script(self, hand: "Hand") -> Iterator[np.ndarray]:
+        """Yield actions that do the task, one a control step."""
+        raise NotImplementedError
+
+    def _zeros(self, width: int) -> torch.Tensor:
+        return torch.zeros((self.env.num_envs, width), device=self.env.device)
+
+
+def subject_problems(facts: SceneFacts, subject: int | None) -> list[str]:
+    """Return why the robot can hardly lift an object."""
+    if subject in facts.targets:
+        target = facts.targets[subject]
+        return [target.problem] if target.problem else []
+    return [
+        f"{facts.thing(subject)} cannot move" if subject in facts.labels else f"there is no object {subject}"
+    ]
+
+
+def draw(rng: Any, env_idx: torch.Tensor, width: int) -> np.ndarray:
+    """Return uniform draws (len(env_idx), width) of ManiSkill's batched generator, by seed."""
+    index = env_idx.cpu().numpy()
+    return np.asarray(rng[index].uniform(size=width), np.float64).reshape(len(index), width)
+
+
+def nearness(distance: torch.Tensor) -> torch.Tensor:
+    """Return 1 at distance 0 (m), falling to 0; half at 11 cm, as in ManiSkill's tasks."""
+    return 1 - torch.tanh(5.0 * distance)

@@ -1,0 +1,116 @@
+"""What tasks need to know of a scene: names, sizes, who carries whom, where there is room. NumPy only."""
+
+import functools
+import re
+
+import numpy as np
+
+from registry import SceneBundle
+from registry.welding import moving_ids, welded_to
+from simrecon_envs.occupancy import ConvexSolid, scene_solids
+from simrecon_envs.placement import PlacementConfig, Target, candidate_targets
+from simrecon_envs.robots import RobotTraits, traits_of
+from simrecon_envs.surfaces import Container, find_container, free_spots
+
+
+class SceneFacts:
+    """A bundle as tasks see it, for one robot; what is expensive is measured when it is asked for."""
+
+    def __init__(self, bundle: SceneBundle, robot: str, solids: list[ConvexSolid] | None = None) -> None:
+        """Read the graph and measure the things that can move."""
+        self.bundle = bundle
+        self.scene_id: str = bundle.scene["id"]
+        self.solids = scene_solids(bundle) if solids is None else solids
+        self.robot = robot
+        self.traits: RobotTraits = traits_of(robot)
+        self.movable = sorted(moving_ids(bundle) - welded_to(bundle).keys())
+        self.parent = {edge.child: edge.parent for edge in bundle.edges}
+        self.relation = {edge.child: edge.relation for edge in bundle.edges}
+        self.labels = {item.id: item.label for item in (*bundle.base, *bundle.objects)}
+        self.base_ids = {item.id for item in bundle.base}
+        self.floor_ids = {item.id for item in bundle.base if item.label == "floor"}
+        self.wall_ids = {item.id for item in bundle.base if item.label == "wall"}
+        self.mass_kg = {item.id: item.mass_kg for item in bundle.objects}
+        self.ranked: list[Target] = candidate_targets(
+            bundle, self.solids, set(self.movable), self.traits, PlacementConfig()
+        )
+        self.targets = {target.id: target for target in self.ranked}
+        self.names = _names(bundle)
+        self._containers: dict[int, Container | None] = {}
+        self._spots: dict[tuple, np.ndarray] = {}
+
+    @functools.cached_property
+    def carriers(self) -> list[int]:
+        """Return the ids that something stands on or that are wide and level enough to stand on."""
+        carrying = {p for c, p in self.parent.items() if self.relation[c] == "supported_by"}
+        wide = {t.id for t in self.ranked if t.grip_width_m >= 0.08}
+        wide |= {o.id for o in self.bundle.objects if not self.hangs(o.id) and min(o.scale[:2]) >= 0.15}
+        return sorted(key for key in carrying | wide if key not in self.wall_ids)
+
+    def container(self, key: int) -> Container | None:
+        """Return the inside of an object, None where it has none or things are stacked in it."""
+        if key not in self._containers:
+            self._containers[key] = find_container(self.solids, key)
+        return self._containers[key]
+
+    @functools.cached_property
+    def containers(self) -> list[int]:
+        """Return the ids of the objects that hold things."""
+        return [o.id for o in self.bundle.objects if not self.hangs(o.id) and self.container(o.id)]
+
+    def hangs(self, key: int) -> bool:
+        """Tell whether an object is fixed to another."""
+        return self.relation.get(key) == "attached_to"
+
+    def radius_m(self, key: int) -> float:
+        """Return the radius of the circle around a movable object's box, seen from above."""
+        cloud = np.concatenate([s.vertices[:, :2] for s in self.solids if s.owner == key])
+        return float(np.linalg.norm(cloud - self.targets[key].center[:2], axis=1).max())
+
+    def height_m(self, key: int) -> float:
+        """Return how high a movable object is."""
+        return self.targets[key].top_m - self.targets[key].bottom_m
+
+    def spots(self, support: int, subject: int) -> np.ndarray:
+        """Return where on a support the subject can stand (k, 3), the roomiest first."""
+        key = (support, subject)
+        if key not in self._spots:
+            around = self.targets[subject].center[:2] if support in self.base_ids else None
+            radius = 0.9 * self.radius_m(subject)
+            self._spots[key] = free_spots(
+                self.solids, support, radius, frozenset({subject, *self.above(subject)}), around
+            )
+        return self._spots[key]
+
+    def above(self, key: int) -> list[int]:
+        """Return everything that stands on or hangs from an object, directly or not."""
+        out = [child for child, parent in self.parent.items() if parent == key]
+        return out + [far for child in out for far in self.above(child)]
+
+    def thing(self, key: int) -> str:
+        """Return an object's name in a sentence: "mug", "object 7"."""
+        label = self.labels[key]
+        same = [other for other in self.labels.values() if other == label]
+        if label == "unknown":
+            return f"object {key}"
+        return label if len(same) == 1 or key in self.floor_ids else f"{label} {key}"
+
+
+def _names(bundle: SceneBundle) -> dict[str, int]:
+    """Return {name: id}: `mug`, `box_7` where there are several, `object_7` for any; floors are `floor`."""
+    names: dict[str, int] = {}
+    items = [*(b for b in bundle.base if b.label == "floor"), *bundle.objects]
+    slugs = [re.sub(r"[^a-z0-9]+", "_", item.label.lower()).strip("_") for item in items]
+    for item, slug in zip(items, slugs, strict=True):
+        if slug and slug != "unknown" and (slugs.count(slug) == 1 or item in bundle.base):
+            names.setdefault(slug, item.id)
+        if slug and slug != "unknown":
+            names[f"{slug}_{item.id}"] = item.id
+        names[f"object_{item.id}"] = item.id
+    return names
+
+
+def best_name(facts: SceneFacts, key: int) -> str:
+    """Return the shortest of an object's names that says what it is."""
+    mine = [name for name, value in facts.names.items() if value == key]
+    return min(mine, key=lambda name: (name.startswith("object_"), len(name)))

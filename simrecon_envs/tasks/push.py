@@ -1,0 +1,140 @@
+"""Push: move an object along its support to a goal, without lifting it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from simrecon_envs.tasks.base import Info, Task, draw, nearness
+from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.spec import TaskSpec
+
+WITHIN_M = 0.035
+_DISTANCES_M = (0.10, 0.20)
+_UPRIGHT = 0.94
+_MAX_PUSHED_KG = 3.0
+
+
+class Push(Task):
+    """The object's middle within 3.5 cm of the goal on its support, upright, at rest, carried by that support."""
+
+    kind = "push"
+    max_reward = 4.0
+
+    @classmethod
+    def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
+        if subject not in facts.targets:
+            return super().problems(facts, subject, place)
+        problems = []
+        target, height = facts.targets[subject], facts.height_m(subject)
+        if facts.above(subject):
+            problems.append("something stands on it or hangs from it")
+        if height < 0.03:
+            problems.append(f"only {1000 * height:.0f} mm high")
+        if height > 2.2 * target.grip_width_m:
+            problems.append("so slim that it tips over")
+        if facts.mass_kg[subject] > _MAX_PUSHED_KG:
+            problems.append(f"weighs {facts.mass_kg[subject]:.1f} kg")
+        if not problems and not len(cls._goals(facts, subject)):
+            problems.append("there is no free way for it")
+        return problems
+
+    @classmethod
+    def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
+        return [cls._goals(facts, spec.subject)]
+
+    @classmethod
+    def _goals(cls, facts: SceneFacts, subject: int) -> np.ndarray:
+        """Return goals (k, 3): level spots 10 to 20 cm away with a free way there, and room behind the object."""
+        support = facts.parent.get(subject)
+        spots = facts.spots(support, subject)
+        if not len(spots):
+            return spots
+        target = facts.targets[subject]
+        middle = target.center[:2]
+        away = np.linalg.norm(spots[:, :2] - middle, axis=1)
+        keep = (
+            (away >= _DISTANCES_M[0])
+            & (away <= _DISTANCES_M[1])
+            & (np.abs(spots[:, 2] - target.bottom_m) < 0.01)
+        )
+        ordered = spots[keep]
+        near = {tuple(cell) for cell in np.floor(spots[:, :2] / 0.03).astype(int)}
+        free = []
+        for spot in ordered:
+            along = middle + np.linspace(0.35, 1.0, 6)[:, None] * (spot[:2] - middle)
+            if all(_touches(near, cell) for cell in np.floor(along / 0.03).astype(int)):
+                free.append(spot)
+        return np.array(free).reshape(-1, 3)
+
+    def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
+        super().__init__(env, spec, placement)
+        goals = self._goals(self.facts, spec.subject)
+        mask = placement.reaches(goals, self.facts.traits)
+        goals = goals[mask] if mask.any() else goals
+        # Away from the robot or across: the hand comes from behind, and pulling is no pushing.
+        outward = np.array([np.cos(placement.yaw_rad), np.sin(placement.yaw_rad)])
+        middle = self.facts.targets[spec.subject].center[:2]
+        forward = (goals[:, :2] - middle) @ outward
+        order = np.argsort(-(forward > -0.03).astype(int), kind="stable")
+        good = goals[order][: max(int((forward > -0.03).sum()), 1)]
+        self.goals = good[:24] if len(good) else self.facts.targets[spec.subject].center[None]
+
+    @classmethod
+    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
+        return f"Push the {facts.thing(spec.subject)} to the goal."
+
+    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+        if not hasattr(self, "goal"):
+            self.goal, self._home = self._zeros(3), self._zeros(3)
+        chosen = (draw(rng, env_idx, 1)[:, 0] * len(self.goals)).astype(int)
+        self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
+        goal = torch.as_tensor(self.goals[chosen], dtype=torch.float32, device=self.env.device)
+        goal[:, 2] = self._home[env_idx, 2]
+        self.goal[env_idx] = goal
+
+    def evaluate(self) -> Info:
+        measures, support = self.env.measures, self.facts.parent[self.subject]
+        position = measures.position(self.subject)
+        away = torch.linalg.norm((position - self.goal)[:, :2], dim=1)
+        carried = measures.supported(self.subject, support)
+        upright = measures.up(self.subject) >= _UPRIGHT
+        rest, held = measures.at_rest(self.subject), measures.held(self.subject)
+        near = away <= WITHIN_M
+        return {
+            "success": near & upright & rest & carried & ~held,
+            "is_near": near,
+            "is_upright": upright,
+            "is_at_rest": rest,
+            "is_grasped": held,
+            "target_to_goal_m": away,
+            "tcp_to_target_m": torch.linalg.norm(position - measures.tcp[:, :3], dim=1),
+        }
+
+    def reward(self, info: Info) -> torch.Tensor:
+        start = torch.linalg.norm((self._home - self.goal)[:, :2], dim=1).clamp(min=1e-3)
+        progress = torch.clamp(1 - info["target_to_goal_m"] / start, -1.0, 1.0)
+        upright = info["is_upright"].float()
+        reward = torch.clamp(0.5 * nearness(info["tcp_to_target_m"]) + 2.0 * progress * upright, min=0.0)
+        reward = reward + (info["is_near"] & info["is_upright"]).float()
+        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+
+    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+        measures = self.env.measures
+        pose = measures.pose(self.subject)
+        return {
+            "target_pose": pose,
+            "tcp_to_target": pose[:, :3] - measures.tcp[:, :3],
+            "goal_position": self.goal,
+            "target_to_goal": self.goal - pose[:, :3],
+        }
+
+    def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
+        for _ in range(3):  # from another side, where the first way went past the goal
+            yield from hand.push(self.subject, lambda: self.goal[0].cpu().numpy(), 0.4 * WITHIN_M)
+            yield from hand.lift(0.10)
+            yield from hand.wait(15)
+
+
+def _touches(near: set[tuple[int, int]], cell: np.ndarray) -> bool:
+    return any((cell[0] + dx, cell[1] + dy) in near for dx in (-1, 0, 1) for dy in (-1, 0, 1))

@@ -1,0 +1,80 @@
+"""Put: drop an object into an open container."""
+
+import numpy as np
+import torch
+
+from simrecon_envs.tasks.base import Info
+from simrecon_envs.tasks.carry import Carry
+from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.spec import TaskSpec
+
+_DROP_M = 0.03  # above the floor of the container, where it is let go
+
+
+class Put(Carry):
+    """The object's middle is inside the container's walls and it reaches below the rim; it rests, nobody holds it."""
+
+    kind = "put"
+    joint = "_in_"
+
+    @classmethod
+    def options(cls, facts: SceneFacts) -> list[tuple[int | None, int | None]]:
+        return [
+            (target.id, key)
+            for target in facts.ranked
+            for key in facts.containers
+            if key not in (target.id, facts.parent.get(target.id)) and key not in facts.above(target.id)
+        ]
+
+    @classmethod
+    def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
+        if subject in facts.targets and facts.container(place) is None:
+            return [f"{facts.thing(place)} is no open container"]
+        return super().problems(facts, subject, place)
+
+    @classmethod
+    def _goals(cls, facts: SceneFacts, spec: TaskSpec) -> np.ndarray:
+        inside = facts.container(spec.place)
+        if inside is None or facts.radius_m(spec.subject) > inside.radius_m:
+            return np.zeros((0, 3))
+        spots = facts.spots(spec.place, spec.subject)
+        if len(spots):
+            xy = np.round(inside.cells / 1e-3)
+            keep = [bool((np.abs(xy - np.round(spot[:2] / 1e-3)).max(axis=1) <= 20).any()) for spot in spots]
+            spots = spots[np.array(keep) & (spots[:, 2] < inside.rim_m - 0.01)]
+        return spots if len(spots) else inside.center[None]
+
+    @classmethod
+    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
+        return f"Put the {facts.thing(spec.subject)} in the {facts.thing(spec.place)}."
+
+    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+        super().start(env_idx, rng)
+        inside = self.facts.container(self.spec.place)
+        device = self.env.device
+        self._cells = torch.as_tensor(inside.cells, dtype=torch.float32, device=device)
+        target = self.facts.targets.get(self.spec.place)
+        center = np.zeros(3) if target is None else target.center
+        self._container_home = torch.as_tensor(center, dtype=torch.float32, device=device)[None]
+
+    def _container_moved(self) -> torch.Tensor:
+        if self.spec.place not in self.facts.targets:
+            return torch.zeros_like(self.goal)
+        return self.env.measures.position(self.spec.place) - self._container_home
+
+    def live_goal(self) -> torch.Tensor:
+        return self.goal + self._container_moved()
+
+    def _arrived(self) -> Info:
+        inside = self.facts.container(self.spec.place)
+        moved = self._container_moved()
+        local = self.env.measures.position(self.subject) - moved
+        nearest = torch.abs(local[:, None, :2] - self._cells[None]).amax(dim=2).amin(dim=1)
+        within = nearest <= 0.01
+        bottom = local[:, 2] - self.facts.height_m(self.subject) / 2
+        # A thing that fell over inside has another height: its middle below the rim will do as well.
+        below = (bottom < inside.rim_m - 0.008) | (local[:, 2] < inside.rim_m)
+        upright = torch.ones_like(within)
+        if self.spec.place in self.facts.targets:
+            upright = self.env.measures.up(self.spec.place) > 0.9
+        return {"is_there": within & below & upright, "is_within_walls": within, "is_below_rim": below}

@@ -1,0 +1,67 @@
+"""Reach: bring the hand over an object without touching it, and keep still there."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from simrecon_envs.tasks.base import Info, Task, nearness
+from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.spec import TaskSpec
+
+ABOVE_M = 0.05  # over the object's top
+WITHIN_M = 0.025
+STILL_RAD_S = 0.3
+TOUCHED_M = 0.03  # an object that was moved by more was knocked over, not reached
+
+
+class Reach(Task):
+    """The point between the fingers within 2.5 cm of 5 cm above the object; the robot still, the object unmoved."""
+
+    kind = "reach"
+    max_reward = 3.0
+    lasting = False
+
+    @classmethod
+    def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
+        """Reaching needs no grip: only that the object is there."""
+        return [] if subject in facts.targets else super().problems(facts, subject, place)
+
+    @classmethod
+    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
+        return f"Move the hand over the {facts.thing(spec.subject)}."
+
+    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+        if not hasattr(self, "_home"):
+            self._home = self._zeros(3)
+        self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
+
+    def _goal(self) -> torch.Tensor:
+        lift = torch.tensor([0, 0, self.facts.height_m(self.subject) / 2 + ABOVE_M], device=self.env.device)
+        return self.env.measures.position(self.subject) + lift
+
+    def evaluate(self) -> Info:
+        measures = self.env.measures
+        distance = torch.linalg.norm(self._goal() - measures.tcp[:, :3], dim=1)
+        moved = torch.linalg.norm(measures.position(self.subject) - self._home, dim=1)
+        still = measures.joint_speed <= STILL_RAD_S
+        near, unmoved = distance <= WITHIN_M, moved <= TOUCHED_M
+        return {"success": near & still & unmoved, "is_near": near, "is_still": still, "is_unmoved": unmoved,
+                "tcp_to_goal_m": distance}  # fmt: skip
+
+    def reward(self, info: Info) -> torch.Tensor:
+        near = info["is_near"].float()
+        slow = 1 - torch.tanh(2.0 * self.env.measures.joint_speed)
+        reward = (nearness(info["tcp_to_goal_m"]) + near * slow) * (0.5 + 0.5 * info["is_unmoved"].float())
+        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+
+    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+        measures = self.env.measures
+        return {
+            "target_pose": measures.pose(self.subject),
+            "tcp_to_goal": self._goal() - measures.tcp[:, :3],
+        }
+
+    def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
+        yield from hand.go(lambda: self._goal()[0].cpu().numpy(), within_m=0.008)
+        yield from hand.wait(20)

@@ -1,0 +1,94 @@
+"""Composites: `put_can_in_tray-then-stack_box_on_book`, one stage after the other."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from simrecon_envs.tasks.base import Info, Task
+from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.spec import TaskSpec
+
+
+class Sequence(Task):
+    """Done when the last stage is done and what earlier stages put somewhere is still there.
+
+    Reaching, picking and driving count once they are done; the reward is 1 a finished stage and the share of the
+    present one.
+    """
+
+    kind = "sequence"
+
+    @classmethod
+    def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
+        from simrecon_envs.tasks import kind_of
+
+        out = [goals for stage in spec.stages for goals in kind_of(stage).interests(facts, stage)]
+        others = {stage.subject for stage in spec.stages[1:]} & facts.targets.keys()
+        return out + [facts.targets[key].center[None] for key in sorted(others)]
+
+    def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
+        super().__init__(env, spec, placement)
+        from simrecon_envs.tasks import kind_of
+
+        self.stages = [kind_of(stage)(env, stage, placement) for stage in spec.stages]
+
+    @property
+    def max_reward(self) -> float:
+        return float(len(self.stages))
+
+    @classmethod
+    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
+        from simrecon_envs.tasks import kind_of
+
+        return " Then: ".join(kind_of(stage).words(facts, stage) for stage in spec.stages)
+
+    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+        if not hasattr(self, "stage"):
+            self.stage = self._zeros(1)[:, 0].long()
+        self.stage[env_idx] = 0
+        for stage in self.stages:
+            stage.start(env_idx, rng)
+
+    def evaluate(self) -> Info:
+        infos = [stage.evaluate() for stage in self.stages]
+        done = torch.stack([info["success"] for info in infos], dim=1)
+        present = self.stage.clamp(max=len(infos) - 1)
+        advance = (self.stage < len(infos)) & done.gather(1, present[:, None])[:, 0]
+        self.stage = self.stage + advance.long()
+        lasting = torch.tensor([stage.lasting for stage in self.stages], device=done.device)
+        kept = (done | ~lasting).all(dim=1)
+        self._infos = infos
+        return {
+            "success": (self.stage >= len(infos)) & kept,
+            "stage": self.stage.clone(),
+            "stages_done": done.sum(dim=1),
+        }
+
+    def reward(self, info: Info) -> torch.Tensor:
+        shares = torch.stack(
+            [
+                stage.reward(one) / stage.max_reward
+                for stage, one in zip(self.stages, self._infos, strict=True)
+            ],
+            dim=1,
+        )
+        present = self.stage.clamp(max=len(self.stages) - 1)
+        reward = self.stage.float() * 0.98 + 0.98 * shares.gather(1, present[:, None])[:, 0]
+        reward = torch.clamp(reward, max=0.98 * len(self.stages))
+        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+
+    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+        out = {"stage": torch.nn.functional.one_hot(self.stage, len(self.stages) + 1).float()}
+        for number, (stage, one) in enumerate(zip(self.stages, self._infos, strict=True)):
+            out.update({f"stage_{number}_{key}": value for key, value in stage.observe(one).items()})
+        return out
+
+    def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
+        for number, stage in enumerate(self.stages):
+            if number:
+                yield from hand.let_go()
+            for action in stage.script(hand):
+                yield action
+                if int(self.stage[0]) > number and number + 1 < len(self.stages):
+                    break
