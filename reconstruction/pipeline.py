@@ -30,6 +30,7 @@ from reconstruction.instances.lens import Lens
 from reconstruction.overrides import Overrides
 from reconstruction.profiling import Usage, UsageMeter
 from reconstruction.progress import NO_PROGRESS, Progress, StageListener
+from reconstruction.scene_graph import MergedGraph
 from reconstruction.types import (
     AssembledScene,
     AssetSet,
@@ -38,7 +39,6 @@ from reconstruction.types import (
     InstanceSet,
     ObjectAsset,
     PosedFrames,
-    SceneGraph,
     Surface,
     WorldFrame,
 )
@@ -82,7 +82,7 @@ STAGES: tuple[Stage, ...] = (
     Stage(
         "assets", "reconstruction.assets", AssetSet, ("poses", "gaussians", "world", "surface", "instances")
     ),
-    Stage("scene_graph", "reconstruction.scene_graph", SceneGraph, ("assets",)),
+    Stage("scene_graph", "reconstruction.scene_graph", MergedGraph, ("assets",)),
     Stage("assembly", "reconstruction.assembly", AssembledScene, ("assets", "scene_graph")),
 )  # fmt: skip
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
@@ -256,7 +256,13 @@ class Run:
                 config = replace(config, refine_depth=False)  # the truth has nothing to gain
             return module.make_gaussians(done["poses"], done["depth"], config, progress=progress)
         if stage.name == "scene_graph":
-            return module.infer_scene_graph(done["assets"], config, progress=progress)
+            return module.infer_scene_graph(
+                done["assets"],
+                config,
+                make_scene=self.view_scene,
+                records=self.store.work_dir / module.RECORDS,
+                progress=progress,
+            )
         if stage.name == "assembly":
             return module.assemble(done["assets"], done["scene_graph"], config, progress=progress)
         if stage.name == "views":
@@ -287,6 +293,14 @@ class Run:
         if stage.name == "world":
             return self.oracle.world(done["poses"])
         return self.oracle.instances(*self.in_world(), done["surface"])
+
+    def view_scene(self) -> "ViewScene":
+        """Return what views are chosen in: the Gaussians, the free space, and what belongs to which thing."""
+        from reconstruction.avo import prepare_scene
+
+        done = self.results
+        gaussians = done["gaussians"].in_world(done["world"])
+        return prepare_scene(gaussians, done["surface"], done["instances"], self.in_world()[0].camera)
 
     def in_world(self) -> tuple[PosedFrames, DepthMaps]:
         """Return the posed frames and the depth maps that the Gaussians corrected, in world space, in metres."""
@@ -401,6 +415,10 @@ def _refuse_missing(config: PipelineConfig) -> None:
         from reconstruction.assets.physics.load import load_physicist
 
         load_physicist(config.assets)
+    if config.scene_graph.backend == "vlm":
+        from reconstruction.scene_graph.load import load_model
+
+        load_model(config.scene_graph)
     if config.assets.generator != "none":
         from reconstruction.assets.generation import check_generator
 

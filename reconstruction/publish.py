@@ -22,6 +22,8 @@ from reconstruction.instances import backends as instance_backends
 from reconstruction.instances.gaussian_ids import add_instances_to_ply, gaussian_instances
 from reconstruction.preview import render_preview
 from reconstruction.profiling import OTHER, PUBLISH, Usage, UsageMeter
+from reconstruction.scene_graph import backend_name
+from reconstruction.scene_graph.publishing import graph_of_bundle
 from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
 from registry import SceneRecord, SceneRegistry, seal_bundle
 from registry.errors import EnvironmentMissing, SimReconError
@@ -91,7 +93,7 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "cameras": _cameras(posed),
         "base": [_base(item, folder) for item in assets.base],
         "objects": [_object(item, placed[item.id], item.id in attached, folder) for item in assets.objects],
-        "graph": {"edges": [dataclasses.asdict(edge) for edge in assembled.graph.edges]},
+        "graph": graph_of_bundle(assembled.graph.edges, run.results["scene_graph"], folder),
         "gaussians": _gaussians(run, folder),
         "report": _report(run),
     }
@@ -274,7 +276,7 @@ def _backends(run: "Run") -> dict[str, str]:
         **instance_backends(run.config.instances),
         "assets": _completion(run.config.assets.generator),
         "physics": physics_backend(run.config.assets),
-        "relations": "geometry",
+        "relations": backend_name(run.config.scene_graph),
     }
     if "views" in run.keys:
         backends["views"] = run.config.avo.strategy

@@ -95,6 +95,7 @@ class BundleEdge:
     parent: int
     confidence: float
     evidence: Any
+    said_by: str = ""  # "geometry", a model, "assembly", "user"; "" in bundles of before
 
 
 class SceneBundle:
@@ -209,7 +210,10 @@ class SceneBundle:
     def edges(self) -> tuple[BundleEdge, ...]:
         """The scene graph."""
         keys = ("child", "relation", "parent", "confidence", "evidence")
-        return tuple(BundleEdge(**{key: e[key] for key in keys}) for e in self.scene["graph"]["edges"])
+        return tuple(
+            BundleEdge(**{key: e[key] for key in keys}, said_by=e.get("said_by", ""))
+            for e in self.scene["graph"]["edges"]
+        )
 
 
 def seal_bundle(folder: Path, scene: dict) -> str:

@@ -61,6 +61,8 @@ def validate_scene(scene: Any) -> None:
     object_ids = _objects(_sequence(_get(scene, "objects", ""), "objects"), base_ids)
     graph = _mapping(_get(scene, "graph", ""), "graph")
     _edges(_sequence(_get(graph, "edges", "graph"), "graph.edges"), base_ids, object_ids)
+    if "steps" in graph:  # bundles of before had none
+        _steps(_sequence(graph["steps"], "graph.steps"), base_ids | object_ids)
     _report(_mapping(_get(scene, "report", ""), "report"))
     if "gaussians" in scene:  # bundles of before had none
         _path(_mapping(scene["gaussians"], "gaussians"), "file", "gaussians", ".ply")
@@ -79,6 +81,9 @@ def referenced_files(scene: dict) -> dict[str, str]:
         found.update({path: f"objects[{i}].collision[{k}]" for k, path in enumerate(item["collision"])})
     if "gaussians" in scene:
         found[scene["gaussians"]["file"]] = "gaussians.file"
+    for i, step in enumerate(scene["graph"].get("steps", [])):
+        if "picture" in step:
+            found[step["picture"]] = f"graph.steps[{i}].picture"
     for i, frame in enumerate(scene.get("instances", {"frames": []})["frames"]):
         found.update({frame[key]: f"instances.frames[{i}].{key}" for key in ("image", "ids")})
     return found
@@ -252,6 +257,22 @@ def _edges(items: list, base_ids: set[int], object_ids: set[int]) -> None:
             trail.append(node)
             node = parent_of[node]
         rooted.update(trail)
+
+
+def _steps(steps: list, known: set[int]) -> None:
+    """How the graph came about; ids that a model made up may occur in what was said."""
+    for i, step in enumerate(steps):
+        where = f"graph.steps[{i}]"
+        _text(_mapping(step, where), "kind", where)
+        for key in ("about", "visible", "said", "decisions", "merged", "notes"):
+            _sequence(_get(step, key, where), f"{where}.{key}")
+        for k, edge in enumerate(step["merged"]):
+            place = f"{where}.merged[{k}]"
+            for key in ("child", "parent"):
+                if _integer(_mapping(edge, place), key, place) not in known:
+                    _fail(f"{place}.{key}", "the id of an object or base entity", edge[key])
+        if "picture" in step:
+            _path(step, "picture", where, ".jpg")
 
 
 def _report(report: dict) -> None:

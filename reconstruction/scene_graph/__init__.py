@@ -1,43 +1,34 @@
-"""Stage 8: assets -> scene graph. Every object gets exactly one parent; floor and walls are the roots.
+"""Stage 9: assets -> scene graph. Every object gets exactly one parent; floor and walls are the roots.
 
-Regions by clustering, relations per region from a backend (geometry by default), merged into one graph with
-conflict resolution, as the paper's Scene Graph Synthesizer does.
+Regions by clustering, relations per region from a backend (geometry by default, or a vision-language model that is
+shown a view of the region), merged into one graph with conflict resolution: the paper's Scene Graph Synthesizer.
 """
 
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.scene_graph.merge import GraphMerge, breadth_first
+from reconstruction.scene_graph.base import (
+    LocalGraph,
+    MergedGraph,
+    MergeStep,
+    Question,
+    RelationBackend,
+    SaidEdge,
+)
+from reconstruction.scene_graph.config import SCENE_GRAPH_PRESETS, SceneGraphConfig
+from reconstruction.scene_graph.load import RECORDS, backend_name, load_relations, outside_inputs
 from reconstruction.scene_graph.regions import find_regions
-from reconstruction.scene_graph.relations import GeometryRelations, RelationBackend, RelationConfig
-from reconstruction.types import AssetSet, Edge, SceneGraph
+from reconstruction.scene_graph.relations import GeometryRelations
+from reconstruction.scene_graph.synthesis import synthesize
+from reconstruction.types import AssetSet
 from registry.errors import InputError
 
-VERSION = 1
+if TYPE_CHECKING:
+    from reconstruction.avo import ViewScene
 
-
-@dataclass(frozen=True)
-class SceneGraphConfig:
-    """How relations are inferred and merged."""
-
-    strategy: Literal["regions", "naive", "global"] = "regions"
-    """The paper's method; without conflict resolution; or one question about everything."""
-    region_radius_m: float = 0.5
-    """DBSCAN: objects whose centers are this close belong together."""
-    region_min_objects: int = 2
-    """DBSCAN: an object with this many in its radius (itself included) is a core."""
-    view_margin_m: float = 0.25
-    """How far around a region its view shows other objects."""
-    relations: RelationConfig = field(default_factory=RelationConfig)
-    """Tolerances of the geometric backend."""
-
-
-SCENE_GRAPH_PRESETS = {
-    "fast": SceneGraphConfig(),
-    "default": SceneGraphConfig(),
-    "quality": SceneGraphConfig(),
-}
+VERSION = 2
 
 
 def infer_scene_graph(
@@ -45,74 +36,66 @@ def infer_scene_graph(
     config: SceneGraphConfig,
     *,
     backend: RelationBackend | None = None,
+    make_scene: "Callable[[], ViewScene] | None" = None,
+    records: Path | None = None,
     progress: Progress = NO_PROGRESS,
-) -> SceneGraph:
+) -> MergedGraph:
     """Find the parent of every object: what carries it, or what it hangs on.
+
+    Args:
+        assets: what relations are between.
+        config: how.
+        backend: in place of the one that the config names.
+        make_scene: the Gaussians to look at, for backends that look; not called by others.
+        records: where exchanges with a model are kept.
+        progress: told of questions and conflicts.
 
     Raises:
         InputError: the assets hold no floor, so the graph has no root.
+        EnvironmentMissing: the backend needs something that is not there.
     """
-    base_ids = [b.id for b in assets.base]
+    base_ids = [b.id for b in sorted(assets.base, key=lambda b: (b.label != "floor", b.id))]
     if not any(b.label == "floor" for b in assets.base):
         raise InputError(
             f"scene graph: none of the {len(base_ids)} base surfaces is a floor, so nothing can stand; "
             "the instance stage must find or assume one"
         )
-    backend = backend or GeometryRelations(assets, config.relations)
-    everything = tuple(sorted(o.id for o in assets.objects))
-    if config.strategy == "global":
-        views = [everything]
-    else:
-        regions = find_regions(
-            assets.objects, config.region_radius_m, config.region_min_objects, config.view_margin_m
-        )
-        views = [visible for _, visible in regions]
-    progress.start(len(views), "relations")
-    graphs = []
-    for view in views:
-        graphs.append(backend.infer(view))
-        progress.advance()
-    edges = merge_graphs(
-        graphs, base_ids, everything, backend, naive=config.strategy == "naive", progress=progress
+    backend = backend or load_relations(config, assets, make_scene, records)
+    return synthesize(
+        region_questions(assets, config),
+        base_ids,
+        sorted(o.id for o in assets.objects),
+        backend,
+        merging=config.merging,
+        adjudications=config.adjudications,
+        last_resort=lambda: GeometryRelations(assets, config.relations),
+        progress=progress,
     )
-    return SceneGraph(edges)
 
 
-def merge_graphs(
-    graphs: list[list[Edge]],
-    base_ids: list[int],
-    object_ids: tuple[int, ...],
-    backend: RelationBackend,
-    *,
-    naive: bool = False,
-    progress: Progress = NO_PROGRESS,
-) -> tuple[Edge, ...]:
-    """Merge the regions' graphs; the result does not depend on their order."""
-    merge = GraphMerge(base_ids, None if naive else backend)
-    # A canonical order makes the outcome independent of the order in which regions arrive.
-    for graph in sorted(graphs, key=lambda edges: sorted((e.child, e.parent, e.relation) for e in edges)):
-        merge.add_graph(graph)
-    for line in merge.conflicts:
-        progress.note(f"scene graph: {line}")
-    missing = [i for i in object_ids if i not in merge.parent_edge]
-    if missing:
-        progress.note(
-            f"scene graph: no region connects {missing} to the base; asked again with everything in view"
-        )
-        merge.add_graph(
-            [e for e in backend.infer(object_ids) if e.child in set(missing)] + list(merge_edges(merge))
-        )
-    for i in object_ids:
-        if i not in merge.parent_edge:
-            root = min(base_ids)
-            progress.note(f"scene graph: object {i} has no path to the base; put on base {root}")
-            merge.parent_edge[i] = Edge(i, "supported_by", root, 0.05, "no relation was found")
-    return merge_edges(merge)
+def region_questions(assets: AssetSet, config: SceneGraphConfig) -> list[Question]:
+    """Return one question a region."""
+    regions = find_regions(
+        assets.objects, config.region_radius_m, config.region_min_objects, config.view_margin_m
+    )
+    return [Question.of(members, visible) for members, visible in regions]
 
 
-def merge_edges(merge: GraphMerge) -> tuple[Edge, ...]:
-    """Return the merged edges, breadth first from the base."""
-    return tuple(breadth_first(list(merge.parent_edge.values()), merge.base_ids))
-
-
-__all__ = ["SCENE_GRAPH_PRESETS", "VERSION", "SceneGraphConfig", "infer_scene_graph", "merge_graphs"]
+__all__ = [
+    "RECORDS",
+    "SCENE_GRAPH_PRESETS",
+    "VERSION",
+    "GeometryRelations",
+    "LocalGraph",
+    "MergeStep",
+    "MergedGraph",
+    "Question",
+    "RelationBackend",
+    "SaidEdge",
+    "SceneGraphConfig",
+    "backend_name",
+    "infer_scene_graph",
+    "outside_inputs",
+    "region_questions",
+    "synthesize",
+]

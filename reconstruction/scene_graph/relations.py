@@ -1,4 +1,4 @@
-"""Which thing rests on or hangs from which: the relation backend and its embedded, geometric default.
+"""Which thing rests on or hangs from which, by geometry: the embedded relation backend.
 
 For each cell of a child's underside, the carrier is the highest surface that faces up at or just beneath it.
 The parent is the thing that carries most of the underside, weighted by closeness, with the instance stage's
@@ -9,23 +9,13 @@ overlapping things is the upper one.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.scene_graph.base import LocalGraph, Question, SaidEdge
 from reconstruction.scene_graph.surfaces import SampledBase, SampledObject, sample_assets
-from reconstruction.types import AssetSet, Edge
-
-
-class RelationBackend(Protocol):
-    """Proposes a parent for each object of a view (geometry here, a vision-language model elsewhere)."""
-
-    name: str
-    version: int
-
-    def infer(self, ids: Iterable[int]) -> list[Edge]:
-        """Return one edge per object id in `ids`; parents are among `ids` and the base. No cycles."""
+from reconstruction.types import AssetSet
 
 
 @dataclass(frozen=True)
@@ -62,7 +52,6 @@ class GeometryRelations:
     """The embedded relation backend. Samples all surfaces once; asking is cheap."""
 
     name = "geometry"
-    version = 1
 
     def __init__(self, assets: AssetSet, config: RelationConfig) -> None:
         """Prepare the assets for questions."""
@@ -72,11 +61,19 @@ class GeometryRelations:
         self._trees: dict[int, cKDTree] = {}
         self._gaps: dict[tuple[int, int, bool], np.ndarray] = {}
 
-    def infer(self, ids: Iterable[int]) -> list[Edge]:
+    def infer(self, question: Question) -> LocalGraph:
         """See `RelationBackend.infer`."""
-        present = sorted(i for i in set(ids) if i in self._objects)
+        present = tuple(i for i in question.visible if i in self._objects)
         ranked = {i: self.candidates(i, present) for i in present}
-        return _without_cycles(ranked)
+        return LocalGraph(tuple(_without_cycles(ranked)), present)
+
+    def distance_m(self, child: int, parent: int) -> float:
+        """Return how far apart an object and another one, or a base surface, are at least; by their boxes."""
+        own = self._objects[child]
+        if parent in self._base:
+            return max(0.0, float(np.abs(self._base[parent].distance(own.points)).min()))
+        other = self._objects[parent]
+        return float(np.linalg.norm(np.maximum(0.0, np.maximum(own.low - other.high, other.low - own.high))))
 
     def candidates(self, child_id: int, present: Iterable[int]) -> list[_Candidate]:
         """Return possible (relation, parent)s of an object, best first; never empty."""
@@ -297,7 +294,7 @@ def _gap_words(gap_m: float) -> str:
     return f"{abs(gap_m) * 1000:.0f} mm {'above' if gap_m > 0 else 'inside'}"
 
 
-def _without_cycles(ranked: dict[int, list[_Candidate]]) -> list[Edge]:
+def _without_cycles(ranked: dict[int, list[_Candidate]]) -> list[SaidEdge]:
     """Give each child its best parent; the weakest edge of a cycle takes its next candidate."""
     choice = dict.fromkeys(ranked, 0)
     while True:
@@ -314,7 +311,9 @@ def _without_cycles(ranked: dict[int, list[_Candidate]]) -> list[Edge]:
         rest = max((c.score for n, c in enumerate(ranked[i]) if n != choice[i]), default=0.0)
         confidence = chosen.score / (chosen.score + 0.5 * rest) * min(1.0, 0.1 + 1.2 * chosen.score)
         out.append(
-            Edge(i, chosen.relation, chosen.parent, round(float(min(confidence, 0.99)), 3), chosen.evidence)
+            SaidEdge(
+                i, chosen.relation, chosen.parent, round(float(min(confidence, 0.99)), 3), chosen.evidence
+            )
         )
     return out
 

@@ -14,7 +14,7 @@ from reconstruction.synthetic.furnishing import SIDE_KINDS, WALL_KINDS
 from reconstruction.synthetic.furniture import Workshop
 from reconstruction.synthetic.layout import KINDS, Item, Layout, RoomIsFull, RoomShape
 from reconstruction.synthetic.room import WALL_HEIGHT_M, Entity, Room
-from reconstruction.synthetic.shapes import COARSE, Solid, box, moved, shifted
+from reconstruction.synthetic.shapes import COARSE, Patch, Solid, box, moved, shifted
 from reconstruction.synthetic.textures import Texture
 from reconstruction.synthetic.things import SMALL_KINDS
 from registry.errors import UsageError
@@ -168,25 +168,44 @@ def furnish(plan: RoomPlan) -> Room:
             else fine.textures
         )
         looks |= painted
-        points = np.concatenate([p.vertices for part in item.model.parts for p in part])
-        entity = Entity(
-            id=len(entities) + 1,
-            name=item.name,
-            label=kind.label,
-            base=False,
-            relation="attached_to" if item.hangs else "supported_by",
-            parent=ids[item.support],
-            fixed=kind.fixed,
-            size=tuple(np.ptp(points, axis=0).tolist()),
-            world_from_object=item.pose,
-            solids=tuple(moved(part, item.pose) for part in item.model.parts),
-            patches=tuple(patch for part in fine.parts for patch in moved(part, item.pose)),
-            pieces=tuple(p @ item.pose[:3, :3].T + item.pose[:3, 3] for p in item.model.pieces),
-        )
+        patches = tuple(patch for part in fine.parts for patch in moved(part, item.pose))
+        entity = _entity(item, len(entities) + 1, ids[item.support], patches)
         entities.append(entity)
         ids[item.name] = entity.id
     s = plan.shape
     return Room(tuple(entities), looks, (s.west, s.east, s.south, s.north))
+
+
+def unpainted(plan: RoomPlan) -> Room:
+    """Return the truth of a plan alone, in a fraction of the time: no textures, nothing to film."""
+    entities = [
+        _base_entity(number, name, label, solid, ())
+        for number, (name, label, solid) in enumerate(_base_solids(plan.shape, COARSE), start=1)
+    ]
+    ids = {e.name: e.id for e in entities}
+    for item in plan.items:
+        entities.append(_entity(item, len(entities) + 1, ids[item.support], ()))
+        ids[item.name] = entities[-1].id
+    s = plan.shape
+    return Room(tuple(entities), {}, (s.west, s.east, s.south, s.north))
+
+
+def _entity(item: Item, number: int, parent: int, patches: tuple[Patch, ...]) -> Entity:
+    points = np.concatenate([p.vertices for part in item.model.parts for p in part])
+    return Entity(
+        id=number,
+        name=item.name,
+        label=KINDS[item.key].label,
+        base=False,
+        relation="attached_to" if item.hangs else "supported_by",
+        parent=parent,
+        fixed=KINDS[item.key].fixed,
+        size=tuple(np.ptp(points, axis=0).tolist()),
+        world_from_object=item.pose,
+        solids=tuple(moved(part, item.pose) for part in item.model.parts),
+        patches=patches,
+        pieces=tuple(p @ item.pose[:3, :3].T + item.pose[:3, 3] for p in item.model.pieces),
+    )
 
 
 def _flattened(look: Texture) -> Texture:
@@ -200,11 +219,13 @@ def _base(plan: RoomPlan, rng: np.random.Generator) -> tuple[dict[str, Texture],
     for (name, label, fine), (_, _, coarse) in zip(
         _base_solids(plan.shape, plan.spec.step_m), _base_solids(plan.shape, COARSE)
     ):
-        size = tuple(np.ptp(np.concatenate([p.vertices for p in coarse]), axis=0).tolist())
-        entities.append(
-            Entity(len(entities) + 1, name, label, True, None, None, True, size, np.eye(4), (coarse,), fine)
-        )
+        entities.append(_base_entity(len(entities) + 1, name, label, coarse, fine))
     return looks, entities
+
+
+def _base_entity(number: int, name: str, label: str, coarse: Solid, fine: tuple[Patch, ...]) -> Entity:
+    size = tuple(np.ptp(np.concatenate([p.vertices for p in coarse]), axis=0).tolist())
+    return Entity(number, name, label, True, None, None, True, size, np.eye(4), (coarse,), fine)
 
 
 def _base_solids(shape: RoomShape, step_m: float) -> list[tuple[str, str, Solid]]:

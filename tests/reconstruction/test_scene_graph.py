@@ -1,15 +1,14 @@
-"""Relations of analytic scenes, regions, and the merge of contradicting regions."""
+"""Relations of analytic scenes by geometry, and regions."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from boxes import box, floor, room, tilt, tray, wall
 
-from reconstruction.scene_graph import SCENE_GRAPH_PRESETS, SceneGraphConfig, infer_scene_graph, merge_graphs
+from reconstruction.scene_graph import SCENE_GRAPH_PRESETS, SceneGraphConfig, infer_scene_graph
 from reconstruction.scene_graph.regions import dbscan, find_regions
-from reconstruction.types import AssetSet, Edge
+from reconstruction.types import AssetSet
 from registry.errors import InputError
 
 
@@ -42,9 +41,9 @@ TRUTH = {
 }
 
 
-@pytest.mark.parametrize("strategy", ["regions", "global", "naive"])
-def test_furnished_room(strategy):
-    assert relations(furnished(), strategy=strategy) == TRUTH
+@pytest.mark.parametrize("merging", ["online", "global", "naive"])
+def test_furnished_room(merging):
+    assert relations(furnished(), merging=merging) == TRUTH
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -112,58 +111,3 @@ def test_regions_partition_objects_and_views_contain_them():
     assert len(regions) == 2
     assert all(set(inside) <= set(seen) for inside, seen in regions)
     assert next(r for r in regions if 11 in r[0])[0] == (8, 9, 10, 11)
-
-
-class Oracle:
-    """Answers as the truth says, restricted to what is in view."""
-
-    name, version = "oracle", 1
-
-    def __init__(self, truth: dict[int, int]) -> None:
-        self.truth = truth
-
-    def infer(self, ids):
-        out = []
-        for i in sorted(ids):
-            parent = self.truth[i]
-            while parent not in ids and parent != 1:
-                parent = self.truth[parent]
-            out.append(Edge(i, "supported_by", parent, 0.9, "seen"))
-        return out
-
-
-def test_merge_settles_conflicts_whatever_the_order_of_regions():
-    truth = {10: 1, 11: 10, 12: 11, 13: 10, 14: 13}
-    oracle = Oracle(truth)
-    # One region did not see the book (11) under the mug (12); one has a reversed pair.
-    graphs = [
-        oracle.infer({10, 12, 13}),
-        oracle.infer({10, 11, 12}),
-        [Edge(14, "supported_by", 10, 0.5, ""), Edge(13, "supported_by", 14, 0.5, ""), *oracle.infer({10})],
-        oracle.infer({10, 13, 14}),
-    ]
-    for order in itertools.permutations(graphs):
-        edges = merge_graphs(list(order), [1, 2], tuple(truth), oracle)
-        assert {e.child: e.parent for e in edges} == truth
-
-
-def test_merge_never_leaves_a_cycle_or_an_orphan():
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        ids = list(range(10, 18))
-        graphs = [
-            [
-                Edge(int(i), "supported_by", int(rng.choice([1, *ids])), 0.5, "")
-                for i in rng.choice(ids, 4, replace=False)
-            ]
-            for _ in range(3)
-        ]
-        truth = {i: int(rng.choice([1, *range(10, i)])) for i in ids}
-        edges = merge_graphs(graphs, [1], tuple(ids), Oracle(truth))
-        parent = {e.child: e.parent for e in edges}
-        assert sorted(parent) == ids
-        for i in ids:
-            steps, node = 0, i
-            while node != 1:
-                node, steps = parent[node], steps + 1
-                assert steps <= len(ids)

@@ -1,0 +1,83 @@
+"""What a relation backend may not say, in words that it can be asked again with."""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+
+from reconstruction.scene_graph.base import RELATIONS
+
+Triple = tuple[int, str, int]  # child, relation, parent
+
+
+@dataclass
+class Findings:
+    """What is wrong with an answer."""
+
+    problems: list[str] = field(default_factory=list)  # for the model
+    children: set[int] = field(default_factory=set)  # objects whose edges cannot be used
+
+    def add(self, problem: str, *children: int) -> None:
+        """Note a problem with the edges of some children."""
+        self.problems.append(problem)
+        self.children.update(children)
+
+
+def examine(
+    triples: Sequence[Triple],
+    visible: Collection[int],
+    base: Collection[int],
+    silent: Collection[int] = (),
+    distance_m: Callable[[int, int], float] | None = None,
+    reach_m: float = float("inf"),
+) -> Findings:
+    """Look for ids that do not exist, second parents, cycles, missing edges, and parents out of reach.
+
+    Args:
+        triples: the answer.
+        visible: ids of the objects that it is about.
+        base: ids of floor, walls and ceiling.
+        silent: objects of which it says that it cannot tell.
+        distance_m: between an object and its parent-to-be, for what cannot touch.
+        reach_m: the largest such distance.
+    """
+    out, parents = Findings(), {}
+    for child, relation, parent in triples:
+        said = f"({child}, {relation}, {parent})"
+        if child in base:
+            out.add(f"{said}: {child} is floor, wall or ceiling; these have no parent")
+        elif child not in visible:
+            out.add(f"{said}: there is no object {child}; the objects are {_listed(visible)}")
+        elif relation not in RELATIONS:
+            out.add(f"{said}: {relation!r} is none of {', '.join(RELATIONS)}", child)
+        elif child == parent:
+            out.add(f"{said}: nothing is its own parent", child)
+        elif parent not in visible and parent not in base:
+            out.add(f"{said}: there is no {parent}; parents are {_listed({*visible, *base})}", child)
+        elif parents.setdefault(child, (relation, parent)) != (relation, parent):
+            out.add(f"object {child} has two parents, {parents[child][1]} and {parent}; name one", child)
+        elif distance_m is not None and distance_m(child, parent) > reach_m:
+            apart = distance_m(child, parent)
+            out.add(f"{said}: they are {100 * apart:.0f} cm apart and cannot touch", child)
+    for cycle in _cycles({c: p for c, (_, p) in parents.items() if c not in out.children}):
+        chain = " on ".join(map(str, [*cycle, cycle[0]]))
+        out.add(f"{chain}: that is a circle; one of them must rest on something else", *cycle)
+    missing = sorted(set(visible) - set(parents) - set(silent) - out.children)
+    if missing:
+        out.add(f"there is no edge for {_listed(missing)}", *missing)
+    return out
+
+
+def _cycles(parent: dict[int, int]) -> list[list[int]]:
+    out, done = [], set()
+    for start in sorted(parent):
+        path, node = [], start
+        while node in parent and node not in done and node not in path:
+            path.append(node)
+            node = parent[node]
+        if node in path:
+            out.append(path[path.index(node) :])
+        done.update(path)
+    return out
+
+
+def _listed(ids: Collection[int]) -> str:
+    return ", ".join(map(str, sorted(ids)))

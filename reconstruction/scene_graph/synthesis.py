@@ -1,0 +1,116 @@
+"""Views in, one graph out: the paper's online merging, and what it is compared with."""
+
+from collections.abc import Callable, Sequence
+
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.scene_graph.base import (
+    LocalGraph,
+    MergedGraph,
+    MergeStep,
+    Question,
+    RelationBackend,
+    SaidEdge,
+)
+from reconstruction.scene_graph.merge import GraphMerge
+
+
+def synthesize(
+    questions: Sequence[Question],
+    base_ids: Sequence[int],
+    object_ids: Sequence[int],
+    backend: RelationBackend,
+    *,
+    merging: str = "online",
+    adjudications: int = 3,
+    last_resort: Callable[[], RelationBackend] | None = None,
+    progress: Progress = NO_PROGRESS,
+) -> MergedGraph:
+    """Ask about every region, and merge the answers; the result does not depend on the order of the regions.
+
+    Args:
+        questions: one a region; they should name every object between them.
+        base_ids: ids of floor, walls and ceiling, the floor that nothing-is-known-of stands on first.
+        object_ids: ids of all objects.
+        backend: is asked.
+        merging: "online"; "naive": what came first stays, nothing is asked again; "global": one question.
+        adjudications: how often the objects of a conflict are looked at, at most.
+        last_resort: makes what decides on objects that the backend says nothing of; without it the floor carries them.
+        progress: told of questions, conflicts, and of what was not answered.
+
+    Returns:
+        A forest rooted in the base, every object with one parent, and the steps that led to it.
+    """
+    everything = Question.of(object_ids)
+    if merging == "global":
+        questions = [everything] if object_ids else []
+    progress.start(len(questions), "relations")
+    answers = []
+    for question in questions:
+        answers.append((question, backend.infer(question)))
+        progress.advance()
+    merge = GraphMerge(base_ids, backend if merging == "online" else None, adjudications)
+    # A canonical order makes the outcome independent of the order in which regions arrive.
+    for question, graph in sorted(answers, key=_canonical):
+        merge.add_view(question.about, graph)
+    if merging == "online":
+        _ask_for_the_rest(merge, questions, object_ids, backend, adjudications)
+    missing = [i for i in sorted(object_ids) if i not in merge.parent_edge]
+    if missing:
+        _decide_the_rest(merge, missing, everything, last_resort)
+    _tell(merge.steps, missing, progress)
+    return MergedGraph(merge.edges(), tuple(merge.steps))
+
+
+def _canonical(item: tuple[Question, LocalGraph]) -> tuple:
+    question, graph = item
+    return question.about, question.visible, sorted((e.child, e.parent, e.relation) for e in graph.edges)
+
+
+def _ask_for_the_rest(
+    merge: GraphMerge,
+    questions: Sequence[Question],
+    object_ids: Sequence[int],
+    backend: RelationBackend,
+    attempts: int,
+) -> None:
+    """Look again, region by region, for the objects that no view connects to the base."""
+    for _ in range(attempts):
+        for question in sorted(questions, key=lambda q: (q.about, q.visible)):
+            missing = {i for i in question.about if i not in merge.parent_edge}
+            if not missing:
+                continue
+            wanted = {merge.loose[i].parent for i in missing if i in merge.loose} - merge.base_ids
+            again = merge.another_look(missing | wanted, question.visible)
+            merge.add_view(again.about, backend.infer(again), "rest")
+        if all(i in merge.parent_edge for i in object_ids):
+            return
+
+
+def _decide_the_rest(
+    merge: GraphMerge,
+    missing: Sequence[int],
+    everything: Question,
+    last_resort: Callable[[], RelationBackend] | None,
+) -> None:
+    """Give parents to objects that no view connects to the base; those that wait for one of them keep their edge."""
+    if last_resort is None:
+        floor = merge.floor
+        known = [SaidEdge(i, "supported_by", floor, 0.05, "no relation was found", "nobody") for i in missing]
+    else:
+        known = [e for e in last_resort().infer(everything).edges if e.child in set(missing)]
+    merge.put((e for e in known if e.child not in merge.loose), "no view says")
+    merge.put((e for e in known if e.child not in merge.parent_edge), "no view says")
+
+
+def _tell(steps: Sequence[MergeStep], missing: Sequence[int], progress: Progress) -> None:
+    """Say what was not plain: conflicts, problems of the backend, objects that nothing was said of."""
+    for step in steps:
+        for line in step.notes:
+            progress.note(f"scene graph: {line}")
+        for done in step.decisions:
+            if done.verdict == "conflict":
+                progress.note(f"scene graph: {done.child} {done.relation} {done.parent}: {done.why}")
+            elif done.verdict == "replaced":
+                progress.note(f"scene graph: settled: {done.child} {done.relation} {done.parent}, {done.why}")
+    if missing:
+        progress.note(f"scene graph: no view says what {', '.join(map(str, missing))} rest on")
