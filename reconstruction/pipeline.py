@@ -264,7 +264,7 @@ class Run:
                 progress=progress,
             )
         if stage.name == "assembly":
-            return module.assemble(done["assets"], done["scene_graph"], config, progress=progress)
+            return module.assemble(done["assets"], done["scene_graph"].plain(), config, progress=progress)
         if stage.name == "views":
             return module.make_views(self.view_scene(), done["instances"], config, progress=progress)
         posed, depth = self.in_world()
@@ -293,14 +293,6 @@ class Run:
         if stage.name == "world":
             return self.oracle.world(done["poses"])
         return self.oracle.instances(*self.in_world(), done["surface"])
-
-    def view_scene(self) -> "ViewScene":
-        """Return what views are chosen in: the Gaussians, the free space, and what belongs to which thing."""
-        from reconstruction.avo import prepare_scene
-
-        done = self.results
-        gaussians = done["gaussians"].in_world(done["world"])
-        return prepare_scene(gaussians, done["surface"], done["instances"], self.in_world()[0].camera)
 
     def in_world(self) -> tuple[PosedFrames, DepthMaps]:
         """Return the posed frames and the depth maps that the Gaussians corrected, in world space, in metres."""

@@ -1,7 +1,7 @@
 """The seam to whoever says what carries what: a question about a view, a local graph as the answer."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
@@ -87,7 +87,12 @@ class MergeStep:
 
 @dataclass(frozen=True)
 class MergedGraph(SceneGraph):
-    """Stage 9: the scene graph with who said each edge, and how it came about."""
+    """What the stage makes: the scene graph with who said each edge, and how it came about."""
 
     edges: tuple[SaidEdge, ...]
     steps: tuple[MergeStep, ...] = ()
+
+    def plain(self) -> SceneGraph:
+        """Return the edges alone."""
+        names = [field.name for field in fields(Edge)]
+        return SceneGraph(tuple(Edge(**{name: getattr(e, name) for name in names}) for e in self.edges))
