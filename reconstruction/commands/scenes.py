@@ -37,6 +37,12 @@ def add_parsers(verbs: argparse._SubParsersAction) -> None:
         "what hides it; made from the work folder of the scene, and kept there",
     )
     show.add_argument(
+        "--graph",
+        action="store_true",
+        help="print who said each edge of the scene graph and why, and write a picture of every step that led to it: "
+        "the view, what it said, the graph after it (docs/scene_graph.md); views are drawn from the work folder",
+    )
+    show.add_argument(
         "--set",
         action="append",
         default=[],
@@ -47,13 +53,13 @@ def add_parsers(verbs: argparse._SubParsersAction) -> None:
         "--work-dir",
         type=Path,
         metavar="DIR",
-        help="with --views: the folder that `simrecon reconstruct --work-dir` was given, if it was",
+        help="with --views and --graph: the folder that `simrecon reconstruct --work-dir` was given, if it was",
     )
     show.add_argument(
         "--out",
         type=Path,
         metavar="DIR",
-        help="where contact sheets go (default: SCENE_instances or SCENE_views here)",
+        help="where pictures go (default: SCENE_instances, SCENE_views or SCENE_graph here)",
     )
     show.add_argument(
         "--overrides-template",
@@ -95,10 +101,12 @@ def run_show(arguments: argparse.Namespace) -> int:
     registry = SceneRegistry(arguments.registry)
     record = registry.get(arguments.scene)
     bundle = registry.load(arguments.scene)
-    if arguments.instances and arguments.views:
-        raise UsageError("--instances and --views write different sheets; ask for one of them")
-    if (arguments.set or arguments.work_dir) and not arguments.views:
-        raise UsageError("--set and --work-dir belong to: simrecon show SCENE --views")
+    if arguments.instances + arguments.views + arguments.graph > 1:
+        raise UsageError("--instances, --views and --graph write different pictures; ask for one of them")
+    if arguments.set and not arguments.views:
+        raise UsageError("--set belongs to: simrecon show SCENE --views")
+    if arguments.work_dir and not (arguments.views or arguments.graph):
+        raise UsageError("--work-dir belongs to: simrecon show SCENE --views, or --graph")
     if arguments.overrides_template and not arguments.instances:
         raise UsageError("--overrides-template belongs to: simrecon show SCENE --instances")
     if arguments.instances:
@@ -107,8 +115,12 @@ def run_show(arguments: argparse.Namespace) -> int:
         from reconstruction.commands.views import show_views
 
         return show_views(arguments, bundle, registry.root)
+    if arguments.graph:
+        from reconstruction.commands.graph import show_graph
+
+        return show_graph(arguments, bundle, registry.root)
     if arguments.out:
-        raise UsageError("--out belongs to: simrecon show SCENE --instances, or --views")
+        raise UsageError("--out belongs to: simrecon show SCENE --instances, --views or --graph")
     if arguments.json:
         from reconstruction.profiling import costs_json
 

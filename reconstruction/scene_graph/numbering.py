@@ -12,6 +12,7 @@ from registry.geometry import transform_points
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _RINGS = (0.0, 1.0, 1.5, 2.2, 3.0, 4.0, 5.5, 7.5)  # heights of a label away from its thing
 _DIRECTIONS = 16
+_SPECK = 5e-5  # of the picture: smaller parts and holes of a thing get no outline
 
 
 def id_map(assets: AssetSet, camera: Camera, world_from_camera: np.ndarray) -> np.ndarray:
@@ -46,9 +47,9 @@ def number_things(
     out = np.ascontiguousarray(picture).copy()
     scale = max(min(picture.shape[:2]) / 768, 0.5)
     for number in things:
-        contours, _ = cv2.findContours(
-            (ids == number).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE
-        )
+        smooth = cv2.medianBlur((ids == number).astype(np.uint8), 3)
+        contours, _ = cv2.findContours(smooth, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        contours = [c for c in contours if len(contours) == 1 or cv2.contourArea(c) > _SPECK * ids.size]
         cv2.drawContours(out, contours, -1, (255, 255, 255), max(round(4 * scale), 2), cv2.LINE_AA)
         cv2.drawContours(out, contours, -1, color_of(number), max(round(2 * scale), 1), cv2.LINE_AA)
     taken = np.zeros(ids.shape, bool)

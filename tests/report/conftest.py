@@ -102,7 +102,7 @@ def reconstructed(tmp_path_factory) -> Reconstructed:
         "instances": found,
         "assets": assets,
         "scene_graph": graph,
-        "assembly": assemble(assets, graph, AssemblyConfig()),
+        "assembly": assemble(assets, graph.plain(), AssemblyConfig()),
     }
     publish(home, results, PipelineConfig(surface=SurfaceConfig(voxel_size_m=0.016)))
     write_truth(capture, home / "truth")
