@@ -8,6 +8,7 @@ from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts, end_decomposer
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
+from reconstruction.assets.cut_off import Room, continued, cut_off_sides, lone_front, with_copies
 from reconstruction.assets.fused import fused_points, without_strays
 from reconstruction.assets.generation.complete import Attempt, SurfaceColors, generated_shape
 from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
@@ -227,12 +228,19 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     hanging = hanging_slab(item.id, frame, scene.posed, scene.depth.camera, scene.found, config)
     if hanging is not None:
         return Shape(hanging.body, frame, "observed+slab" + ("+completed" if hanging.completed else ""))
+    room = Room(scene.posed, scene.depth.camera, scene.depth.depth, scene.surface, scene.found)
+    front = lone_front(item.id, frame, seen, room)
+    if front is not None:
+        return Shape(front, frame, "observed+front")
     noise = object_noise(scene.posed, scene.depth, scene.pixels, seen, item.id)
+    sides = cut_off_sides(item.id, frame, seen, room)
+    frame = with_copies(frame, sides)
     volume = fuse_volume(item.id, frame, noise, scene.posed, scene.depth, scene.pixels, config)
     furniture = float(np.ptp(frame.points, axis=0).max()) > config.furniture_m
     # A container's rim may be close to what it holds; a table has none.
     grow = max(2.0 * volume.noise_m, volume.voxel_m, 0.012 if furniture else 0.004)
     volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))
+    volume = continued(volume, sides)
     attempt = None
     if scene.fetched is not None:
         space = scene.surface.space
@@ -246,7 +254,7 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
             body, how = relief(fused, frame.wall_y, config), "observed+relief"
     if body is None:
         return box_fallback(item, seen.points)
-    return Shape(body, frame, how, attempt)
+    return Shape(body, frame, how + "+continued" * bool(sides), attempt)
 
 
 def embedded_solid(

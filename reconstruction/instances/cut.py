@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.instances.base import base_entities, base_planes
+from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.base_planes import FittedPlane, base_owner, behind_base
@@ -41,3 +42,4 @@ class Cut:
 
     things: list[Thing]
     owner: np.ndarray  # int32 (v,)
+    told: FrameMasks | None = None  # masks it was made by, with ids of the base, then of things

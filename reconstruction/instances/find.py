@@ -1,11 +1,16 @@
 """The stage itself: base planes, the cut, boxes and labels, id maps."""
 
+from dataclasses import replace
+
+import numpy as np
+
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.cut import Shell
+from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
 from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
+from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.refine import refine_by_views
 from reconstruction.instances.rules import cut_by_rules
 from reconstruction.instances.scraps import without_unseen
@@ -48,5 +53,12 @@ def find_instances(
     progress.advance()
     if not objects:
         progress.note("No separate things were found: the scene is an empty room.")
-    id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, progress=progress)
+    told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
+    id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, told, progress=progress)
     return without_unseen(InstanceSet(vertex_instance, shell.base, objects, id_maps), config, progress)
+
+
+def _with_numbers(told: FrameMasks, cut: Cut, base: int, vertex_instance: np.ndarray) -> FrameMasks:
+    """Return the masks with the numbers of things that `describe` gave, for ids in the order of the cut."""
+    numbers = [vertex_instance[thing.vertices[0]] for thing in cut.things]
+    return replace(told, ids=np.r_[np.arange(base + 1), numbers].astype(np.uint16)[told.ids])

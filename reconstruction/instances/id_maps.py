@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.masks.base import FrameMasks
+from reconstruction.instances.told_maps import ToldMaps
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import lab_from_rgb
 from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
@@ -15,17 +17,18 @@ def render_id_maps(
     surface: Surface,
     vertex_instance: np.ndarray,
     config: InstancesConfig,
+    told: FrameMasks | None = None,
     *,
     progress: Progress,
 ) -> np.ndarray:
-    """Return uint16 (n, h, w) ids per keyframe at depth resolution."""
+    """Return uint16 (n, h, w) ids per keyframe at depth resolution, as masks with ids `told` them, if there are any."""
     camera = depth.camera
+    asked = None if told is None else ToldMaps(told, surface)
     maps = np.zeros((len(posed.images), camera.height, camera.width), np.uint16)
     progress.start(len(maps), "instance maps")
     for row in range(len(maps)):
-        maps[row] = snapped_ids(
-            draw_ids(surface, vertex_instance, posed, depth, row), posed, depth, row, config
-        )
+        ids = snapped_ids(draw_ids(surface, vertex_instance, posed, depth, row), posed, depth, row, config)
+        maps[row] = ids if asked is None else cv2.medianBlur(asked.ids(ids, posed, depth, row), 3)
         progress.advance()
     return maps
 

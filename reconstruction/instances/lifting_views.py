@@ -9,7 +9,7 @@ from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.progress import Progress
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
+from reconstruction.types import DepthMaps, PosedFrames, Surface
 from registry.geometry import invert_rigid
 
 UNSEEN = -1
@@ -57,8 +57,8 @@ def view_masks(
         masks: id images of some frames.
         progress: told of every frame.
     """
-    camera = _working_camera(masks.camera)
-    columns, rows = _samples(masks.camera.width, camera.width), _samples(masks.camera.height, camera.height)
+    masks = _at_working_size(masks)
+    camera = masks.camera
     count = len(masks.frame_indices)
     seen = np.full((count, len(graph.points)), UNSEEN, np.int32)
     frame_of, id_of = [UNSEEN], [0]
@@ -66,13 +66,13 @@ def view_masks(
     key_poses = np.asarray(posed.world_from_camera, np.float64)
     progress.start(count, "masks onto the surface")
     for row in range(count):
-        ids = np.ascontiguousarray(masks.ids[row][rows[:, None], columns[None, :]])
+        ids = masks.ids[row]
         numbers, first = _numbered(ids, len(frame_of))
         frame_of += [row] * len(numbers)
         id_of += numbers.tolist()
         pose = np.asarray(masks.world_from_camera[row], np.float64)
         drawn = rasterize_mesh(points, surface.faces, camera, pose).depth
-        near = _nearest_views(pose, key_poses)
+        near = nearest_views(pose, key_poses, _WITNESSES)[0]
         confirmed = np.zeros(len(points), bool)
         for key in near:
             _confirm(
@@ -87,21 +87,22 @@ def view_masks(
     return MaskViews(seen, np.array(frame_of, np.int32), np.array(id_of, np.int32))
 
 
-def _nearest_views(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rows of the few poses (n, 4, 4) whose place and direction are most like those of `pose`."""
+def nearest_views(pose: np.ndarray, others: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows of the poses (n, 4, 4) whose place and direction are most like those of `pose`, and how far they are.
+
+    The distance is in metres; turns count as steps do.
+    """
     step = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1)
     turn = np.arccos(np.clip(others[:, :3, 2] @ pose[:3, 2], -1.0, 1.0))
-    return np.argsort(step + _TURN_M * turn, kind="stable")[:_WITNESSES]
+    away = step + _TURN_M * turn
+    near = np.argsort(away, kind="stable")[:most]
+    return near, away[near]
 
 
-def _working_camera(camera: Camera) -> Camera:
+def _at_working_size(masks: FrameMasks) -> FrameMasks:
+    camera = masks.camera
     scale = min(1.0, _MAX_SIDE_PX / max(camera.width, camera.height))
-    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-
-
-def _samples(full: int, wanted: int) -> np.ndarray:
-    """Return which of `full` pixels lie at the centers of `wanted` ones."""
-    return np.minimum(((np.arange(wanted) + 0.5) * full / wanted).astype(np.int64), full - 1)
+    return masks.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
 def _numbered(ids: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,7 @@
 """The cut by masks: clusters of masks become base or things, cleaned of what clings to them."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -44,11 +46,15 @@ def cut_by_masks(
     graph = shell.graph
     lifted = lift_masks(graph, surface, posed, depth, masks, progress)
     label = np.where(shell.behind | (lifted.share < _SURE_SHARE), 0, lifted.cluster)
-    base = _base_clusters(shell, label, lifted.count)
+    base_id = _base_clusters(shell, label, lifted.count)
+    base = base_id > 0
     frames = np.maximum((lifted.views.seen > 0).sum(axis=0), 1)
     label = _without_fragments(graph, np.where(base[label], 0, label), lifted.count, frames, lifted.share)
     label = _without_crumbs(graph, label, lifted.count, config)
-    things = [Thing(np.flatnonzero(label == c)) for c in np.unique(label[label > 0])]
+    kept = np.unique(label[label > 0])
+    things = [Thing(np.flatnonzero(label == c)) for c in kept]
+    names = base_id.copy()
+    names[kept] = len(shell.base) + 1 + np.arange(len(kept))
     _tell(lifted, base, len(things), progress)
     owner = np.where(label > 0, 0, shell.owner).astype(np.int32)
     for thing, carrier in zip(things, carriers(graph, [t.vertices for t in things])):
@@ -56,7 +62,20 @@ def cut_by_masks(
     for thing in things:
         _drop_skirts(graph, thing, [t for t in things if t.rests_on is thing])
     _mark_attached(shell, things)
-    return Cut(things, owner)
+    return Cut(things, owner, _named(masks.resized(depth.camera.width, depth.camera.height), lifted, names))
+
+
+def _named(masks: FrameMasks, lifted: Lifted, names: np.ndarray) -> FrameMasks:
+    """Return the masks with the names (count + 1,) of their clusters for ids, 0 where the cluster has none."""
+    ids = np.zeros_like(masks.ids)
+    views = lifted.views
+    for row, own in enumerate(masks.ids):
+        table = np.zeros(int(own.max()) + 1, np.uint16)
+        numbers = np.flatnonzero(views.mask_frame == row)
+        there = numbers[views.mask_id[numbers] < len(table)]
+        table[views.mask_id[there]] = names[lifted.mask_cluster[there]]
+        ids[row] = table[own]
+    return replace(masks, ids=ids)
 
 
 def _tell(lifted: Lifted, base: np.ndarray, things: int, progress: Progress) -> None:
@@ -68,7 +87,7 @@ def _tell(lifted: Lifted, base: np.ndarray, things: int, progress: Progress) -> 
 
 
 def _base_clusters(shell: Shell, label: np.ndarray, count: int) -> np.ndarray:
-    """Return which clusters, bool (count + 1,), are floor, wall or ceiling rather than things."""
+    """Return the base entity, int32 (count + 1,), that a cluster is part of; 0 for those that are things."""
     graph, planes = shell.graph, len(shell.base) + 1
     table = np.zeros((count + 1, planes))
     np.add.at(table, (label, shell.owner), graph.areas)
@@ -88,7 +107,7 @@ def _base_clusters(shell: Shell, label: np.ndarray, count: int) -> np.ndarray:
             colors = graph.lab[label == other] * LIGHTNESS_WEIGHT
             differs = np.linalg.norm(colors - ground, axis=1) > _OTHER_COLOR
             base[other] |= bool(large or differs.mean() < _COLORED_SHARE)
-    return base
+    return np.where(base, 1 + np.argmax(table[:, 1:], axis=1), 0).astype(np.int32)
 
 
 def _color(graph: MeshGraph, chosen: np.ndarray) -> np.ndarray:

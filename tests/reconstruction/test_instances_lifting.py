@@ -7,11 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from surfaces import floor_sheet, frames_of, looking_at, merged, sheet, solid_box, surface_from
 
 from reconstruction.config import PipelineConfig
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.cut import Shell
+from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.lifting import lift_masks
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import FrameMasks
@@ -312,6 +314,33 @@ def test_folder_of_held_out_frames_only(room, tmp_path):
     found = find_instances(posed, depth, room.surface, config, progress=NO_PROGRESS)
     assert len(found.objects) == len(THINGS)
     assert len(found.id_maps) == len(posed.images)
+
+
+def test_masks_reach_keyframes_that_have_none(room):
+    """Things that drag along what is around them are drawn fat; masks follow the picture."""
+    spoiled = room.part_of_vertices()
+    things = {name: NAMES.index(name) + 1 for name in ("box", "cup")}
+    for number in things.values():
+        own = room.surface.vertices[spoiled == number]
+        spoiled[cKDTree(own).query(room.surface.vertices)[0] < 0.06] = number
+    config = InstancesConfig(snap_radius_px=0)
+
+    def maps(told: FrameMasks | None) -> np.ndarray:
+        return render_id_maps(
+            room.posed, room.depth, room.surface, spoiled, config, told, progress=NO_PROGRESS
+        )
+
+    carried, drawn = maps(room.masks(chosen=slice(0, None, 2))), maps(None)
+    for number in things.values():
+        own = room.parts[1::2] == number
+        assert iou(drawn[1::2] == number, own) < 0.8
+        assert iou(carried[1::2] == number, own) > 0.9
+    nothing = room.masks(np.zeros_like(room.parts))
+    np.testing.assert_array_equal(maps(nothing), [cv2.medianBlur(ids, 3) for ids in drawn])
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return np.count_nonzero(a & b) / np.count_nonzero(a | b)
 
 
 def test_folder_errors(room, tmp_path):

@@ -4,7 +4,7 @@ Masks of one frame are one id image; the ids of two frames have nothing to do wi
 room is decided by `reconstruction.instances.lifting`, from their agreement across views.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +21,17 @@ class FrameMasks:
     frame_indices: np.ndarray  # int32 (n,) video frame numbers
     world_from_camera: np.ndarray  # float64 (n, 4, 4)
     ids: np.ndarray  # uint16 (n, h, w), 0 = in no mask
+
+    def resized(self, width: int, height: int) -> "FrameMasks":
+        """Return the masks at another resolution of the same aspect; a pixel takes what lies at its center."""
+        columns, rows = _centers(self.camera.width, width), _centers(self.camera.height, height)
+        ids = np.ascontiguousarray(self.ids[:, rows[:, None], columns[None, :]])
+        return replace(self, camera=self.camera.resized(width, height), ids=ids)
+
+
+def _centers(full: int, wanted: int) -> np.ndarray:
+    """Return which of `full` pixels lie at the centers of `wanted` ones."""
+    return np.minimum(((np.arange(wanted) + 0.5) * full / wanted).astype(np.int64), full - 1)
 
 
 class MaskBackend(Protocol):
