@@ -13,13 +13,13 @@ from reconstruction.assets.fused import fused_points, without_strays
 from reconstruction.assets.generation.complete import Attempt, SurfaceColors, generated_shape
 from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
 from reconstruction.assets.hanging import hanging_slab
-from reconstruction.assets.hanging_relief import relief
+from reconstruction.assets.hanging_relief import mound, relief
 from reconstruction.assets.physics.base import choice_for
 from reconstruction.assets.physics.load import load_physicist
 from reconstruction.assets.physics.mass import physical_attributes
 from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.solid import Solid
-from reconstruction.assets.standing import Stands, find_stands, without_children
+from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, frame_object, fuse_volume
 from reconstruction.avo import SceneViews
@@ -39,6 +39,7 @@ from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
 
 _COVERED_SHARE = 0.75  # of what was seen, along each axis
+_HUNG_SHARE = 0.9  # the fused surface of what hangs has no skirts behind it
 
 
 @dataclass(frozen=True)
@@ -240,7 +241,7 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     # A container's rim may be close to what it holds; a table has none.
     grow = max(2.0 * volume.noise_m, volume.voxel_m, 0.012 if furniture else 0.004)
     volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))
-    volume = continued(volume, sides)
+    volume = within_walls(continued(volume, sides), frame, scene.found)
     attempt = None
     if scene.fetched is not None:
         space = scene.surface.space
@@ -250,8 +251,10 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     body, how = embedded_solid(volume, frame, config, furniture=furniture)
     if frame.wall_y is not None:
         fused = fused_points(item.id, frame, scene.surface, scene.found)
-        if len(fused) and not _covers(body, fused):
+        if len(fused) and not _covers(body, fused, _HUNG_SHARE):
             body, how = relief(fused, frame.wall_y, config), "observed+relief"
+    elif not furniture and not _covers(body, frame.points):
+        body, how = mound(frame.points, config), "observed+relief"
     if body is None:
         return box_fallback(item, seen.points)
     return Shape(body, frame, how + "+continued" * bool(sides), attempt)
@@ -280,12 +283,12 @@ def embedded_solid(
     return body, "observed+" + ("+".join(field.symmetries) or "carved")
 
 
-def _covers(body: Solid | None, points: np.ndarray) -> bool:
+def _covers(body: Solid | None, points: np.ndarray, share: float = _COVERED_SHARE) -> bool:
     """Tell whether a body is as large as what was seen: a wrong symmetry frees what was there, as do few pixels."""
     if body is None:
         return False
     seen = np.ptp(np.percentile(points, [3, 97], axis=0), axis=0)
-    return bool((body.extents > _COVERED_SHARE * seen).all())
+    return bool((body.extents > share * seen).all())
 
 
 def box_fallback(item: Instance, points: np.ndarray) -> Shape:

@@ -14,6 +14,8 @@ from reconstruction.assets import symmetry
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 
+_HIDDEN_M = 0.02  # of a foot
+
 
 @dataclass(frozen=True)
 class CompletedField:
@@ -38,7 +40,7 @@ def complete(
     else:
         hull = hull_region(volume, frame.points, to_support=True)
         solid = enclosed(volume, hull, config.enclosed_directions)
-        solid |= _contact(volume, hull, frame, furniture=furniture)
+        solid |= _contact(volume, hull, frame, solid, furniture=furniture)
     field = np.where(volume.known, volume.distance, np.where(solid, -volume.trunc_m, volume.trunc_m))
     field = _keep_shells(field.astype(np.float32), volume, config)
     return CompletedField(volume.origin, volume.voxel_m, _blend(field, volume, frame), tuple(names))
@@ -161,13 +163,19 @@ def _meets(unknown: np.ndarray, inside: np.ndarray, dx: int, dy: int) -> np.ndar
     return out
 
 
-def _contact(volume: ObjectVolume, hull: np.ndarray, frame: ObjectFrame, *, furniture: bool) -> np.ndarray:
+def _contact(
+    volume: ObjectVolume, hull: np.ndarray, frame: ObjectFrame, closed: np.ndarray, *, furniture: bool
+) -> np.ndarray:
     """Unknown voxels between the object and its support close below: seen surface ends there, so it stands there."""
     size = np.percentile(frame.points, 99, axis=0) - np.percentile(frame.points, 1, axis=0)
     reach = 0.03 if furniture else max(0.03, 0.4 * float(size[:2].min()))
+    solid_above = volume.known & (volume.distance < 0)
+    lowest = float(np.percentile(frame.points[:, 2], 1))
     if not frame.on_support:
         reach = min(reach, 0.02)
-    solid_above = volume.known & (volume.distance < 0)
+    elif not furniture and lowest > _HIDDEN_M:  # a rim hides its foot, and nothing floats
+        reach = max(reach, lowest + 2 * volume.voxel_m)
+        solid_above |= closed
     layers = min(int(np.ceil(reach / volume.voxel_m)), volume.distance.shape[2] - 1)
     z = volume.centers(2)
     first = int(np.searchsorted(z, 0.0))

@@ -4,6 +4,8 @@ A board seen edge on has few pixels in any frame, too few to carve it from; the 
 it. A thing that hangs is fixed to its wall, so that what lies between its front and the wall is taken for solid.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import ndimage
 
@@ -46,6 +48,19 @@ def relief(points: np.ndarray, wall_y: float, config: AssetsConfig) -> Solid | N
     front = closed[_CLOSED_CELLS:-_CLOSED_CELLS, _CLOSED_CELLS:-_CLOSED_CELLS]
     body = _between(front, start, steps, wall_y, cell)
     return None if body is None else lighten(body, config.faces_small, _TOLERANCE_M)
+
+
+def mound(points: np.ndarray, config: AssetsConfig) -> Solid | None:
+    """Return what lies between points (k, 3) and the support at z = 0 below them, in the grid frame.
+
+    For flat things that few frames saw, at a slant, so that rays took too much of their volume away.
+    """
+    laid = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
+    body = relief(laid, 0.0, replace(config, flat_thickness_m=config.min_thickness_m))
+    if body is None:
+        return None
+    x, down, y = body.vertices.T
+    return Solid(np.column_stack([x, y, -down]), body.faces)
 
 
 def _between(

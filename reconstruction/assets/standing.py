@@ -10,7 +10,7 @@ import numpy as np
 
 from reconstruction.assets.views import ScenePixels, SeenPoints, lift_object, within_outlines
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, support_height, without_outliers
-from reconstruction.types import DepthMaps, InstanceSet, PosedFrames
+from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _SAME_LEVEL_M = 0.015
@@ -19,6 +19,8 @@ _BOARD_M = 0.02
 _FOOTPRINT_SHRINK_M = 0.006
 _SMEAR_REACH_M = 0.06  # depth of a thing smears as far onto what is around it
 _RISE_M = 0.004
+_LEAST_HIDDEN_M, _HIDDEN_BELOW_M = 0.01, 0.02  # the rim of what hides a foot passes for its support
+_MOST_BEHIND = 0.5  # of a thing's volume: a wall that cuts off more is none
 _LEVEL_AROUND = 0.8  # of a rise's outline, where its carrier is at the level of what stands beside it
 
 
@@ -68,8 +70,11 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
         parent = item.support_hint
         if parent not in carriers:
             carriers[parent] = lift_object(posed, depth, pixels, parent, 150_000)
-        level = support_height(item, points, carriers.get(parent), found)
         low, high = np.percentile(points[:, 2], [0.5, 99.5])
+        level = support_height(item, points, carriers.get(parent), found)
+        foot = _hidden_foot(item, float(low), float(high))
+        if foot is not None and (level is None or level - foot > _HIDDEN_BELOW_M):
+            level = foot
         middle = np.median(points[:, :2], axis=0)
         # The outermost points are depth errors at the outline: drop them before the hull.
         flat = points[:: max(1, len(points) // 20_000), :2]
@@ -83,6 +88,15 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
             item.id, parent, float(low if level is None else level), level is not None, outline, float(high)
         )
     return Stands(seen, _agreed(by_child))
+
+
+def _hidden_foot(item: Instance, low: float, high: float) -> float | None:
+    """Return the height that the instance's box reaches down to, where what was seen of the thing ends higher up.
+
+    It is that of the floor of the container whose rim hides the foot; a thing is hidden by half at most.
+    """
+    bottom = float(item.center[2] - 0.5 * item.extents_m[2])
+    return bottom if _LEAST_HIDDEN_M < low - bottom <= high - low else None
 
 
 def _agreed(by_child: dict[int, Standing]) -> dict[int, Standing]:
@@ -191,6 +205,27 @@ def _smeared(
         if at_level[around].mean() >= _LEVEL_AROUND:
             out |= own
     return out
+
+
+def within_walls(volume: ObjectVolume, frame: ObjectFrame, found: InstanceSet) -> ObjectVolume:
+    """Free what lies behind a wall: the wall seen between the boards of a shelf is none of the shelf's."""
+    walls = [b.surface.plane for b in found.base if b.label == "wall"]
+    if not walls or frame.wall_y is not None:
+        return volume
+    x, y = volume.centers(0), volume.centers(1)
+    corners = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    world = transform_points(frame.world_from_grid, np.column_stack([corners, np.zeros(len(corners))]))
+    behind = np.zeros(len(world), bool)
+    for plane in walls:
+        behind |= world @ plane[:3] + plane[3] < 0
+    behind = behind.reshape(len(x), len(y))
+    if not behind.any() or behind.mean() > _MOST_BEHIND:
+        return volume
+    distance, known, free, seen = (
+        getattr(volume, name).copy() for name in ("distance", "known", "free", "seen")
+    )
+    distance[behind], known[behind], free[behind], seen[behind] = volume.trunc_m, True, True, False
+    return replace(volume, distance=distance, known=known, free=free, seen=seen)
 
 
 def _within(points: np.ndarray, outline: np.ndarray, grow_m: float) -> np.ndarray:
