@@ -8,7 +8,7 @@ from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, 
 
 __all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets", "outside_inputs", "wants_views")
 
-VERSION = 10
+VERSION = 11
 
 
 def build_assets(
