@@ -23,15 +23,18 @@ from simrecon_envs.registration import (
     register_scenes,
     teach_gymnasium,
 )
+from simrecon_envs.vector import make_vec
 
 if TYPE_CHECKING:
     from simrecon_envs.oracle import Oracle
+    from simrecon_envs.randomization import Randomization
     from simrecon_envs.rollout import record_rollout, render_scene_picture
     from simrecon_envs.scene_env import SceneEnv
 
 __all__ = [
     "EnvNotFound",
     "Oracle",
+    "Randomization",
     "SceneAssetsMissing",
     "SceneEnv",
     "TaskEntry",
@@ -40,12 +43,14 @@ __all__ = [
     "list_tasks",
     "make",
     "make_cpu",
+    "make_vec",
     "record_rollout",
     "register_scenes",
     "render_scene_picture",
 ]
 
 _LAZY = {
+    "Randomization": "simrecon_envs.randomization",
     "Oracle": "simrecon_envs.oracle",
     "SceneEnv": "simrecon_envs.scene_env",
     "record_rollout": "simrecon_envs.rollout",

@@ -24,7 +24,8 @@ class Measures:
         self._row: dict[int, int] = {}
         centers = np.zeros((len(self._actors), 3))
         self._half_diagonal: dict[int, float] = {}
-        self._weight_n = {}
+        self._nominal_n: dict[int, float] = {}
+        self._weight_n: dict[int, torch.Tensor] = {}
         for number, placed in enumerate(env.builder.movable_actors):
             self._row[placed.id] = number
             target = env.facts.targets[placed.id]
@@ -33,7 +34,10 @@ class Measures:
             centers[number] = transform_points(actor_from_world, target.center[None])[0]
             cloud = np.concatenate([s.vertices for s in env.facts.solids if s.owner == placed.id])
             self._half_diagonal[placed.id] = float(np.linalg.norm(cloud - target.center, axis=1).max())
-            self._weight_n[placed.id] = item.mass_kg * _GRAVITY_M_S2
+            self._nominal_n[placed.id] = item.mass_kg * _GRAVITY_M_S2
+            self._weight_n[placed.id] = torch.full(
+                (env.num_envs,), self._nominal_n[placed.id], device=env.device
+            )
         self._centers = torch.as_tensor(centers, dtype=torch.float32, device=env.device)[None]
         self._cpu = not env.gpu_sim_enabled
         self._supported: dict[tuple[int, int], torch.Tensor] = {}
@@ -51,6 +55,10 @@ class Measures:
         self.refresh()
         for known in self._supported.values():
             known[env_idx] = False
+
+    def scale_weight(self, key: int, env_idx: torch.Tensor, factor: torch.Tensor) -> None:
+        """Say that a thing is heavier by a factor (len(env_idx),) than the bundle says."""
+        self._weight_n[key][env_idx] = self._nominal_n[key] * factor
 
     # ---- Things.
 

@@ -137,9 +137,13 @@ class SceneBuilder:
     def shift(self, key: int, env_idx: torch.Tensor, moved: np.ndarray, device: torch.device) -> None:
         """Move an object of the environments `env_idx` (b,) by (b, 3) from where the bundle has it."""
         body = next(body for body in self.bodies if body.root == key)
-        position = body.world_from_root[None, :3, 3] + moved
-        quat = np.repeat(quat_from_matrix(body.world_from_root[None, :3, :3]), len(position), axis=0)
-        self._set_pose(key, position, quat, device)
+        poses = np.repeat(body.world_from_root[None], len(env_idx), axis=0)
+        poses[:, :3, 3] += moved
+        self.place(key, poses, device)
+
+    def place(self, key: int, poses: np.ndarray, device: torch.device) -> None:
+        """Put an object where poses (b, 4, 4) say, in the environments that are being reset."""
+        self._set_pose(key, poses[:, :3, 3], quat_from_matrix(poses[:, :3, :3]), device)
 
     def _set_pose(self, key: int, position: np.ndarray, quat: np.ndarray, device: torch.device) -> None:
         p, q = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in (position, quat))

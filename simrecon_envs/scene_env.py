@@ -18,16 +18,18 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from registry import BundleError, SceneBundle, SceneNotFound, SceneRegistry, UsageError, default_registry_root
 from simrecon_envs.backends import choose_render_backend
-from simrecon_envs.cameras import Viewpoint, room_view, workspace_view
+from simrecon_envs.cameras import room_view
 from simrecon_envs.errors import SceneAssetsMissing
 from simrecon_envs.measures import Measures
 from simrecon_envs.occupancy import scene_solids
-from simrecon_envs.placement import Placement, Target
+from simrecon_envs.placement import Target
 from simrecon_envs.planning import Plan, plan_task
+from simrecon_envs.randomization import Randomization, Randomizer
 from simrecon_envs.robots import RobotShape, check_robot, rest_qpos, robot_shape, traits_of
 from simrecon_envs.scene_builder import SceneBuilder, scene_extent
 from simrecon_envs.tasks import PickTaskConfig, kind_of
 from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.viewpoints import camera, observing_cameras, parse_cameras
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +88,10 @@ class SceneEnv(BaseEnv):
         task: str = "pick",
         target: str | int = "auto",
         pose_noise: float | tuple[float, float] = 0.0,
+        randomize: str | dict | Randomization | None = None,
         robot_uids: str = "panda",
+        cameras: str | list | tuple = ("workspace",),
+        observe_objects: bool = True,
         task_config: PickTaskConfig | dict | None = None,
         obs_mode: str | None = None,
         render_mode: str | None = None,
@@ -108,8 +113,12 @@ class SceneEnv(BaseEnv):
             pose_noise: Standard deviation of a random shift of each movable object at reset (m), or of shift
                 and
                 turn (m, rad). A little noise can make objects overlap where they stand close together.
+            randomize: What differs from reset to reset: None, "all", or a dict of `Randomization`'s fields.
             robot_uids: A robot of ManiSkill, or "none".
-            task_config: Thresholds of the task.
+            cameras: Which cameras observe, by name or names with commas: "workspace" (`base_camera`), "overview",
+                "wrist", "capture:N" (N frames of the video). What the robot carries observes anyway.
+            observe_objects: Have `object_poses` in the state, whose length differs from scene to scene.
+            task_config: Thresholds of picking.
             obs_mode: As in ManiSkill; "state" where None.
             render_mode: None, "rgb_array", "sensors", "all" or "human".
             render_backend: "auto" renders only if a mode asks for pictures; "gpu", "cpu" and "none" as in
@@ -140,8 +149,12 @@ class SceneEnv(BaseEnv):
             robot_shape(robot_uids) if robot_uids != "none" else RobotShape(np.zeros((0, 3)), None, False)
         )
         self.facts = SceneFacts(self.bundle, robot_uids, self._solids)
+        self.observe_objects = observe_objects
+        self.cameras = parse_cameras(cameras)
         self._apply(plan_task(self.facts, task, target, self._shape))
         self.measures: Measures | None = None
+        self.randomization = Randomization.parse(randomize)
+        self._randomizer = Randomizer(self, self.randomization)
         super().__init__(
             obs_mode=obs_mode,
             render_mode=render_mode,
@@ -186,16 +199,18 @@ class SceneEnv(BaseEnv):
         )
 
     @property
+    def robot_points(self) -> np.ndarray:
+        """Return points (n, 3) on the robot at rest, in its root space."""
+        return self._shape.points
+
+    @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        middle = (self.builder.extent[0] + self.builder.extent[1]) / 2
-        placement = self.placement or Placement(middle, 0.0, 0.0, None, "")
-        view = workspace_view(self._solids, placement, middle, self._shape.points)
-        return [_camera("base_camera", view, 128)]
+        return observing_cameras(self, self.cameras)
 
     @property
     def _default_human_render_camera_configs(self) -> list[CameraConfig]:
         view = room_view(self.bundle, self._solids, self.placement, self._shape.points)
-        return [_camera("render_camera", view, 512)]
+        return [camera("render_camera", view, 512)]
 
     def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, self._root_pose() if self.placement is not None else None)
@@ -209,6 +224,10 @@ class SceneEnv(BaseEnv):
             pedestal = (top, self.placement.pedestal_m - 0.004, radius)
         self.builder.build(self.scene, pedestal)
         self.measures = Measures(self)
+        self._randomizer.rebuilt()
+        if self.gpu_sim_enabled:
+            every = torch.arange(self.num_envs, device=self.device)
+            self._randomizer.physics(every, self._batched_episode_rng)
 
     def _load_lighting(self, options: dict) -> None:
         # The textures come from a video and carry the room's light already: mostly ambient, a little shape.
@@ -227,12 +246,40 @@ class SceneEnv(BaseEnv):
             gym.Env.reset(self, seed=int(np.ravel(seed)[0]))
         return super().reset(seed=seed, options=options)
 
+    def step(self, action: np.ndarray | torch.Tensor | dict | None) -> tuple:
+        """Step as ManiSkill does; actions outside [-1, 1] are clipped where the controller normalizes them.
+
+        Raises:
+            UsageError: the action has another shape than the action space, or is not finite.
+        """
+        if isinstance(action, np.ndarray | torch.Tensor):
+            self._check_action(action)
+        return super().step(action)
+
+    def _check_action(self, action: np.ndarray | torch.Tensor) -> None:
+        if self.agent is None:
+            raise UsageError("this environment has no robot: step(None)")
+        single, shape = self._orig_single_action_space.shape, tuple(action.shape)
+        if shape != (self.num_envs, *single) and not (self.num_envs == 1 and shape == single):
+            raise UsageError(f"action: expected the shape {(self.num_envs, *single)} or, of one environment, "
+                             f"{single}; got {shape}")  # fmt: skip
+        if isinstance(action, np.ndarray):
+            finite = np.isfinite(action).all()
+        else:
+            finite = self.gpu_sim_enabled or torch.isfinite(action).all()
+        if not finite:
+            raise UsageError("action: expected finite numbers, got NaN or infinity")
+
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
         if self.agent is not None:
             qpos = torch.as_tensor(rest_qpos(self.agent), dtype=torch.float32, device=self.device)
             self.agent.reset(qpos.repeat(len(env_idx), 1))
             self.agent.robot.set_pose(Pose.create(self._root_pose(), device=self.device))
+        self._randomizer.poses(env_idx, self._batched_episode_rng)
+        if not self.gpu_sim_enabled:  # on the GPU they are fixed once the simulation runs
+            self._randomizer.physics(env_idx, self._batched_episode_rng)
+        self._randomizer.looks(env_idx, self._batched_episode_rng)
         self.measures.forget(env_idx)
         if self.task_object is not None:
             self.task_object.start(env_idx, self._batched_episode_rng)
@@ -272,6 +319,10 @@ class SceneEnv(BaseEnv):
 
     # ---- Observations.
 
+    def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
+        data = super()._get_obs_sensor_data(apply_texture_transforms)
+        return self._randomizer.pictures(data, self._batched_episode_rng)
+
     def _get_obs_agent(self) -> dict:
         return super()._get_obs_agent() if self.agent is not None else {}
 
@@ -284,16 +335,9 @@ class SceneEnv(BaseEnv):
             # What a robot knows without being told where things are: its own touch, and the goal it was given.
             return obs | {key: value for key, value in known.items() if key.endswith(PUBLIC)}
         obs |= known
-        if self.movable_ids:
+        if self.movable_ids and self.observe_objects:
             obs["object_poses"] = self.measures.poses.flatten(1)
         return obs
-
-
-def _camera(uid: str, view: Viewpoint, size_px: int) -> CameraConfig:
-    pose = sapien.Pose(view.eye, view.quat_wxyz)
-    return CameraConfig(
-        uid=uid, pose=pose, width=size_px, height=size_px, fov=view.fov_rad, near=0.01, far=100
-    )
 
 
 def _load(scene_id: str, revision: str | None, registry: str | None, strict: bool) -> tuple[SceneBundle, str]:

@@ -57,18 +57,25 @@ class Put(Carry):
         center = np.zeros(3) if target is None else target.center
         self._container_home = torch.as_tensor(center, dtype=torch.float32, device=device)[None]
 
-    def _container_moved(self) -> torch.Tensor:
+    def _from_captured(self, points: torch.Tensor, back: bool = False) -> torch.Tensor:
+        """Take points (b, 3) along with the container from where it was captured, or `back` there."""
         if self.spec.place not in self.facts.targets:
-            return torch.zeros_like(self.goal)
-        return self.env.measures.position(self.spec.place) - self._container_home
+            return points
+        measures, home = self.env.measures, self._container_home
+        here, yaw = measures.position(self.spec.place), measures.yaw(self.spec.place)
+        if back:
+            here, home, yaw = home, here, -yaw
+        c, s = torch.cos(yaw), torch.sin(yaw)
+        x, y, z = (points - home).unbind(dim=1)
+        return torch.stack([c * x - s * y, s * x + c * y, z], dim=1) + here
 
     def live_goal(self) -> torch.Tensor:
-        return self.goal + self._container_moved()
+        """Return the goal inside the container, where that is now."""
+        return self._from_captured(self.goal)
 
     def _arrived(self) -> Info:
         inside = self.facts.container(self.spec.place)
-        moved = self._container_moved()
-        local = self.env.measures.position(self.subject) - moved
+        local = self._from_captured(self.env.measures.position(self.subject), back=True)
         nearest = torch.abs(local[:, None, :2] - self._cells[None]).amax(dim=2).amin(dim=1)
         within = nearest <= 0.01
         bottom = local[:, 2] - self.facts.height_m(self.subject) / 2

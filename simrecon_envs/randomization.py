@@ -1,0 +1,359 @@
+"""Domain randomization: what may differ from one reset to the next, all of it drawn from the reset's seed.
+
+Poses stay within the support: a thing and what stands on it move together, stay on the level they stand on, and
+touch nothing that they did not touch before. Mass and friction stay within the bundle's `ranges`.
+"""
+
+import zlib
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from registry import UsageError
+from simrecon_envs.surfaces import CELL_M, height_map
+from simrecon_envs.tasks.facts import SceneFacts
+
+_TRIES = 6
+_TINTS = 4  # of each texture, made when they are first drawn
+_TINTED_PX = 512
+_GAP_M = 0.004
+_LEVEL_M = 0.006
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomization:
+    """How much differs. 0 is nothing; `all` is `Randomization.everything()`."""
+
+    shift_m: float = 0.0
+    """Greatest horizontal shift of a thing along x and y."""
+    turn_rad: float = 0.0
+    """Greatest turn about the vertical."""
+    mass: float = 0.0
+    """Which share of the bundle's range of masses is drawn from, on a logarithmic scale."""
+    friction: float = 0.0
+    """Which share of the bundle's range of frictions is drawn from."""
+    lights: float = 0.0
+    """Greatest relative change of the lights' brightness and color."""
+    textures: float = 0.0
+    """Greatest relative change of the things' colors."""
+    camera_m: float = 0.0
+    """Standard deviation of the position of the cameras that stand still."""
+    camera_rad: float = 0.0
+    """Standard deviation of their orientation."""
+    image_noise: float = 0.0
+    """Standard deviation of a color value, of 255; at every step."""
+    depth_noise: float = 0.0
+    """Standard deviation of depth at 1 m, in metres; it grows with the square of depth; at every step."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            most = 1.0 if field.name in ("mass", "friction", "lights", "textures") else float("inf")
+            if not isinstance(value, int | float) or not 0 <= value <= most:
+                raise UsageError(f"randomize: {field.name}={value!r} is not a number between 0 and {most:g}")
+
+    @classmethod
+    def everything(cls) -> "Randomization":
+        """Return a moderate amount of all."""
+        return cls(shift_m=0.05, turn_rad=0.5, mass=1.0, friction=1.0, lights=0.4, textures=0.3, camera_m=0.02,
+                   camera_rad=0.03, image_noise=4.0, depth_noise=0.003)  # fmt: skip
+
+    @classmethod
+    def parse(cls, value: "str | dict | Randomization | None") -> "Randomization":
+        """Return what an option means: None or "none", "all", or a dict of the fields.
+
+        Raises:
+            UsageError: lists the fields.
+        """
+        if isinstance(value, cls):
+            return value
+        if value in (None, "none"):
+            return cls()
+        if value == "all":
+            return cls.everything()
+        names = [field.name for field in fields(cls)]
+        if not isinstance(value, dict) or set(value) - set(names):
+            raise UsageError(
+                f'randomize: expected "none", "all" or a dict of {", ".join(names)}, got {value!r}'
+            )
+        return cls(**value)
+
+    @property
+    def any(self) -> bool:
+        """Tell whether anything differs at all."""
+        return any(asdict(self).values())
+
+
+class Randomizer:
+    """Draws and applies a `Randomization` in an environment."""
+
+    def __init__(self, env: Any, config: Randomization) -> None:
+        """Plan the groups that move together; `env` is a `SceneEnv` whose facts are known."""
+        self._env, self.config = env, config
+        self._entries = {entry["id"]: entry for entry in env.bundle.scene["objects"]}
+        self._groups = _groups(env.facts) if config.shift_m or config.turn_rad else []
+        self._home: dict[str, np.ndarray] = {}
+        self._nominal: dict[int, tuple] = {}
+
+    # ---- Poses.
+
+    def poses(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Move the groups in the environments `env_idx`, which have their captured poses."""
+        if not self._groups:
+            return
+        index = env_idx.cpu().numpy()
+        draws = np.asarray(rng[index].uniform(-1, 1, size=(len(self._groups), _TRIES, 3)), np.float64)
+        draws = draws.reshape(len(index), len(self._groups), _TRIES, 3)
+        moves = [self._moves(one) for one in draws]
+        for number, group in enumerate(self._groups):
+            for key in group.members:
+                poses = np.stack([move[number] @ group.start[key] for move in moves])
+                self._env.builder.place(key, poses, self._env.device)
+
+    def _moves(self, draws: np.ndarray) -> list[np.ndarray]:
+        """Return a transform (4, 4) a group from draws (groups, tries, 3) in [-1, 1]."""
+        hulls = [group.hull for group in self._groups]
+        moves = [np.eye(4) for _ in self._groups]
+        for number, group in enumerate(self._groups):
+            for draw in draws[number]:
+                shift, turn = draw[:2] * self.config.shift_m, draw[2] * self.config.turn_rad
+                move = _about(group.center, shift, turn)
+                hull = group.hull @ move[:2, :2].T + move[:2, 3]
+                others = (hulls[k] for k in range(len(hulls)) if k != number and k not in group.touching)
+                if group.on_support(hull) and not any(_overlap(hull, other) for other in others):
+                    hulls[number], moves[number] = hull, move
+                    break
+        return moves
+
+    # ---- Mass and friction.
+
+    def physics(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Draw masses and frictions in the environments `env_idx`."""
+        if not (self.config.mass or self.config.friction):
+            return
+        for body in (body for body in self._env.builder.bodies if body.dynamic):
+            factors = self._factors(body, env_idx, rng)
+            for row, number in enumerate(env_idx.tolist()):
+                self._set_physics(body, number, *factors[row])
+            weight = torch.as_tensor(factors[:, 0], dtype=torch.float32, device=self._env.device)
+            self._env.measures.scale_weight(body.root, env_idx, weight)
+
+    def _factors(self, body: Any, env_idx: torch.Tensor, rng: Any) -> np.ndarray:
+        """Return the factors of mass and friction (b, 2) of a body, by the range of its root."""
+        index = env_idx.cpu().numpy()
+        draws = np.asarray(rng[index].uniform(size=2), np.float64).reshape(len(index), 2)
+        entry = self._entries[body.root]
+        ranges = entry.get("ranges", {})
+        out = np.ones((len(index), 2))
+        for column, (name, share) in enumerate(
+            (("mass_kg", self.config.mass), ("friction", self.config.friction))
+        ):
+            low, high = np.maximum(ranges.get(name, [entry[name]] * 2), 1e-6) / max(entry[name], 1e-6)
+            ends = np.log([low, high]) * share
+            out[:, column] = np.exp(ends[0] + draws[:, column] * (ends[1] - ends[0]))
+        return out
+
+    def _set_physics(self, body: Any, number: int, mass: float, friction: float) -> None:
+        component = self._env.builder.objects[body.root].actor._bodies[number]
+        key = (body.root, number)
+        if key not in self._nominal:
+            frictions = [shape.physical_material.static_friction for shape in component.collision_shapes]
+            self._nominal[key] = (float(component.mass), np.asarray(component.inertia), frictions)
+        nominal_mass, inertia, frictions = self._nominal[key]
+        component.mass = nominal_mass * mass
+        component.inertia = (inertia * mass).astype(np.float32)
+        for shape, value in zip(component.collision_shapes, frictions, strict=True):
+            shape.physical_material.static_friction = value * friction
+            shape.physical_material.dynamic_friction = value * friction
+
+    def rebuilt(self) -> None:
+        """Forget the bodies of before: the scene was built anew."""
+        self._nominal = {}
+        self._home = {}
+
+    # ---- Looks.
+
+    def looks(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Draw lights, colors and the poses of the cameras in the environments `env_idx`."""
+        env = self._env
+        if not env.scene.can_render() or env.scene.parallel_in_single_scene:
+            return
+        for number in env_idx.tolist():
+            one = rng.rngs[number]
+            if self.config.lights:
+                _draw_lights(env.scene.sub_scenes[number], one, self.config.lights, self._home, number)
+            if self.config.textures:
+                for placed in {id(p.actor): p for p in env.builder.objects.values()}.values():
+                    _draw_tint(placed.actor._objs[number], one, self.config.textures, self._home)
+        if (self.config.camera_m or self.config.camera_rad) and not env.gpu_sim_enabled:
+            for name, sensor in env._sensors.items():
+                if sensor.entity is None:
+                    _draw_camera(name, sensor.camera, rng.rngs[0], self.config, self._home)
+
+    def pictures(self, data: dict, rng: Any) -> dict:
+        """Return the sensors' pictures with noise, which is another one at every step."""
+        if not (self.config.image_noise or self.config.depth_noise):
+            return data
+        for textures in data.values():
+            for name, picture in textures.items():
+                if name == "rgb" and self.config.image_noise:
+                    noise = torch.as_tensor(_noise(rng, picture.shape), device=picture.device)
+                    noisy = picture.float() + self.config.image_noise * noise
+                    textures[name] = noisy.round().clamp(0, 255).to(picture.dtype)
+                elif name == "depth" and self.config.depth_noise:
+                    # Integers are millimetres.
+                    unit = 1.0 if picture.is_floating_point() else 1e-3
+                    noise = torch.as_tensor(_noise(rng, picture.shape), device=picture.device)
+                    depth = picture.float() * unit
+                    noisy = (depth + self.config.depth_noise * depth**2 * noise).clamp(min=0) / unit
+                    noisy = noisy if picture.is_floating_point() else noisy.round().clamp(max=32767)
+                    textures[name] = torch.where(picture == 0, picture, noisy.to(picture.dtype))
+        return data
+
+
+@dataclass
+class _Group:
+    """A thing on something that does not move, with all that stands on it."""
+
+    members: tuple[int, ...]
+    center: np.ndarray  # (2,)
+    hull: np.ndarray  # (h, 2) convex, seen from above
+    start: dict[int, np.ndarray]  # world_from_object (4, 4)
+    level: np.ndarray  # bool (nx, ny): cells of the support at the height it stands on
+    lower: np.ndarray  # (2,)
+    touching: frozenset[int] = frozenset()  # groups whose hulls overlap as they were captured
+
+    def on_support(self, hull: np.ndarray) -> bool:
+        """Tell whether the outline lies on the level that the group stands on."""
+        edges = np.concatenate([hull, (hull + np.roll(hull, 1, axis=0)) / 2])
+        cell = np.floor((edges - self.lower) / CELL_M).astype(int)
+        if (cell < 0).any() or (cell >= self.level.shape).any():
+            return False
+        return bool(self.level[cell[:, 0], cell[:, 1]].all())
+
+
+def _groups(facts: SceneFacts) -> list[_Group]:
+    from scipy.spatial import ConvexHull
+
+    items = {item.id: item for item in facts.bundle.objects}
+    groups = []
+    for key in facts.movable:
+        parent = facts.parent[key]
+        if parent in facts.movable or facts.hangs(key):
+            continue
+        members = (key, *(k for k in facts.above(key) if k in facts.movable))
+        cloud = np.concatenate(
+            [s.vertices[:, :2] for s in facts.solids if s.owner in {key, *facts.above(key)}]
+        )
+        hull = cloud[ConvexHull(cloud).vertices]
+        target = facts.targets[key]
+        window = (hull.min(axis=0) - 0.5, hull.max(axis=0) + 0.5)
+        own = height_map([s for s in facts.solids if s.owner == parent], *window)
+        fixed = [s for s in facts.solids if s.owner not in facts.movable and s.owner != parent]
+        blocked = height_map([s for s in fixed if s.lower[2] < target.top_m], *window).top
+        level = (np.abs(own.top - target.bottom_m) <= _LEVEL_M) & (blocked <= target.bottom_m + _LEVEL_M)
+        start = {k: np.asarray(items[k].world_from_object) for k in members}
+        groups.append(_Group(members, target.center[:2], hull, start, level, own.lower))
+    for number, group in enumerate(groups):
+        near = {k for k, other in enumerate(groups) if k != number and _overlap(group.hull, other.hull)}
+        group.touching = frozenset(near)
+    return groups
+
+
+def _about(center: np.ndarray, shift: np.ndarray, turn: float) -> np.ndarray:
+    """Return the transform (4, 4) that turns about a vertical axis and shifts."""
+    c, s = np.cos(turn), np.sin(turn)
+    out = np.eye(4)
+    out[:2, :2] = [[c, -s], [s, c]]
+    out[:2, 3] = center + shift - out[:2, :2] @ center
+    return out
+
+
+def _overlap(first: np.ndarray, second: np.ndarray) -> bool:
+    """Tell whether two convex outlines (h, 2) are closer than the gap: no edge's normal separates them."""
+    for hull in (first, second):
+        edges = np.roll(hull, -1, axis=0) - hull
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+        a, b = first @ normals.T, second @ normals.T
+        apart = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0))
+        if apart.max() > _GAP_M:
+            return False
+    return True
+
+
+def _draw_lights(scene: Any, rng: np.random.RandomState, most: float, home: dict, number: int) -> None:
+    import sapien
+
+    found = [e.find_component_by_type(sapien.render.RenderDirectionalLightComponent) for e in scene.entities]
+    lights = [light for light in found if light is not None]
+    if ("lights", number) not in home:
+        home["lights", number] = [
+            np.array(scene.ambient_light)[:3],
+            *(np.array(light.color) for light in lights),
+        ]
+    for place, start in enumerate(home["lights", number]):
+        bright = 1 + most * rng.uniform(-1, 1)
+        color = np.clip(start * bright * (1 + 0.3 * most * rng.uniform(-1, 1, size=3)), 0, 4).astype(
+            np.float32
+        )
+        if place == 0:
+            scene.ambient_light = color
+        else:
+            lights[place - 1].color = color
+
+
+def _draw_tint(entity: Any, rng: np.random.RandomState, most: float, home: dict) -> None:
+    """Give an entity one of a few tints; textures hide a material's own color, so they are tinted themselves."""
+    import sapien
+
+    variant = int(rng.randint(_TINTS))
+    body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+    for place, shape in enumerate(body.render_shapes if body is not None else ()):
+        for part_number, part in enumerate(shape.parts):
+            key = ("tint", entity.name, place, part_number, entity.per_scene_id)
+            if key not in home:
+                home[key] = (np.array(part.material.base_color), part.material.base_color_texture)
+            color, texture = home[key]
+            seed = zlib.crc32(f"{entity.name} {place} {part_number} {variant}".encode())
+            tint = 1 + most * np.random.RandomState(seed).uniform(-1, 1, size=3)
+            if texture is None:
+                part.material.base_color = [*np.clip(color[:3] * tint, 0, 1), color[3]]
+                continue
+            place_of_it = (*key, variant)
+            if place_of_it not in home:
+                home[place_of_it] = _tinted(texture, tint)
+            part.material.base_color_texture = home[place_of_it]
+
+
+def _tinted(texture: Any, tint: np.ndarray) -> Any:
+    """Return a copy of a texture of 8 bits a color, at most 512 pixels wide, times a tint (3,)."""
+    import sapien
+
+    pixels = texture.download()
+    step = max(pixels.shape[1] // _TINTED_PX, 1)
+    pixels = pixels[::step, ::step].astype(np.float32)
+    pixels[..., :3] *= tint
+    return sapien.render.RenderTexture2D(pixels.clip(0, 255).astype(np.uint8), texture.format, srgb=True)
+
+
+def _draw_camera(
+    name: str, camera: Any, rng: np.random.RandomState, config: Randomization, home: dict
+) -> None:
+    import sapien
+
+    if ("camera", name) not in home:
+        home["camera", name] = camera.get_local_pose().sp
+    start = home["camera", name]
+    angles = config.camera_rad * rng.normal(size=3)
+    turn = np.linalg.norm(angles)
+    axis = angles / turn if turn > 0 else np.array([1.0, 0, 0])
+    quat = [np.cos(turn / 2), *(np.sin(turn / 2) * axis)]
+    camera.set_local_pose(start * sapien.Pose(config.camera_m * rng.normal(size=3), quat))
+
+
+def _noise(rng: Any, shape: tuple[int, ...]) -> np.ndarray:
+    return np.stack([one.standard_normal(size=shape[1:]).astype(np.float32) for one in rng.rngs])

@@ -1,0 +1,98 @@
+"""Which cameras observe: names -> ManiSkill's camera configs."""
+
+import re
+from typing import Any
+
+import numpy as np
+import sapien
+from mani_skill.sensors.camera import CameraConfig
+
+from registry import UsageError
+from registry.geometry import SAPIEN_CAMERA_FROM_OPENCV, quat_from_matrix
+from simrecon_envs.cameras import Viewpoint, room_view, workspace_view
+from simrecon_envs.placement import Placement
+
+NAMES = ("workspace", "overview", "wrist", "capture", "capture:N")
+SIZE_PX = 128
+_DEFAULT_CAPTURES = 3
+
+
+def parse_cameras(value: str | list | tuple) -> tuple[str, ...]:
+    """Return the names of an option such as "workspace,wrist" or ("overview", "capture:4").
+
+    Raises:
+        UsageError: lists the names.
+    """
+    names = tuple(value.split(",")) if isinstance(value, str) else tuple(value)
+    names = tuple(str(name).strip() for name in names)
+    for name in names:
+        if name not in NAMES[:4] and not re.fullmatch(r"capture:[1-9]\d{0,2}", name):
+            raise UsageError(f"cameras: {name!r} is not one of {', '.join(NAMES)}")
+    return names
+
+
+def observing_cameras(env: Any, names: tuple[str, ...]) -> list[CameraConfig]:
+    """Return the cameras of a `SceneEnv` whose robot is built."""
+    out = []
+    for name in names:
+        if name == "workspace":
+            middle = (env.builder.extent[0] + env.builder.extent[1]) / 2
+            placement = env.placement or Placement(middle, 0.0, 0.0, None, "")
+            view = workspace_view(env.facts.solids, placement, middle, env.robot_points)
+            out.append(camera("base_camera", view, SIZE_PX))
+        elif name == "overview":
+            view = room_view(env.bundle, env.facts.solids, env.placement, env.robot_points)
+            out.append(camera("overview", view, SIZE_PX))
+        elif name == "wrist":
+            out += _wrist(env)
+        else:
+            out += _captured(env.bundle, int(name.partition(":")[2] or _DEFAULT_CAPTURES))
+    return out
+
+
+def camera(uid: str, view: Viewpoint, size_px: int) -> CameraConfig:
+    """Return a square camera at a viewpoint."""
+    pose = sapien.Pose(view.eye, view.quat_wxyz)
+    return CameraConfig(
+        uid=uid, pose=pose, width=size_px, height=size_px, fov=view.fov_rad, near=0.01, far=100
+    )
+
+
+def _wrist(env: Any) -> list[CameraConfig]:
+    """Return a camera on the hand that looks where the fingers point; none where the robot has one already."""
+    if env.agent is None or not hasattr(env.agent, "tcp"):
+        raise UsageError(f"cameras: 'wrist' needs a robot with a hand, {env.robot_uids!r} has none")
+    carried = [config.uid for config in np.ravel(env.agent._sensor_configs).tolist()]
+    if any("hand" in uid for uid in carried):
+        return []
+    # Beside the hand; the hand's axis is +z between its fingers, a camera's +x.
+    pose = sapien.Pose([0.07, 0.0, -0.10], [np.cos(np.pi / 4), 0, -np.sin(np.pi / 4), 0])
+    return [
+        CameraConfig(
+            uid="hand_camera", pose=pose, width=SIZE_PX, height=SIZE_PX, fov=1.4, near=0.01, far=100,
+            mount=env.agent.tcp,
+        )
+    ]  # fmt: skip
+
+
+def _captured(bundle: Any, count: int) -> list[CameraConfig]:
+    """Return cameras of the video: evenly spread frames, their own lens, as high as the others."""
+    cameras = bundle.cameras
+    total = len(cameras.indices)
+    if not total:
+        raise UsageError(f"cameras: scene {bundle.scene['id']} has no capture cameras")
+    rows = np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
+    scale = SIZE_PX / cameras.height
+    fx, fy, cx, cy = np.asarray(cameras.params, np.float64)[:4] * scale
+    lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
+    out = []
+    for row in rows:
+        pose = np.asarray(cameras.world_from_camera[row])
+        quat = quat_from_matrix(pose[:3, :3] @ SAPIEN_CAMERA_FROM_OPENCV[:3, :3].T)
+        out.append(
+            CameraConfig(
+                uid=f"capture_{int(cameras.indices[row])}", pose=sapien.Pose(pose[:3, 3], quat),
+                width=round(cameras.width * scale), height=SIZE_PX, intrinsic=lens, near=0.01, far=100,
+            )
+        )  # fmt: skip
+    return out

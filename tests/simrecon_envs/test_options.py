@@ -1,0 +1,205 @@
+"""Options of environments: randomization, cameras, several at once, many scenes, hostile actions."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from conftest import BLOCK, BOX, CRATE, CUBE, CYLINDER
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+import simrecon_envs
+from registry import SceneNotFound, UsageError
+from simrecon_envs.multi import split_of
+from simrecon_envs.randomization import Randomization, _overlap
+
+
+def _make(root: Path, scene: str = "things", **kwargs: object) -> gym.Env:
+    return simrecon_envs.make(scene, registry=root, **kwargs)
+
+
+def _outline(env: gym.Env, key: int) -> np.ndarray:
+    """Return where an object's outline (h, 2) is now."""
+    scene = env.unwrapped
+    item = next(o for o in scene.bundle.objects if o.id == key)
+    group = next(g for g in scene._randomizer._groups if key in g.members)
+    now = scene.builder.objects[key].actor.pose.to_transformation_matrix()[0].numpy()
+    move = now @ np.linalg.inv(item.world_from_object)
+    return group.hull @ move[:2, :2].T + move[:2, 3]
+
+
+def test_poses_stay_on_their_support_and_apart(scenes_root: Path) -> None:
+    env = _make(scenes_root, randomize={"shift_m": 0.10, "turn_rad": 1.0})
+    keys = (CUBE, CYLINDER, BLOCK, CRATE)
+    seen = []
+    for seed in range(12):
+        env.reset(seed=seed)
+        hulls = [_outline(env, key) for key in keys]
+        seen.append(np.concatenate(hulls))
+        for number, hull in enumerate(hulls):
+            assert np.abs(hull - [0, 0.9]).max(axis=0)[0] < 0.6 + 0.01
+            assert np.abs(hull - [0, 0.9]).max(axis=0)[1] < 0.4 + 0.01
+            assert not any(_overlap(hull, other) for other in hulls[:number])
+        for _ in range(3):
+            env.step(None)
+        heights = env.unwrapped.measures.positions[0, :, 2].numpy()
+        expected = [env.unwrapped.facts.targets[key].center[2] for key in env.unwrapped.movable_ids]
+        np.testing.assert_allclose(heights, expected, atol=1e-3)
+    assert np.std(seen, axis=0).min() > 0.01  # every thing did move
+    env.close()
+
+
+def test_what_stands_on_a_thing_moves_with_it(scenes_root: Path) -> None:
+    env = _make(scenes_root, "room", randomize={"shift_m": 0.05})
+    assert [group.members for group in env.unwrapped._randomizer._groups] == [(10,), (11,), (14,)]
+    env.close()
+
+
+def test_mass_and_friction_stay_within_the_ranges_of_the_bundle(scenes_root: Path) -> None:
+    env = _make(scenes_root, randomize={"mass": 1.0, "friction": 1.0})
+    scene = env.unwrapped
+    ranges = {"mass_kg": [0.1, 0.6], "friction": [0.5, 0.9]}
+    scene._randomizer._entries[CUBE]["ranges"] = ranges
+    body = scene.builder.objects[CUBE].actor._bodies[0]
+    inertia = np.array(body.inertia) / body.mass
+    masses, frictions = [], []
+    for seed in [*range(30), 7]:
+        env.reset(seed=seed)
+        masses.append(body.mass)
+        frictions.append(body.collision_shapes[0].physical_material.static_friction)
+        np.testing.assert_allclose(np.array(body.inertia) / body.mass, inertia, rtol=1e-3)
+    for values, name in ((masses, "mass_kg"), (frictions, "friction")):
+        low, high = ranges[name]
+        assert low - 1e-6 <= min(values) < max(values) <= high + 1e-6
+        assert max(values) - min(values) > 0.6 * (high - low)
+        assert values[7] == values[-1]
+    other = scene.builder.objects[BLOCK].actor._bodies[0]
+    assert other.mass == pytest.approx(0.8)  # without ranges, it is what it is
+    env.close()
+
+
+def test_randomized_runs_are_identical_by_seed(scenes_root: Path) -> None:
+    # Built anew at every reset: what PhysX keeps of the last episode changes the last bits of the next.
+    env = _make(scenes_root, randomize="all", task="push_block", reconfiguration_freq=1)
+    traces = []
+    for _ in range(2):
+        trace = [env.reset(seed=5)[0].clone()]
+        env.action_space.seed(5)
+        trace += [env.step(env.action_space.sample())[0].clone() for _ in range(30)]
+        traces.append(torch.stack(trace))
+    assert torch.equal(*traces)
+    assert not torch.equal(traces[0][0], env.reset(seed=6)[0])
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "value", ["some", {"shift": 1}, {"mass": 2.0}, {"shift_m": -1}, 3, {"turn_rad": float("nan")}]
+)
+def test_wrong_randomization_lists_the_fields(value: object) -> None:
+    with pytest.raises(UsageError, match=r"shift_m|between 0 and|mass=2|turn_rad"):
+        Randomization.parse(value)
+
+
+def test_wrong_cameras_list_the_names(scenes_root: Path) -> None:
+    for value in ("side", ("workspace", "capture:0"), "wrist:2"):
+        with pytest.raises(UsageError, match="workspace, overview, wrist, capture"):
+            _make(scenes_root, cameras=value)
+
+
+@pytest.mark.parametrize(
+    "action", [np.full(8, np.nan), np.full(8, np.inf), np.zeros(7), np.zeros((2, 8)), np.zeros(())]
+)
+def test_actions_that_mean_nothing_are_refused(action: np.ndarray, scenes_root: Path) -> None:
+    env = _make(scenes_root)
+    env.reset(seed=0)
+    for wrong in (action, torch.as_tensor(action)):
+        with pytest.raises(UsageError, match="action: expected"):
+            env.step(wrong)
+    env.step(np.full(8, 50.0))  # beyond the bounds: clipped
+    env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_cameras_show_what_their_names_say_and_randomization_changes_them(scenes_root: Path) -> None:
+    env = _make(
+        scenes_root, "room", target=BOX, obs_mode="rgb+depth", cameras="wrist,capture:1", randomize="all"
+    )  # fmt: skip
+    first, _ = env.reset(seed=1)
+    cameras = first["sensor_data"]
+    assert set(cameras) == {"hand_camera", "capture_0"}
+    assert cameras["capture_0"]["rgb"].shape == (1, 128, 171, 3)  # the video's own aspect
+    np.testing.assert_allclose(first["sensor_param"]["capture_0"]["intrinsic_cv"][0][:2, :2],
+                               np.diag([520 / 480 * 128] * 2), rtol=1e-4)  # fmt: skip
+    kept = {name: cameras[name]["rgb"].clone() for name in cameras}
+    other, _ = env.reset(seed=2)
+    again, _ = env.reset(seed=1)
+    for name, picture in kept.items():
+        assert torch.equal(again["sensor_data"][name]["rgb"], picture)
+        assert (other["sensor_data"][name]["rgb"].float() - picture.float()).abs().mean() > 2
+    env.close()
+
+
+@pytest.mark.parametrize("kind", ["sync", "sb3"])
+def test_several_environments_at_once(kind: str, scenes_root: Path) -> None:
+    vec = simrecon_envs.make_vec("things", 1, kind=kind, registry=scenes_root, task="reach_cube", seed=3)
+    obs = vec.reset() if kind == "sb3" else vec.reset(seed=3)[0]
+    single = simrecon_envs.make_cpu("things", registry=scenes_root, task="reach_cube")
+    expected, _ = single.reset(seed=3)
+    np.testing.assert_array_equal(obs[0], expected)
+    out = vec.step(np.zeros((1, *single.action_space.shape), np.float32))
+    assert out[0].shape == (1, *single.observation_space.shape)
+    vec.close()
+    single.close()
+
+
+@pytest.mark.slow
+def test_environments_in_processes_of_their_own(scenes_root: Path) -> None:
+    vec = simrecon_envs.make_vec("things", 2, kind="async", registry=scenes_root, task="reach_cube")
+    obs, _ = vec.reset(seed=[1, 2])
+    assert obs.shape[0] == 2
+    vec.close()
+
+
+def test_wrong_vectors_say_what_is_right(scenes_root: Path) -> None:
+    with pytest.raises(UsageError, match="sync, async, sb3"):
+        simrecon_envs.make_vec("things", 1, kind="threads", registry=scenes_root)
+    with pytest.raises(UsageError, match="at least 1"):
+        simrecon_envs.make_vec("things", 0, registry=scenes_root)
+
+
+def test_many_scenes_in_one_environment(scenes_root: Path) -> None:
+    simrecon_envs.register_scenes(scenes_root)
+    env = gym.make("SimRecon/Multi-v0", registry=str(scenes_root), task="pick", cache_size=1)
+    assert EnvSpec.from_json(env.spec.to_json()).kwargs["task"] == "pick"
+    check_env(env.unwrapped, skip_render_check=True)
+
+    def run() -> list[tuple[str, bytes]]:
+        resets = [env.reset(seed=4 if number == 0 else None) for number in range(6)]
+        return [(info["scene"], obs.tobytes()) for obs, info in resets]
+
+    first = run()
+    assert first == run()
+    assert {scene for scene, _ in first} == {"room", "things"}
+    assert list(env.unwrapped.skipped) == ["bare"]
+    assert len(env.unwrapped._made) == 1
+    assert env.reset(options={"scene": "room"})[1]["scene"] == "room"
+    with pytest.raises(UsageError, match="bare: nothing in this scene can move"):
+        env.reset(options={"scene": "bare"})
+    env.close()
+    for kwargs, error, text in (
+        ({"split": "dev"}, UsageError, "train, test, all"),
+        ({"scenes": "roo"}, SceneNotFound, "room"),
+        ({"scenes": ["bare"]}, UsageError, "none of 1 scenes can do the task"),
+    ):
+        with pytest.raises(error, match=text):
+            gym.make("SimRecon/Multi-v0", registry=str(scenes_root), **kwargs)
+
+
+def test_splits_keep_their_side() -> None:
+    names = [f"scene{number:04d}" for number in range(2000)]
+    test = [name for name in names if split_of(name) == "test"]
+    assert 0.17 < len(test) / len(names) < 0.23
+    assert split_of("scene0001") == split_of("scene0001")
