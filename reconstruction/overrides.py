@@ -24,6 +24,7 @@ ACTIONS: dict[str, tuple[str, ...]] = {
     "instances": ("relabel", "drop", "merge", "split", "make_base"),
     "assets": ("mass_kg", "material", "friction", "mesh"),
     "scene_graph": ("parent",),
+    "assembly": ("dynamic",),
 }
 _ADDRESS = ("id", "near", "at", "pixel", "relation")
 
@@ -114,6 +115,21 @@ class Overrides:
                 step = edges[step].parent
         return replace(graph, edges=tuple(edges[edge.child] for edge in graph.edges))
 
+    def movable(self, assets: "AssetSet", graph: "SceneGraph", pointer: "Pointer") -> dict[int, bool]:
+        """Return which objects shall be able to move, and which not; refuses it of what is attached to something."""
+        objects = {item.id: item for item in assets.objects}
+        attached = {edge.child: edge.parent for edge in graph.edges if edge.relation == "attached_to"}
+        out: dict[int, bool] = {}
+        for entry in self.of_stage("assembly"):
+            item = _addressed(entry, objects, pointer)
+            if item.id in attached:
+                raise UsageError(
+                    f"overrides: dynamic of object {item.id}: it is attached to {attached[item.id]} and moves as that "
+                    "does; give it a parent with relation: supported_by first"
+                )
+            out[item.id] = entry["dynamic"]
+        return out
+
     def _with_mesh(self, item: "ObjectAsset", entry: dict) -> "ObjectAsset":
         if "mesh" not in entry:
             return item
@@ -139,6 +155,8 @@ def _check(entry: Any, where: str) -> None:
         value = entry.get(name)
         if value is not None and not (isinstance(value, int | float) and 0 < value < 1e5):
             raise UsageError(f"{where}: {name} must be a positive number, got {value!r}")
+    if not isinstance(entry.get("dynamic", True), bool):
+        raise UsageError(f"{where}: dynamic must be true or false, got {entry['dynamic']!r}")
     if entry.get("relation", "supported_by") not in ("supported_by", "attached_to"):
         raise UsageError(f"{where}: relation must be supported_by or attached_to")
 

@@ -222,6 +222,12 @@ class Run:
         pointer = self._pointer(done["instances"])
         if stage.name == "assets":
             return self.overrides.apply_to_assets(plain, pointer)
+        if stage.name == "assembly":
+            assets, graph = done["assets"], done["scene_graph"]
+            movable = self.overrides.movable(assets, graph, pointer)
+            return importlib.import_module(stage.module).assemble(
+                assets, graph, self.config.assembly, movable=movable
+            )
         return self.overrides.apply_to_graph(plain, done["assets"], pointer)
 
     def _pointer(self, found: InstanceSet) -> Pointer:

@@ -27,6 +27,7 @@ from reconstruction.scene_graph.publishing import graph_of_bundle
 from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
 from registry import SceneRecord, SceneRegistry, seal_bundle
 from registry.errors import EnvironmentMissing, SimReconError
+from registry.report_card import failures
 
 if TYPE_CHECKING:
     from reconstruction.pipeline import Run
@@ -49,16 +50,15 @@ def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require
     """Write the bundle of a finished run in the work folder, then publish it atomically.
 
     Raises:
-        SimReconError: `require_stable` and an object does not stay put.
+        SimReconError: `require_stable`, and an object does not stay put or the report card falls short of something.
         EnvironmentMissing: the registry cannot be written.
     """
     report = run.results["assembly"].physics_report
-    unstable = [str(p.id) for p in run.results["assembly"].placed if p.dynamic and not p.stable]
-    if require_stable and unstable:
+    faults = failures(report)
+    if require_stable and faults:
         raise SimReconError(
-            f"{scene_id}: not published, because objects {', '.join(unstable)} do not stay put for 10 s "
-            f"(stable rate {report.get('stable_rate', 0):.2f}). Drop or fix them with --overrides, or leave out "
-            f"--require-stable."
+            f"{scene_id}: not published, because it does not rest: {'; '.join(faults)}. Drop or fix these objects with "
+            f"--overrides, or leave out --require-stable."
         )
     staging = run.store.scratch("publish")
     try:

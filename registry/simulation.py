@@ -1,11 +1,11 @@
-"""Bodies in, a bare PhysX scene and the report card of CONTRACT section 4 out. No rendering, no ManiSkill.
+"""Bodies in, a bare PhysX scene out. No rendering, no ManiSkill.
 
-Used by assembly, by `simrecon verify --physics` and by tests, so that all measure the same thing. SAPIEN is
-imported inside functions: listing a registry must not pay for it. Nothing here needs a Vulkan driver.
+Used by assembly, by the report card (`registry.report_card`) and by tests, so that all measure the same thing. SAPIEN
+is imported inside functions: listing a registry must not pay for it. Nothing here needs a Vulkan driver.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,11 @@ from registry.errors import BundleError, EnvironmentMissing, SimReconError
 from registry.geometry import matrix_from_quat, quat_from_matrix, rigid
 
 TIMESTEP_S = 1 / 240
-VERIFY_DURATION_S = 10.0
 BASE_FRICTION, BASE_RESTITUTION = 0.5, 0.0  # of floors and walls; PhysX averages them with the object's own
+_WELD = 1e6, 1e4, 1e10, "acceleration"  # stiffness, damping, limit of what holds a fixed child's turn
 # PhysX cooks at most 255 vertices per convex; flat point sets cannot be cooked and are thickened to this.
 _MAX_PART_VERTICES = 255
 _MIN_PART_THICKNESS_M = 1e-3
-_FLOAT_WINDOW_S, _FLOAT_DROP_M = 0.5, 0.005
-_FAR_AWAY_M = 1e3  # where a body that left the world is said to be: reports hold finite numbers only
 
 
 @dataclass(frozen=True)
@@ -123,8 +121,8 @@ class Physics:
         drive.set_limit_x(0, 0, 0, 0)
         drive.set_limit_y(0, 0, 0, 0)
         drive.set_limit_z(0, 0, 0, 0)
-        drive.set_limit_twist(0, 0, 0, 0)
-        drive.set_limit_cone(0, 0, 0, 0)
+        # Limits of no angle do not hold: within seconds the child turns about the joint and pushes both around.
+        drive.set_drive_property_slerp(*_WELD)
         self._entities[child].add_component(drive)
 
     def pose(self, body_id: int) -> np.ndarray:
@@ -150,6 +148,14 @@ class Physics:
         body = self._bodies[body_id]
         linear = float(np.linalg.norm(body.get_linear_velocity()))
         return linear, float(np.linalg.norm(body.get_angular_velocity()))
+
+    def kinetic_energy(self, body_id: int) -> float:
+        """Return the kinetic energy of an object, joules."""
+        body = self._bodies[body_id]
+        axes = self._entities[body_id].pose * body.cmass_local_pose
+        turning = matrix_from_quat(np.asarray(axes.q)).T @ np.asarray(body.get_angular_velocity(), np.float64)
+        linear = np.asarray(body.get_linear_velocity(), np.float64)
+        return float(0.5 * body.mass * linear @ linear + 0.5 * turning**2 @ np.asarray(body.inertia))
 
     def set_kinematic(self, body_id: int, kinematic: bool) -> None:
         """Freeze an object where it is, or let it go."""
@@ -211,72 +217,6 @@ def build_physics(
                 )
             physics.fix(spec.id, spec.fixed_to)
     return physics
-
-
-def spawn_contacts(specs: Sequence[BodySpec]) -> list[Contact]:
-    """Return every penetrating contact at the given poses, fixed objects against everything included.
-
-    PhysX reports no contact between two immovable bodies, so all objects are movable for this one step.
-    """
-    physics = build_physics([replace(spec, dynamic=not spec.base, fixed_to=None) for spec in specs])
-    physics.step()
-    return physics.contacts(0.0)
-
-
-def physics_report(
-    specs: Sequence[BodySpec],
-    *,
-    duration_s: float = VERIFY_DURATION_S,
-    timestep_s: float = TIMESTEP_S,
-) -> dict[str, Any]:
-    """Measure the report card of CONTRACT section 4: all dynamic objects together, undamped, never asleep.
-
-    Rates are shares of the dynamic objects (1.0 where there is none; `dynamic_objects` says so). JSON.
-    """
-    specs = list(specs)
-    names = {spec.id: spec.name for spec in specs}
-    deepest = min(spawn_contacts(specs), key=lambda c: c.separation_m, default=None)
-    physics = build_physics(specs, timestep_s)
-    moving = [spec for spec in specs if spec.dynamic and not spec.base]
-    physics.step(round(_FLOAT_WINDOW_S / timestep_s))
-    early = {spec.id: _finite(physics.pose(spec.id)) for spec in moving}
-    physics.step(round(duration_s / timestep_s) - round(_FLOAT_WINDOW_S / timestep_s))
-    objects = []
-    for spec in moving:
-        start, end = np.asarray(spec.world_from_object), _finite(physics.pose(spec.id))
-        moved, turned = pose_change(start, end)
-        drop = float(start[2, 3] - end[2, 3])
-        objects.append(
-            {
-                "id": spec.id,
-                "name": spec.name,
-                "moved_m": round(moved, 6),
-                "turned_deg": round(turned, 4),
-                "drop_m": round(drop, 6),
-                "floating": bool(start[2, 3] - early[spec.id][2, 3] > _FLOAT_DROP_M),
-                "stable": bool(moved < 0.02 and turned < 5.0),
-                "stable_10cm_0.1rad": bool(moved < 0.1 and np.deg2rad(turned) < 0.1),
-                "stable_5cm_drop_5deg": bool(drop < 0.05 and turned < 5.0),
-            }
-        )
-
-    def rate(key: str, empty: float) -> float:
-        return float(np.mean([o[key] for o in objects])) if objects else empty
-
-    penetration = 0.0 if deepest is None else max(0.0, -deepest.separation_m * 1e3)
-    return {
-        "duration_s": duration_s,
-        "timestep_s": timestep_s,
-        "dynamic_objects": len(objects),
-        "fixed_objects": sum(not s.dynamic and not s.base for s in specs),
-        "stable_rate": rate("stable", 1.0),
-        "stable_rate_10cm_0.1rad": rate("stable_10cm_0.1rad", 1.0),
-        "stable_rate_5cm_drop_5deg": rate("stable_5cm_drop_5deg", 1.0),
-        "floating_rate": rate("floating", 0.0),
-        "spawn_penetration_mm": round(penetration, 4),
-        "spawn_penetration_between": [] if deepest is None else [names[deepest.first], names[deepest.second]],
-        "objects": objects,
-    }
 
 
 def pose_change(start: np.ndarray, end: np.ndarray) -> tuple[float, float]:
@@ -365,13 +305,6 @@ def _sapien() -> tuple[Any, Any]:
 def _pose(sapien: Any, world_from_object: np.ndarray) -> Any:
     m = np.asarray(world_from_object, np.float64)
     return sapien.Pose(m[:3, 3].astype(np.float32), quat_from_matrix(m[:3, :3]).astype(np.float32))
-
-
-def _finite(pose: np.ndarray) -> np.ndarray:
-    """Replace a pose that diverged or left the world by a finite one far away."""
-    if np.isfinite(pose).all() and np.abs(pose[:3, 3]).max() < _FAR_AWAY_M:
-        return pose
-    return rigid(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, -_FAR_AWAY_M]))
 
 
 def convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) -> Any:

@@ -5,27 +5,47 @@ settles; then all of them are let go together, settled and measured as CONTRACT 
 not stand is repaired in bounded ways, and what was done is written into `PlacedObject.repair`.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from reconstruction.assembly.base import base_slabs
+from reconstruction.assembly.baselines import in_situ, mcmc
 from reconstruction.assembly.config import ASSEMBLY_PRESETS, AssemblyConfig
 from reconstruction.assembly.place import Placement, Placer, base_specs
 from reconstruction.assembly.workbench import object_spec
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.scene_graph.merge import breadth_first
-from reconstruction.types import AssembledScene, AssetSet, PlacedObject, SceneGraph
+from reconstruction.types import AssembledScene, AssetSet, Edge, PlacedObject, SceneGraph
 from registry.errors import SimReconError
-from registry.simulation import TIMESTEP_S, BodySpec, build_physics, physics_report, pose_change
+from registry.report_card import physics_report
+from registry.simulation import TIMESTEP_S, BodySpec, build_physics, pose_change
 
-VERSION = 4
+VERSION = 5
 
 
 def assemble(
-    assets: AssetSet, graph: SceneGraph, config: AssemblyConfig, *, progress: Progress = NO_PROGRESS
+    assets: AssetSet,
+    graph: SceneGraph,
+    config: AssemblyConfig,
+    *,
+    movable: dict[int, bool] | None = None,
+    progress: Progress = NO_PROGRESS,
 ) -> AssembledScene:
-    """Build the scene in physics, parents first, and leave it at rest."""
+    """Build the scene in physics, parents first, and leave it at rest.
+
+    Args:
+        assets: Base surfaces and objects.
+        graph: One parent for every object.
+        config: The method, and the bounds of what it may do.
+        movable: By object, the user's word on whether it can move.
+        progress: Told of every object, and of those that do not stand.
+
+    Raises:
+        SimReconError: an object has no path to the base.
+    """
+    movable = movable or {}
     by_id = {o.id: o for o in assets.objects}
     edges = breadth_first(graph.edges, [b.id for b in assets.base])
     missing = sorted(set(by_id) - {e.child for e in edges})
@@ -34,22 +54,43 @@ def assemble(
             f"assembly: the scene graph does not connect objects {missing} to the base; "
             "every object needs exactly one parent and there must be no cycle"
         )
+    base = base_specs(assets)
+    if config.method == "hierarchical":
+        found, report = _build_up(assets, edges, movable, config, progress)
+    else:
+        found = (
+            in_situ(assets, edges, movable, config)
+            if config.method == "in-situ"
+            else mcmc(assets, edges, movable, config, progress)
+        )
+        report = _report(found, base)
+    stable = {entry["id"]: entry["stable"] for entry in report["objects"]}
+    placed = tuple(_finish(found[o.id], stable.get(o.id, True)) for o in assets.objects)
+    return AssembledScene(placed, SceneGraph(tuple(found[e.child].edge for e in graph.edges)), report)
+
+
+def _build_up(
+    assets: AssetSet, edges: list[Edge], movable: dict[int, bool], config: AssemblyConfig, progress: Progress
+) -> tuple[dict[int, Placement], dict]:
+    """Place every object after its parent, then settle all of them together."""
+    by_id = {o.id: o for o in assets.objects}
     progress.start(len(edges) + config.joint_rounds, "placing objects")
-    placer = Placer(assets, edges, config)
+    placer = Placer(assets, edges, config, movable)
     for edge in _lowest_first(edges, by_id):
         placement = placer.place(by_id[edge.child], edge)
         for note in placement.notes if not placement.stands else ():
             progress.note(f"assembly: {by_id[edge.child].label} {edge.child}: {note}")
         progress.advance()
     report = _settle_together(placer, base_specs(assets), config, progress)
-    stable = {entry["id"]: entry["stable"] for entry in report["objects"]}
-    order = [o.id for o in assets.objects]
-    placed = tuple(_finish(placer.placed[i], stable.get(i, True)) for i in order)
-    edges = [placer.placed[e.child].edge for e in graph.edges]
-    return AssembledScene(placed, SceneGraph(tuple(edges)), report)
+    return placer.placed, report
 
 
-def scene_specs(placements: list[Placement], base: list[BodySpec]) -> list[BodySpec]:
+def _report(placed: dict[int, Placement], base: list[BodySpec]) -> dict:
+    """Measure the placed scene."""
+    return physics_report(scene_specs(list(placed.values()), base), [p.edge for p in placed.values()])
+
+
+def scene_specs(placements: Iterable[Placement], base: list[BodySpec]) -> list[BodySpec]:
     """Describe the placed scene to the physics, as the bundle will."""
     specs = list(base)
     for p in placements:
@@ -58,7 +99,7 @@ def scene_specs(placements: list[Placement], base: list[BodySpec]) -> list[BodyS
     return specs
 
 
-def _lowest_first(edges: list, by_id: dict) -> list:
+def _lowest_first(edges: list[Edge], by_id: dict) -> list[Edge]:
     """Order edges by depth in the graph, then by height, so that stacks and crowds fill from below."""
     depth: dict[int, int] = {}
     for edge in edges:
@@ -75,7 +116,7 @@ def _settle_together(
     best: tuple[tuple, dict[int, Placement], dict] | None = None
     for round_number in range(config.joint_rounds):
         _joint_settle(placer, base, config.joint_settle_s)
-        report = physics_report(scene_specs(list(placer.placed.values()), base))
+        report = _report(placer.placed, base)
         progress.advance()
         key = (-report["stable_rate"], report["floating_rate"], report["spawn_penetration_mm"] > 1.0)
         if best is None or key < best[0]:
@@ -92,7 +133,7 @@ def _settle_together(
             placer.commit(placement)  # the workbench may hold what a worse round came to
         for i in unstable:
             placer.hold(i, "made immovable: it does not stay where it was seen")
-        report = physics_report(scene_specs(list(placer.placed.values()), base))
+        report = _report(placer.placed, base)
     done = "it was made immovable" if config.freeze_unstable else "it was left as it is"
     for i in unstable:
         progress.note(

@@ -1,12 +1,16 @@
 """How the scene is put together: limits and rules of stage 9."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
 class AssemblyConfig:
     """Bounds of every move that assembly may make. Friction and mass are never touched."""
 
+    method: Literal["hierarchical", "in-situ", "mcmc"] = "hierarchical"
+    """From the floor up in physics, with repairs; or, to compare with, everything left where it was reconstructed, or
+    searched for poses without overlap after the fact (docs/assembly.md)."""
     fixed_extent_m: float = 0.6
     """Things on the floor larger than this are furniture: they do not move in the simulation."""
     fixed_mass_kg: float = 15.0
@@ -43,6 +47,10 @@ class AssemblyConfig:
     """Time all objects together are given to come to rest."""
     joint_rounds: int = 4
     """How often the whole scene is settled, measured and repaired."""
+    mcmc_sweeps: int = 150
+    """For `mcmc`: how often a new pose is proposed for every object."""
+    seed: int = 0
+    """For `mcmc`: seed of the proposals."""
     freeze_unstable: bool = True
     """Make what cannot be made to stand immovable (said in its `repair`), instead of leaving it unstable."""
 

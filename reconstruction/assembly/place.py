@@ -83,6 +83,15 @@ def is_furniture(asset: ObjectAsset, on_base: bool, config: AssemblyConfig) -> b
     return (on_base and large) or asset.physics.mass_kg > config.fixed_mass_kg
 
 
+def moves_by_rule(
+    asset: ObjectAsset, edge: Edge, on_base: bool, parent_moves: bool, config: AssemblyConfig
+) -> bool:
+    """Tell whether an object can move in the simulation: furniture cannot, nor what hangs on what cannot."""
+    if edge.relation == "attached_to":
+        return parent_moves
+    return not is_furniture(asset, on_base, config)
+
+
 def upright(pose: np.ndarray, max_tilt_deg: float) -> np.ndarray:
     """Remove the tilt of a pose that is nearly upright; heading and position stay."""
     up = pose[:3, 2]
@@ -100,9 +109,12 @@ def upright(pose: np.ndarray, max_tilt_deg: float) -> np.ndarray:
 class Placer:
     """Places objects one after another on the workbench, parents before children."""
 
-    def __init__(self, assets: AssetSet, edges: Sequence[Edge], config: AssemblyConfig) -> None:
-        """Start with the base."""
+    def __init__(
+        self, assets: AssetSet, edges: Sequence[Edge], config: AssemblyConfig, movable: dict[int, bool]
+    ) -> None:
+        """Start with the base; `movable` is the user's word on what can move."""
         self.config = config
+        self._movable = movable
         self._samples = {o.id: sample_object(o) for o in assets.objects}
         self._carried: dict[int, list[int]] = {}
         for edge in edges:
@@ -125,14 +137,13 @@ class Placer:
         fresh = Placement(asset, edge, start, parts, parts, True, 0.0, (), True)
         if depth > 0:
             fresh = fresh.noted(f"collision shape cut by up to {depth * 1000:.0f} mm to its visible top")
+        moves = self._movable.get(asset.id, not is_furniture(asset, on_base, self.config))
         if edge.relation == "attached_to":
             placement = self._hang(fresh)
-        elif on_base and is_furniture(asset, on_base, self.config):
+        elif on_base and not moves:
             placement = self._stand_furniture(fresh)
         else:
-            placement = self._let_settle(fresh)
-            if is_furniture(asset, on_base, self.config):
-                placement = replace(placement, dynamic=False)
+            placement = replace(self._let_settle(fresh), dynamic=moves)
         self.commit(placement)
         return placement
 

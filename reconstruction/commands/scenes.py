@@ -218,9 +218,11 @@ def run_verify(arguments: argparse.Namespace) -> int:
     report = registry.verify(arguments.scene)
     result = asdict(report)
     if arguments.physics and report.ok:
-        from registry.simulation import physics_report, specs_from_bundle
+        from registry.report_card import physics_report
+        from registry.simulation import specs_from_bundle
 
-        result["physics"] = physics_report(specs_from_bundle(registry.load(arguments.scene)))
+        bundle = registry.load(arguments.scene)
+        result["physics"] = physics_report(specs_from_bundle(bundle), bundle.edges)
     if arguments.json:
         print(json.dumps(result, indent=2, default=str))
     else:
@@ -230,12 +232,32 @@ def run_verify(arguments: argparse.Namespace) -> int:
             f"{arguments.scene}: {'all files are as published' if report.ok else 'damaged; reconstruct it again'}"
         )
         if "physics" in result:
-            physics = result["physics"]
-            print(
-                f"physics: stable {physics['stable_rate']:.0%}, "
-                f"deepest overlap {physics['spawn_penetration_mm']:.2f} mm, floating {physics['floating_rate']:.0%}"
-            )
+            print("\n".join(describe_physics(result["physics"])))
     return 0 if report.ok else 1
+
+
+def describe_physics(physics: dict) -> list[str]:
+    """Return a report card in lines."""
+    from registry.report_card import failures
+
+    contacts = physics["contacts"]
+    edges = contacts["support_edges"] + contacts["attached_edges"]
+    real = contacts["support_edges_real"] + contacts["attached_edges_real"]
+    lines = [
+        f"physics: stable {physics['stable_rate']:.0%}, "
+        f"deepest overlap {physics['spawn_penetration_mm']:.2f} mm, floating {physics['floating_rate']:.0%}, "
+        f"{physics['energy_at_rest_j']:.1e} J left after {physics['duration_s']:g} s",
+        f"contacts: {real} of {edges} edges are real; of {contacts['main_supports']} supports that bear half of an "
+        f"object or more, {len(contacts['supports_without_edge'])} are no edge",
+    ]
+    lines += [
+        f"  {e['child']} {e['relation']} {e['parent']} is no contact"
+        for e in contacts["edges_without_contact"]
+    ]
+    lines += [
+        f"  {e['child']} rests on {e['carrier']}, which is no edge" for e in contacts["supports_without_edge"]
+    ]
+    return lines + [f"  {line}" for line in failures(physics)]
 
 
 def run_remove(arguments: argparse.Namespace) -> int:

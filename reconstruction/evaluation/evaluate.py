@@ -141,9 +141,10 @@ def _cost(bundle: SceneBundle, out: Evaluation) -> None:
 
 
 def _physics(bundle: SceneBundle, out: Evaluation) -> None:
-    from registry.simulation import physics_report, specs_from_bundle
+    from registry.report_card import physics_report
+    from registry.simulation import specs_from_bundle
 
-    report = physics_report(specs_from_bundle(bundle))
+    report = physics_report(specs_from_bundle(bundle), bundle.edges)
     out.metrics.update({key: report[key] for key in _PHYSICS_KEYS})
     out.metrics["dynamic_objects"] = report["dynamic_objects"]
     assembled = [o["assembly"] for o in bundle.scene["objects"] if "assembly" in o]

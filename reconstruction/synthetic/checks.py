@@ -25,7 +25,7 @@ class RoomCheck:
     problems: tuple[str, ...]
     """One line per fault; empty: the room is possible."""
     physics: dict[str, Any]
-    """`registry.simulation.physics_report` of the true meshes; all but what hangs is free to move."""
+    """`registry.report_card.physics_report` of the true meshes; all but what hangs is free to move."""
 
     @property
     def ok(self) -> bool:
@@ -44,7 +44,7 @@ def validate_room(room: Room, duration_s: float = 10.0) -> RoomCheck:
         The faults found: overlaps deeper than 0.1 mm, contacts farther than 0.1 mm off, things that do not stand
         (moved 2 cm or turned 5 degrees, contract section 4).
     """
-    from registry.simulation import physics_report
+    from registry.report_card import physics_report
 
     meshes = {e.id: e.mesh() for e in room.entities}
     problems = [f"{e.name}: its mesh is not closed" for e in room.entities if not meshes[e.id].is_volume]

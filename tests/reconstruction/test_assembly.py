@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from boxes import ball_part, box, box_part, floor, room, thing, tilt, tray, wall
 
-from reconstruction.assembly import AssemblyConfig, assemble, base_slabs
+from reconstruction.assembly import AssemblyConfig, assemble, base_slabs, scene_specs
 from reconstruction.assembly.base import convex_part
+from reconstruction.assembly.baselines import in_situ
 from reconstruction.assembly.collision import cut, flatten_foot
+from reconstruction.assembly.place import base_specs
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
 from reconstruction.types import AssembledScene, AssetSet, Edge, SceneGraph
 from registry.errors import SimReconError
 from registry.geometry import rigid, transform_points
+from registry.simulation import build_physics, pose_change
 
 
 def build(assets: AssetSet, **options) -> tuple[AssembledScene, dict]:
@@ -100,6 +103,79 @@ def test_neighbors_that_overlap_are_moved_apart():
     assert_at_rest(scene)
     assert placed[11].world_from_object[0, 3] - placed[10].world_from_object[0, 3] >= 0.0995
     assert max(p.moved_m for p in scene.placed) < 0.02
+
+
+def test_what_hangs_on_a_thing_that_moves_is_fixed_to_it():
+    crate, handle = box(10, (0.3, 0.3, 0.2), (0, 0, 0)), box(11, (0.1, 0.03, 0.03), (0, -0.165, 0.1))
+    graph = SceneGraph((Edge(10, "supported_by", 1, 1.0, ""), Edge(11, "attached_to", 10, 1.0, "")))
+    scene = assemble(room(crate, handle), graph, AssemblyConfig())
+    assert_at_rest(scene)  # on its own the handle would fall
+    placed = {p.id: p for p in scene.placed}
+    assert placed[10].dynamic
+    assert placed[11].dynamic
+    assert scene.physics_report["contacts"]["attached_edges_real"] == 1
+    specs = scene_specs(
+        in_situ(assets_at(room(crate, handle), placed), graph.edges, {}, AssemblyConfig()).values(),
+        base_specs(room(crate, handle)),
+    )
+    physics = build_physics(specs)
+    before = np.linalg.inv(physics.pose(10)) @ physics.pose(11)
+    physics._bodies[10].set_linear_velocity(np.array([1.0, 0.5, 1.0]))
+    physics._bodies[10].set_angular_velocity(np.array([0.0, 0.0, 2.0]))
+    physics.step(120)
+    assert pose_change(rigid(), physics.pose(10))[0] > 0.05
+    moved, turned = pose_change(before, np.linalg.inv(physics.pose(10)) @ physics.pose(11))
+    assert moved < 2e-3
+    assert turned < 1.0
+
+
+def assets_at(assets: AssetSet, placed: dict) -> AssetSet:
+    """Return the assets at the poses where they were placed."""
+    objects = [replace(o, world_from_object=placed[o.id].world_from_object) for o in assets.objects]
+    return replace(assets, objects=tuple(objects))
+
+
+def test_the_user_says_what_can_move():
+    assets = room(box(10, (1.0, 0.7, 0.4), (0, 0, 0), label="table"), box(11, (0.1, 0.1, 0.1), (0.1, 0, 0.4)))
+    graph = infer_scene_graph(assets, SceneGraphConfig())
+    by_rule = {p.id: p.dynamic for p in assemble(assets, graph, AssemblyConfig()).placed}
+    assert by_rule == {10: False, 11: True}
+    for method in ("hierarchical", "in-situ"):
+        scene = assemble(assets, graph, AssemblyConfig(method=method), movable={10: True, 11: False})
+        assert {p.id: p.dynamic for p in scene.placed} == {10: True, 11: False}
+
+
+def test_too_heavy_things_do_not_move():
+    _, placed = build(
+        room(box(10, (0.3, 0.3, 0.3), (0, 0, 0), mass=20.0), box(11, (0.3, 0.3, 0.3), (1, 0, 0)))
+    )
+    assert (placed[10].dynamic, placed[11].dynamic) == (False, True)
+
+
+@pytest.mark.parametrize("method", ["in-situ", "mcmc"])
+def test_baselines_leave_shapes_as_they_are_and_are_measured_alike(method):
+    assets = room(
+        box(10, (0.2, 0.2, 0.1), (0, 0, -0.008)),
+        box(11, (0.15, 0.15, 0.1), (0.01, 0, 0.085)),
+        box(12, (0.1, 0.1, 0.1), (0.5, 0.01, 0.05)),
+    )
+    edges = tuple(Edge(i, "supported_by", parent, 1.0, "") for i, parent in ((10, 1), (11, 10), (12, 1)))
+    config = AssemblyConfig(method=method, mcmc_sweeps=60)
+    scene = assemble(assets, SceneGraph(edges), config)
+    report, placed = scene.physics_report, {p.id: p for p in scene.placed}
+    assert all(p.collision == () and p.repair == "" for p in scene.placed)
+    floating = {o["id"]: o["floating"] for o in report["objects"]}
+    if method == "in-situ":
+        assert max(p.moved_m for p in scene.placed) == 0
+        assert report["spawn_penetration_mm"] == pytest.approx(8, abs=0.2)
+        assert floating == {10: False, 11: False, 12: True}
+    else:
+        assert 0.005 < placed[10].moved_m < 0.05
+        assert report["spawn_penetration_mm"] < 2.0
+        again = assemble(assets, SceneGraph(edges), config)
+        assert again.physics_report == report
+        other = assemble(assets, SceneGraph(edges), replace(config, seed=1))
+        assert not np.array_equal(other.placed[0].world_from_object, scene.placed[0].world_from_object)
 
 
 def test_uneven_table_top_carries_at_its_visible_height():

@@ -9,12 +9,11 @@ import pytest
 
 from registry.errors import BundleError, SimReconError
 from registry.geometry import rigid
+from registry.report_card import failures, physics_report, spawn_contacts
 from registry.simulation import (
     BodySpec,
     build_physics,
-    physics_report,
     pose_change,
-    spawn_contacts,
     specs_from_bundle,
 )
 
@@ -104,6 +103,15 @@ def test_fixed_child_follows_its_dynamic_parent():
     assert pose_change(expected, between)[0] < 2e-3
 
 
+@pytest.mark.parametrize("child_kg", [0.02, 0.5, 3.0])
+def test_a_fixed_child_stays_fixed_and_at_rest(child_kg):
+    arm = body(3, corners(0.1, 0.03, 0.03), (0, 0.115, 0.05), fixed_to=2, mass_kg=child_kg)
+    report = physics_report([FLOOR, body(2, CUBE, (0, 0, 0), mass_kg=8.0), arm])
+    assert report["stable_rate"] == report["at_rest_rate"] == 1.0
+    assert max(o["turned_deg"] for o in report["objects"]) < 0.1
+    assert max(o["moved_m"] for o in report["objects"]) < 1e-4
+
+
 def test_flat_pieces_and_many_vertices_can_be_used():
     flat = corners(0.2, 0.2, 0.0)
     sphere = np.random.default_rng(0).normal(size=(2000, 3))
@@ -153,3 +161,62 @@ def test_bundle_round_trip(tmp_path):
     del base["collision"]
     with pytest.raises(BundleError, match="no collision slab"):
         specs_from_bundle(SimpleNamespace(scene=scene, resolve=lambda path: tmp_path / path))
+
+
+def edge(child: int, parent: int, relation: str = "supported_by") -> SimpleNamespace:
+    return SimpleNamespace(child=child, relation=relation, parent=parent)
+
+
+def test_edges_are_held_against_who_carries_whom():
+    stack = [FLOOR, *(body(2 + k, CUBE, (0, 0, 0.1 * k)) for k in range(3))]
+    true = [edge(2, 1), edge(3, 2), edge(4, 3)]
+    contacts = physics_report(stack, true, duration_s=1)["contacts"]
+    assert contacts["support_edges_real"] == contacts["support_edges"] == contacts["main_supports"] == 3
+    assert contacts["edges_without_contact"] == contacts["supports_without_edge"] == []
+    contacts = physics_report(stack, [edge(2, 1), edge(3, 2), edge(4, 1)], duration_s=1)["contacts"]
+    assert contacts["support_edges_real"] == 2
+    (unreal,) = contacts["edges_without_contact"]
+    assert (unreal["child"], unreal["parent"], unreal["gap_mm"]) == (4, 1, None)
+    assert contacts["supports_without_edge"] == [{"child": 4, "carrier": 3, "share": 1.0}]
+
+
+def test_a_bridge_has_one_parent_and_a_lesser_carrier():
+    plank = corners(1.0, 0.1, 0.05)
+    piers = [body(2, CUBE, (-0.4, 0, 0)), body(3, CUBE, (0.25, 0, 0))]
+    specs = [FLOOR, *piers, body(4, plank, (0, 0, 0.1))]
+    report = physics_report(specs, [edge(2, 1), edge(3, 1), edge(4, 3)], duration_s=1)
+    assert report["stable_rate"] == 1.0
+    assert report["contacts"]["support_edges_real"] == 3
+    assert report["contacts"]["supports_without_edge"] == []
+    assert report["contacts"]["lesser_supports"] == 1  # it rests on the other pier, too
+
+
+def test_what_cannot_move_must_be_near_its_parent():
+    hung = body(2, CUBE, (0, 0, 0.0015), dynamic=False)
+    far = body(3, CUBE, (1, 0, 0.006), dynamic=False)
+    edges = [edge(2, 1), edge(3, 1, "attached_to")]
+    contacts = physics_report([FLOOR, hung, far], edges, duration_s=0.5)["contacts"]
+    assert (contacts["support_edges_real"], contacts["attached_edges_real"]) == (1, 0)
+    assert contacts["edges_without_contact"][0]["gap_mm"] == pytest.approx(6, abs=0.1)
+
+
+def test_energy_is_that_of_the_moving_body():
+    physics = build_physics([body(2, CUBE, (0, 0, 1.0))])
+    physics.set_gravity(2, False)
+    assert physics.kinetic_energy(2) == 0.0
+    physics._bodies[2].set_linear_velocity(np.array([0.3, 0, 0.4]))
+    physics._bodies[2].set_angular_velocity(np.array([0, 0, 2.0]))
+    about_z = 0.5 / 12 * (0.2**2 + 0.2**2)
+    assert physics.kinetic_energy(2) == pytest.approx(0.5 * 0.5 * 0.25 + 0.5 * about_z * 4, rel=1e-3)
+
+
+def test_a_card_says_what_it_falls_short_of():
+    rests = physics_report([FLOOR, body(2, CUBE, (0, 0, 0))], duration_s=1)
+    assert failures(rests) == []
+    assert rests["energy_at_rest_j"] < 1e-6
+    falls = physics_report([FLOOR, body(2, CUBE, (0, 0, 50.0)), body(3, CUBE, (1, 0, -0.005))], duration_s=1)
+    lines = failures(falls)
+    assert [o["at_rest"] for o in falls["objects"]] == [False, True]
+    assert any("body_2 does not stay put" in line for line in lines)
+    assert any("body_2 floats" in line for line in lines)
+    assert any("overlap by 5.0 mm" in line for line in lines)
