@@ -18,10 +18,10 @@ from registry.geometry import matrix_from_quat
 from registry.simulation import Contact, pose_change
 
 _REACH_M = 0.015  # how far gaps are looked for; wider ones count as this much
-_GAP_WEIGHT, _MOVED_WEIGHT = 0.3, 0.1  # beside a metre of penetration: of gap, of displacement
+_GAP_WEIGHT, _MOVED_WEIGHT = 1.0, 0.3  # beside a metre of penetration: of gap, of displacement
 _TURN_M = 0.1  # a radian of turn counts as this displacement
-_HOT_M, _COLD_M = 4e-3, 1e-4  # temperatures of the annealing
-_STEP_M, _STEP_RAD = (8e-3, 1e-3), (0.04, 0.005)  # 1-sigma of proposals, hot and cold
+_HOT_M, _COLD_M = 5e-4, 1e-5  # temperatures of the annealing
+_STEP_M, _STEP_RAD = (5e-3, 3e-4), (0.02, 1e-3)  # 1-sigma of proposals, hot and cold
 _TILT_SHARE = 0.3  # of the turn, about level axes
 
 
