@@ -43,6 +43,7 @@ def physics_section(g: Gathered) -> Section:
     between = " and ".join(x.replace("_", " ") for x in physics.get("spawn_penetration_between", []))
     tiles.append(Tile(f"{floating:.0%}", "floating", graded(-floating, 0.0, -0.2), "fall > 5 mm in 0.5 s"))
     tiles.append(Tile(f"{overlap:.2f} mm", "deepest overlap at spawn", graded(-overlap, -1.0, -5.0), between))
+    tiles += _rest_tiles(physics)
     rows = []
     ids = {o["id"] for o in g.objects}
     for item in physics["objects"]:
@@ -65,10 +66,26 @@ def physics_section(g: Gathered) -> Section:
         f"All {physics['dynamic_objects']} movable objects together for {physics['duration_s']:.0f} s at "
         f"1/{1 / physics['timestep_s']:.0f} s, undamped, never asleep; {physics['fixed_objects']} objects are fixed."
     )
-    blocks: list[Block] = [Tiles(tiles, columns=len(tiles))]
+    blocks: list[Block] = [Tiles(tiles, columns=-(-len(tiles) // 2) if len(tiles) > 5 else len(tiles))]
     if rows:
         blocks.append(Table(columns, rows, numeric=[1, 2, 3]))
     return Section("physics", "Physics", blocks, lead)
+
+
+def _rest_tiles(physics: dict) -> list[Tile]:
+    """Return the tiles on the scene at rest; older bundles have none."""
+    if "contacts" not in physics:
+        return []
+    contacts, energy = physics["contacts"], physics["energy_at_rest_j"]
+    edges = contacts["support_edges"] + contacts["attached_edges"]
+    real = contacts["support_edges_real"] + contacts["attached_edges_real"]
+    other = len(contacts["supports_without_edge"])
+    share = real / edges if edges else 1.0
+    unknown = f"{other} rest on something else" if other else "and nothing rests on anything else"
+    return [
+        Tile(f"{real} of {edges}", "relations are contacts at rest", graded(share, 1.0, 0.8), unknown),
+        Tile(f"{energy:.0e} J", "left after it", graded(physics["at_rest_rate"], 1.0, 0.8), "kinetic energy"),
+    ]
 
 
 def cost_section(g: Gathered) -> Section:
