@@ -18,7 +18,7 @@ MOST_PENETRATION_MM = 1.0
 MOST_GAP_MM = 2.0  # between what is immovable and what carries it or what it hangs on
 REST_J_PER_KG = 5e-5  # of a body that moves at 1 cm/s
 _FLOAT_WINDOW_S, _FLOAT_DROP_M = 0.5, 0.005
-_REST_WINDOW_S = 0.1  # at the end, over which contacts are summed
+_REST_WINDOW_S = 0.1  # at the end, over which contacts are summed and motion is measured
 _TOUCHING_SHARE = 0.02  # of what an object is pushed up by; less is no support
 _CARRYING_SHARE = 0.5
 _PROBE_M = 0.015  # PhysX reports contacts a little farther apart than this
@@ -73,8 +73,12 @@ def physics_report(
     physics.step(early_steps)
     early = {spec.id: _finite(physics.pose(spec.id)) for spec in moving}
     physics.step(steps - early_steps - last_steps)
+    before = {spec.id: physics.pose(spec.id) for spec in moving}
     push = _pushes(physics, last_steps)
-    objects = [_object_entry(spec, physics, early[spec.id], _depth_mm(near, spec.id)) for spec in moving]
+    objects = []
+    for spec in moving:
+        energy = physics.energy_of_motion(spec.id, before[spec.id], max(last_steps, 1) * timestep_s)
+        objects.append(_object_entry(spec, physics, early[spec.id], _depth_mm(near, spec.id), energy))
     fixed = [spec for spec in specs if not spec.dynamic and not spec.base]
 
     def rate(key: str, empty: float) -> float:
@@ -91,7 +95,7 @@ def physics_report(
         "floating_rate": rate("floating", 0.0),
         "spawn_penetration_mm": round(penetration, 4),
         "spawn_penetration_between": [names[deepest.first], names[deepest.second]] if penetration else [],
-        "energy_at_rest_j": float(sum(entry["energy_j"] for entry in objects)),
+        "energy_at_rest_j": float(f"{sum(entry['energy_j'] for entry in objects):.3g}"),
         "at_rest_rate": rate("at_rest", 1.0),
         "contacts": contact_graph(specs, edges, push, near),
         "objects": objects,
@@ -183,11 +187,12 @@ def contact_graph(
     }
 
 
-def _object_entry(spec: BodySpec, physics: Physics, early: np.ndarray, depth_mm: float) -> dict[str, Any]:
+def _object_entry(
+    spec: BodySpec, physics: Physics, early: np.ndarray, depth_mm: float, energy: float
+) -> dict[str, Any]:
     start, end = np.asarray(spec.world_from_object), _finite(physics.pose(spec.id))
     moved, turned = pose_change(start, end)
     drop = float(start[2, 3] - end[2, 3])
-    energy = physics.kinetic_energy(spec.id)
     energy = energy if np.isfinite(energy) else 0.5 * spec.mass_kg * _FAR_AWAY_M**2
     return {
         "id": spec.id,

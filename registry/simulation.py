@@ -149,13 +149,20 @@ class Physics:
         linear = float(np.linalg.norm(body.get_linear_velocity()))
         return linear, float(np.linalg.norm(body.get_angular_velocity()))
 
-    def kinetic_energy(self, body_id: int) -> float:
-        """Return the kinetic energy of an object, joules."""
-        body = self._bodies[body_id]
-        axes = self._entities[body_id].pose * body.cmass_local_pose
-        turning = matrix_from_quat(np.asarray(axes.q)).T @ np.asarray(body.get_angular_velocity(), np.float64)
-        linear = np.asarray(body.get_linear_velocity(), np.float64)
-        return float(0.5 * body.mass * linear @ linear + 0.5 * turning**2 @ np.asarray(body.inertia))
+    def energy_of_motion(self, body_id: int, before: np.ndarray, seconds: float) -> float:
+        """Return the kinetic energy (joules) of an object's mean motion since a pose (4, 4) some time ago.
+
+        The velocities of a body at rest are no measure: the solver leaves a jitter of centimetres a second in them,
+        which moves nothing.
+        """
+        body, now = self._bodies[body_id], self.pose(body_id)
+        center = np.append(np.asarray(body.cmass_local_pose.p, np.float64), 1.0)
+        velocity = ((now - before) @ center)[:3] / seconds
+        quat = quat_from_matrix(before[:3, :3].T @ now[:3, :3])
+        sine = float(np.linalg.norm(quat[1:]))
+        turned = 2 * np.arctan2(sine, abs(quat[0])) * quat[1:] / max(sine, 1e-12)
+        turning = matrix_from_quat(np.asarray(body.cmass_local_pose.q)).T @ turned / seconds
+        return float(0.5 * body.mass * velocity @ velocity + 0.5 * turning**2 @ np.asarray(body.inertia))
 
     def set_kinematic(self, body_id: int, kinematic: bool) -> None:
         """Freeze an object where it is, or let it go."""

@@ -200,14 +200,17 @@ def test_what_cannot_move_must_be_near_its_parent():
     assert contacts["edges_without_contact"][0]["gap_mm"] == pytest.approx(6, abs=0.1)
 
 
-def test_energy_is_that_of_the_moving_body():
-    physics = build_physics([body(2, CUBE, (0, 0, 1.0))])
+def test_energy_is_that_of_the_motion():
+    physics = build_physics([body(2, CUBE, (0, 0, 1.0), mass_kg=0.5)])
     physics.set_gravity(2, False)
-    assert physics.kinetic_energy(2) == 0.0
+    before = physics.pose(2)
+    assert physics.energy_of_motion(2, before, 0.1) == 0.0
     physics._bodies[2].set_linear_velocity(np.array([0.3, 0, 0.4]))
     physics._bodies[2].set_angular_velocity(np.array([0, 0, 2.0]))
+    physics.step(24)
     about_z = 0.5 / 12 * (0.2**2 + 0.2**2)
-    assert physics.kinetic_energy(2) == pytest.approx(0.5 * 0.5 * 0.25 + 0.5 * about_z * 4, rel=1e-3)
+    expected = 0.5 * 0.5 * 0.25 + 0.5 * about_z * 4
+    assert physics.energy_of_motion(2, before, 0.1) == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_card_says_what_it_falls_short_of():
