@@ -105,7 +105,7 @@ def measure_capture(capture: Capture, out: Path) -> dict[str, Any]:
     """Measure one capture, reconstructed with default options."""
     run = stage_run(capture.source, work_of(out, capture), [])
     run.execute("scene_graph")
-    assets, graph = run.results["assets"], run.results["scene_graph"]
+    assets, graph = run.results["assets"], run.results["scene_graph"].plain()
     centers = _true_centers(capture, run, assets) if capture.truth == "scene" else {}
     group = "captures with truth" if capture.truth == "scene" else "captures without objects in their truth"
     return measure(capture.name, group, assets, graph, centers)

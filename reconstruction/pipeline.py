@@ -223,7 +223,7 @@ class Run:
         if stage.name == "assets":
             return self.overrides.apply_to_assets(plain, pointer)
         if stage.name == "assembly":
-            assets, graph = done["assets"], done["scene_graph"]
+            assets, graph = done["assets"], done["scene_graph"].plain()
             movable = self.overrides.movable(assets, graph, pointer)
             return importlib.import_module(stage.module).assemble(
                 assets, graph, self.config.assembly, movable=movable

@@ -11,9 +11,11 @@ from reconstruction.assembly.base import convex_part
 from reconstruction.assembly.baselines import in_situ
 from reconstruction.assembly.collision import cut, flatten_foot
 from reconstruction.assembly.place import base_specs
+from reconstruction.instances.anchors import Pointer
+from reconstruction.overrides import Overrides
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
-from reconstruction.types import AssembledScene, AssetSet, Edge, SceneGraph
-from registry.errors import SimReconError
+from reconstruction.types import AssembledScene, AssetSet, Edge, Instance, InstanceSet, SceneGraph
+from registry.errors import SimReconError, UsageError
 from registry.geometry import rigid, transform_points
 from registry.simulation import build_physics, pose_change
 
@@ -318,3 +320,21 @@ def test_a_bowl_stands_in_the_plate_whose_collision_shape_has_no_hollow():
     # The rim still stops what slides on the plate.
     high = [p for p in placed[10].collision if p.vertices[:, 2].max() > 0.029]
     assert min(np.abs(p.vertices[:, :2]).max(axis=1).min() for p in high) > 0.05
+
+
+def test_overrides_say_what_can_move_but_not_of_what_hangs():
+    items = [Instance(i, "box", 0.9, np.zeros(3), np.full(3, 0.2), 0.0, 1, i == 11) for i in (10, 11)]
+    pointer = Pointer(
+        InstanceSet(np.zeros(0, np.int32), (), tuple(items), np.zeros((0, 0, 0), np.uint16)), None
+    )
+    assets = room(box(10, (0.3, 0.3, 0.2), (0, 0, 0)), box(11, (0.1, 0.03, 0.03), (0, -0.165, 0.1)))
+    graph = SceneGraph((Edge(10, "supported_by", 1, 1.0, ""), Edge(11, "attached_to", 10, 1.0, "")))
+    assert Overrides([{"id": 10, "dynamic": False}]).movable(assets, graph, pointer) == {10: False}
+    with pytest.raises(UsageError, match="attached to 10"):
+        Overrides([{"id": 11, "dynamic": True}]).movable(assets, graph, pointer)
+
+
+def test_overrides_refuse_a_dynamic_that_is_neither_true_nor_false(tmp_path):
+    (tmp_path / "fixes.yaml").write_text("- {id: 10, dynamic: sometimes}")
+    with pytest.raises(UsageError, match="dynamic must be true or false"):
+        Overrides.load(tmp_path / "fixes.yaml")
