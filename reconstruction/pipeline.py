@@ -280,7 +280,14 @@ class Run:
             return module.make_instances(posed, depth, done["surface"], config, progress=progress)
         views = done["views"] if "views" in self.needs_of(stage) else None
         return module.build_assets(
-            posed, depth, done["surface"], done["instances"], config, views=views, progress=progress
+            posed,
+            depth,
+            done["surface"],
+            done["instances"],
+            config,
+            views=views,
+            keep=self.store.work_dir / "collision",
+            progress=progress,
         )
 
     def _ask_oracle(self, stage: Stage, config: Any, progress: Progress) -> Any:

@@ -1,5 +1,7 @@
 """Stage 7, assets: complete, textured, simulation-ready objects, and floor and walls with their looks."""
 
+from pathlib import Path
+
 from reconstruction.assets.config import ASSETS_PRESETS, AssetsConfig
 from reconstruction.assets.physics.load import outside_inputs
 from reconstruction.avo import SceneViews
@@ -13,12 +15,12 @@ VERSION = 11
 
 def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
-    views: SceneViews | None = None, progress: Progress = NO_PROGRESS,
+    views: SceneViews | None = None, keep: Path | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
     """Build every asset; see `reconstruction.assets.build.build_assets` (compiled code is imported on use)."""
     from reconstruction.assets.build import build_assets as build
 
-    return build(posed, depth, surface, instances, config, views=views, progress=progress)
+    return build(posed, depth, surface, instances, config, views=views, keep=keep, progress=progress)
 
 
 def wants_views(config: AssetsConfig) -> bool:

@@ -1,12 +1,13 @@
 """Stage 7: every instance becomes a closed, textured object with collision shape and mass; base surfaces get looks."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
-from reconstruction.assets.collision import collision_parts, end_decomposer
+from reconstruction.assets.collision import collision_parts, end_decomposer, kept_parts
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.cut_off import Room, continued, cut_off_sides, lone_front, with_copies
 from reconstruction.assets.fused import fused_points, without_strays
@@ -27,6 +28,7 @@ from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import (
     AssetProvenance,
     AssetSet,
+    ConvexPart,
     DepthMaps,
     Instance,
     InstanceSet,
@@ -57,6 +59,7 @@ class Evidence:
     ]  # by object: what it is made of, where something better than the table says
     fetched: Fetched | None  # meshes by a generator
     config: AssetsConfig
+    keep: Path | None = None  # folder of kept collision shapes
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ class Shape:
 
 def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
-    views: SceneViews | None = None, progress: Progress = NO_PROGRESS,
+    views: SceneViews | None = None, keep: Path | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
     """Build a complete asset for every object, and textured surfaces for floor and walls.
 
@@ -97,13 +100,14 @@ def build_assets(
         instances: The things and which pixels show them.
         config: Resolution, budgets and limits.
         views: What a generator and a vision-language model are shown of the objects; None: keyframes.
+        keep: Folder in which collision shapes are kept by mesh; None: they are made anew.
         progress: Told of every object.
 
     Returns:
         All assets, in the order of `instances`.
     """
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
-    scene = gather_evidence(posed, depth, surface, instances, config, progress, views)
+    scene = replace(gather_evidence(posed, depth, surface, instances, config, progress, views), keep=keep)
     objects: list[ObjectAsset] = []
     hulls = 0
     for left, item in zip(range(len(instances.objects) - 1, -1, -1), instances.objects):
@@ -163,13 +167,7 @@ def _finish_object(item: Instance, shape: Shape, scene: Evidence, progress: Prog
         label_confidence=float(item.label_confidence),
         world_from_object=world_from_object,
         visual=visual,
-        collision=collision_parts(
-            body,
-            scene.config,
-            levels=tuple(levels),
-            progress=progress,
-            name=f"object {item.id} ({item.label})",
-        ),
+        collision=_collision(body, tuple(levels), f"object {item.id} ({item.label})", scene, progress),
         physics=physical_attributes(body, choice),
         provenance=AssetProvenance(
             geometry=shape.provenance,
@@ -181,6 +179,14 @@ def _finish_object(item: Instance, shape: Shape, scene: Evidence, progress: Prog
         support_hint=int(item.support_hint),
         attached_hint=bool(item.attached_hint),
     )
+
+
+def _collision(
+    body: Solid, levels: tuple[float, ...], name: str, scene: Evidence, progress: Progress
+) -> tuple[ConvexPart, ...]:
+    if scene.keep is None:
+        return collision_parts(body, scene.config, levels=levels, progress=progress, name=name)
+    return kept_parts(scene.keep, body, scene.config, levels=levels, progress=progress, name=name)
 
 
 def _looks(

@@ -2,16 +2,19 @@
 
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from notes import Notes
 
-from reconstruction.assets.collision import collision_parts
+from reconstruction.assets.collision import build, collision_parts, kept, kept_parts
 from reconstruction.assets.collision.decomposition import Decomposer
 from reconstruction.assets.collision.rings import find_hole
 from reconstruction.assets.collision.slicing import own_levels
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.solid import Solid, box_solid, from_manifold
+from reconstruction.progress import NO_PROGRESS
 from reconstruction.synthetic import containers, furnishing
 from reconstruction.synthetic.furniture import Workshop
 from reconstruction.synthetic.things import Place, Thing
@@ -168,6 +171,53 @@ def test_a_machine_without_coacd_is_told_so(tmp_path, monkeypatch):
     for python, why in ((str(tmp_path / "python"), "No such file"), ("/bin/false", "status 1")):
         with pytest.raises(EnvironmentMissing, match=why):
             Decomposer(python=python).run(solid.vertices, solid.faces, OPTIONS)
+
+
+def test_parts_are_kept_by_mesh_and_options(tmp_path, monkeypatch):
+    _, bowl = made("bowl", 0)
+    config, make = AssetsConfig(), {"levels": (), "progress": NO_PROGRESS, "name": "bowl"}
+    first = kept_parts(tmp_path, bowl, config, **make)
+    (file,) = tmp_path.glob("*.npz")
+    for part, fresh in zip(first, collision_parts(bowl, config), strict=True):
+        np.testing.assert_array_equal(part.vertices, fresh.vertices)
+    monkeypatch.setattr(kept, "collision_parts", None)  # nothing is cut again
+    for now, before in zip(
+        kept_parts(tmp_path, bowl, replace(config, texture_min_px=64), **make), first, strict=True
+    ):
+        np.testing.assert_array_equal(now.vertices, before.vertices)
+        np.testing.assert_array_equal(now.faces, before.faces)
+    monkeypatch.undo()
+    kept_parts(tmp_path, bowl, replace(config, hulls_ring=8), **make)
+    kept_parts(tmp_path, Solid(1.1 * bowl.vertices, bowl.faces), config, **make)
+    assert len(list(tmp_path.glob("*.npz"))) == 3
+    file.write_bytes(b"PK torn")
+    assert len(kept_parts(tmp_path, bowl, config, **make)) == len(first)
+
+
+def test_what_failed_is_not_kept(tmp_path, monkeypatch):
+    _, bookcase = made("bookcase", 0)
+    monkeypatch.setattr(build, "decompose", lambda *arguments: None)
+    monkeypatch.setattr(build, "_sorted_out", lambda pieces, *arguments: ([], pieces))
+    said = Notes()
+    assert kept_parts(tmp_path, bookcase, AssetsConfig(), levels=(), progress=said, name="bookcase")
+    assert "CoACD failed" in said.notes[0]
+    assert not list(tmp_path.glob("*.npz"))
+
+
+def test_what_was_not_used_longest_is_forgotten_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(kept, "_MOST_KEPT", 2)
+    make = {"levels": (), "progress": NO_PROGRESS, "name": "box"}
+    boxes = [box_solid(np.zeros(3), np.full(3, size)) for size in (1.0, 1.1, 1.2)]
+    names = []
+    for number, solid in enumerate(boxes):
+        if number == 2:
+            for age, name in enumerate(reversed(names)):  # the first was used again
+                os.utime(name, (1e9 + age, 1e9 + age))
+        kept_parts(tmp_path, solid, AssetsConfig(), **make)
+        names += [file for file in tmp_path.glob("*.npz") if file not in names]
+    assert not names[1].exists()
+    assert names[0].exists()
+    assert len(list(tmp_path.glob("*.npz"))) == 2
 
 
 def test_a_full_scene_leaves_an_object_fewer_parts_but_some():

@@ -1,0 +1,100 @@
+"""Collision parts that are kept by mesh: the same mesh with the same options is not cut again."""
+
+import hashlib
+import io
+import json
+import zipfile
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.assets.collision.build import collision_parts
+from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.solid import Solid
+from reconstruction.cache import source_digest
+from reconstruction.progress import NoProgress, Progress
+from reconstruction.requesting import write_whole
+from reconstruction.types import ConvexPart
+
+_MOST_KEPT = 400  # files; those that were not used longest go first
+_ELSEWHERE = ("texture_", "base_", "generator", "physics")  # options that no collision shape depends on
+
+
+def kept_parts(
+    folder: Path,
+    solid: Solid,
+    config: AssetsConfig,
+    *,
+    levels: tuple[float, ...],
+    progress: Progress,
+    name: str,
+) -> tuple[ConvexPart, ...]:
+    """Return `collision_parts`, kept in a folder or made and then kept there.
+
+    What a failure of CoACD stands behind is not kept: the next run tries again.
+
+    Args:
+        folder: One .npz a mesh; made where it is missing.
+        solid: The closed mesh.
+        config: Budgets and limits.
+        levels: Heights at which other things stand on it.
+        progress: Told of failures.
+        name: Of the object, for that.
+    """
+    file = folder / f"{_digest(solid, config, levels)}.npz"
+    kept = _read(file)
+    if kept is not None:
+        file.touch()
+        return kept
+    watch = _Watch(progress)
+    parts = collision_parts(solid, config, levels=levels, progress=watch, name=name)
+    if not watch.heard:
+        write_whole(file, _packed(parts))
+        _forget_old(folder)
+    return parts
+
+
+class _Watch(NoProgress):
+    """Passes notes on and remembers that there were some."""
+
+    def __init__(self, listener: Progress) -> None:
+        self._listener, self.heard = listener, False
+
+    def note(self, message: str) -> None:
+        self.heard = True
+        self._listener.note(message)
+
+
+def _digest(solid: Solid, config: AssetsConfig, levels: tuple[float, ...]) -> str:
+    options = {key: value for key, value in asdict(config).items() if not key.startswith(_ELSEWHERE)}
+    code = [source_digest(f"reconstruction.assets.{part}") for part in ("collision", "solid")]
+    digest = hashlib.sha256(json.dumps([options, levels, code, version("coacd")]).encode())
+    for array in (np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int32)):
+        digest.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _packed(parts: tuple[ConvexPart, ...]) -> bytes:
+    arrays = {}
+    for number, part in enumerate(parts):
+        arrays[f"v{number}"], arrays[f"f{number}"] = part.vertices, part.faces
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _read(file: Path) -> tuple[ConvexPart, ...] | None:
+    """Return kept parts; None where there are none, or the file is damaged."""
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            return tuple(ConvexPart(arrays[f"v{k}"], arrays[f"f{k}"]) for k in range(len(arrays.files) // 2))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _forget_old(folder: Path) -> None:
+    files = sorted(folder.glob("*.npz"), key=lambda file: file.stat().st_mtime)
+    for file in files[: max(len(files) - _MOST_KEPT, 0)]:
+        file.unlink(missing_ok=True)
