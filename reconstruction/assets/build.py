@@ -10,6 +10,7 @@ from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts, end_decomposer, kept_parts
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.cut_off import Room, continued, cut_off_sides, lone_front, with_copies
+from reconstruction.assets.edges import with_simple_edges
 from reconstruction.assets.fused import fused_points, without_strays
 from reconstruction.assets.generation.complete import Attempt, SurfaceColors, generated_shape
 from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
@@ -222,7 +223,9 @@ def to_object_space(body: Solid, frame: ObjectFrame) -> tuple[Solid, np.ndarray]
     """Shift a solid of the grid frame so that its origin is at the bottom centre; return world_from_object too."""
     low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
     origin = np.array([*(low + high)[:2] / 2, low[2]])
-    return Solid(body.vertices - origin, body.faces), frame.world_from_grid @ rigid(translation=origin)
+    return with_simple_edges(Solid(body.vertices - origin, body.faces)), frame.world_from_grid @ rigid(
+        translation=origin
+    )
 
 
 def object_shape(item: Instance, scene: Evidence) -> Shape:

@@ -8,7 +8,7 @@ from surfaces import frames_of, merged, sheet, solid_box, surface_from
 
 from reconstruction.assets import AssetsConfig
 from reconstruction.assets.fused import fused_points, sample_surface, without_strays
-from reconstruction.assets.hanging_relief import relief
+from reconstruction.assets.hanging_relief import mound, relief
 from reconstruction.assets.views import prepare_pixels
 from reconstruction.assets.volume import ObjectFrame
 from reconstruction.types import Instance, InstanceSet
@@ -91,3 +91,15 @@ def test_parts_of_a_relief_stand_out_as_far_as_they_were_seen():
     assert body.vertices[:, 1].min() == pytest.approx(-0.09, abs=1e-3)
     assert body.volume == pytest.approx(0.4 * 0.1 * 0.03 + np.pi * 0.015**2 * 0.06, rel=0.15)
     assert relief(np.zeros((0, 3)), 0.0, AssetsConfig()) is None
+
+
+def test_a_mound_reaches_from_the_support_to_what_was_seen():
+    """A plate whose rim rises from 1 to 2 cm."""
+    rng = np.random.default_rng(0)
+    radius, turn = 0.12 * np.sqrt(rng.uniform(0, 1, 8000)), rng.uniform(0, 2 * np.pi, 8000)
+    height = 0.01 + 0.01 * (radius > 0.1)
+    body = mound(np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height]), AssetsConfig())
+    assert body.vertices.min(axis=0) == pytest.approx([-0.12, -0.12, 0.0], abs=0.006)
+    assert body.vertices.max(axis=0) == pytest.approx([0.12, 0.12, 0.02], abs=0.006)
+    assert body.volume == pytest.approx(np.pi * (0.12**2 * 0.01 + (0.12**2 - 0.1**2) * 0.01), rel=0.25)
+    assert mound(np.zeros((0, 3)), AssetsConfig()) is None

@@ -1,12 +1,15 @@
 """Things on a carrier: at which height they stand, and what of the carrier is only their smeared depth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from reconstruction.assets.standing import Standing, _agreed, without_children
+from reconstruction.assets.standing import Standing, _agreed, _hidden_foot, within_walls, without_children
 from reconstruction.assets.views import SeenPoints
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, support_height
-from reconstruction.types import Instance, InstanceSet
+from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane
+from registry.geometry import rigid
 
 PLATE = Instance(5, "plate", 0.5, np.array([0, 0, 0.415]), 0.0, np.array([0.22, 0.22, 0.02]), 4, False)
 NOTHING = InstanceSet(np.zeros(0, np.int32), (), (PLATE,), np.zeros((1, 2, 2), np.uint16))
@@ -116,3 +119,31 @@ def test_what_seems_to_sink_into_its_board_stands_where_the_others_do():
 def test_what_stands_higher_or_on_another_board_keeps_its_level():
     agreed = _agreed(standing_at(0.80, 0.802, 0.825, 0.60))
     assert [agreed[k].level_m for k in (4, 5)] == [0.825, 0.60]
+
+
+def test_a_foot_that_a_rim_hides_is_on_the_floor_of_the_container():
+    can = Instance(6, "can", 0.5, np.array([0, 0, 0.46]), 0.0, np.array([0.07, 0.07, 0.11]), 4, False)
+    assert _hidden_foot(can, 0.46, 0.515) == pytest.approx(0.405)
+    assert _hidden_foot(can, 0.41, 0.515) is None  # its foot was seen
+    assert _hidden_foot(can, 0.50, 0.515) is None  # hardly any of it was seen: the box may be wrong
+
+
+def test_nothing_of_a_thing_lies_behind_a_wall():
+    volume = slab_with(lambda r: r < 0)
+    frame = ObjectFrame(
+        rigid(translation=np.array([1.0, 0, 0])), np.zeros((0, 3)), np.zeros((0, 3)), True, None
+    )
+    wall = BaseEntity(1, "wall", Plane(np.array([-1.0, 0, 0, 1.2]), np.zeros((3, 3))), True)  # x = 1.2
+
+    def solid_columns(walls: tuple[BaseEntity, ...], hung: ObjectFrame = frame) -> np.ndarray:
+        cut = within_walls(volume, hung, InstanceSet(NOTHING.vertex_instance, walls, (), NOTHING.id_maps))
+        return volume.centers(0)[(cut.distance < 0).any(axis=(1, 2))]
+
+    assert solid_columns(()).max() == pytest.approx(0.295)
+    assert solid_columns((wall,)).max() == pytest.approx(0.195)
+    assert solid_columns((wall,)).min() == pytest.approx(-0.295)
+    before = replace(
+        wall, surface=Plane(np.array([1.0, 0, 0, -1.2]), np.zeros((3, 3)))
+    )  # most is behind: no wall
+    assert solid_columns((before,)).min() == pytest.approx(-0.295)
+    assert solid_columns((wall,), replace(frame, wall_y=0.0)).max() == pytest.approx(0.295)

@@ -15,6 +15,7 @@ _WASTE_SHARE = 0.01  # of the whole's hull: a hull that takes so little empty sp
 _ODD_SECTORS = 2  # of a ring
 _LEAST_PARTS = 3
 _REACH_M = 0.002
+_GRID_DIGITS = 6  # metres
 
 
 def collision_parts(
@@ -120,6 +121,8 @@ def _deflate(
 def _part(vertices: np.ndarray) -> ConvexPart | None:
     from scipy.spatial import QhullError
 
+    # Corners that files cannot tell apart would leave triangles without area.
+    vertices = np.unique(np.round(vertices, _GRID_DIGITS), axis=0)
     if np.ptp(vertices, axis=0).min() < 5e-4:
         return None
     try:

@@ -1,0 +1,64 @@
+"""Meshes stay watertight for readers that know vertices by their positions."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from reconstruction.assets.collision.build import _part
+from reconstruction.assets.edges import with_simple_edges
+from reconstruction.assets.gltf import read_obj, write_obj
+from reconstruction.assets.solid import Solid, box_solid, manifold_of
+
+
+def joined(*solids: Solid) -> Solid:
+    offsets = np.cumsum([0, *(len(s.vertices) for s in solids[:-1])])
+    return Solid(
+        np.concatenate([s.vertices for s in solids]),
+        np.concatenate([s.faces + o for s, o in zip(solids, offsets)]),
+    )
+
+
+def is_watertight(solid: Solid) -> bool:
+    """As a reader sees it that merges vertices at one place."""
+    return trimesh.Trimesh(solid.vertices.astype(np.float32), solid.faces, process=True).is_watertight
+
+
+def test_two_boxes_that_touch_along_an_edge():
+    """The second one stands beside the first one's edge, 10 cm of which both have."""
+    first = box_solid(np.zeros(3), np.array([0.1, 0.1, 0.2]))
+    second = box_solid(np.array([0.1, 0.1, 0.0]), np.array([0.2, 0.2, 0.2]))
+    touching = joined(first, second)
+    assert not is_watertight(touching)
+    mended = with_simple_edges(touching)
+    assert is_watertight(mended)
+    assert manifold_of(mended) is not None
+    assert mended.volume == pytest.approx(2 * 0.1 * 0.1 * 0.2)
+    np.testing.assert_allclose(mended.extents, touching.extents)
+    again = with_simple_edges(mended)
+    np.testing.assert_array_equal(again.faces.shape, mended.faces.shape)
+
+
+def test_faces_back_to_back_and_faces_without_area_go():
+    box = box_solid(np.zeros(3), np.full(3, 0.1))
+    fin = np.array([[0, 3, 5], [0, 5, 3], [2, 2, 7], [2, 7, 2]], np.int32)
+    mended = with_simple_edges(Solid(box.vertices, np.concatenate([box.faces, fin])))
+    assert is_watertight(mended)
+    assert len(mended.faces) == len(box.faces)
+    assert mended.volume == pytest.approx(1e-3)
+
+
+def test_what_is_watertight_keeps_its_surface_and_what_is_open_comes_back():
+    box = box_solid(np.zeros(3), np.full(3, 0.1))
+    assert with_simple_edges(box).volume == pytest.approx(1e-3)
+    opened = Solid(box.vertices, box.faces[:-1])
+    assert with_simple_edges(opened) is opened
+
+
+def test_collision_parts_are_watertight_in_their_files(tmp_path):
+    """Corners a hundredth of a micrometre apart are one in the file."""
+    rng = np.random.default_rng(1)
+    corners = box_solid(np.zeros(3), np.array([0.3, 0.2, 0.1])).vertices
+    part = _part(np.concatenate([corners, corners + rng.uniform(-1e-8, 1e-8, corners.shape)]))
+    write_obj(part, tmp_path / "part.obj")
+    back = read_obj(tmp_path / "part.obj")
+    assert is_watertight(Solid(back.vertices.astype(float), back.faces))
