@@ -420,10 +420,10 @@ def _refuse_missing(config: PipelineConfig) -> None:
         from reconstruction.assets.physics.load import load_physicist
 
         load_physicist(config.assets)
-    if config.scene_graph.backend == "vlm":
-        from reconstruction.scene_graph.load import load_model
+    if config.scene_graph.backend != "geometry":
+        from reconstruction.scene_graph.load import check_backend
 
-        load_model(config.scene_graph)
+        check_backend(config.scene_graph)
     if config.assets.generator != "none":
         from reconstruction.assets.generation import check_generator
 

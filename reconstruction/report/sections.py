@@ -252,6 +252,7 @@ def graph_section(g: Gathered) -> Section:
             Cell(e["relation"].replace("_", " "), "bad" if e["child"] in wrong else ""),
             Cell(g.names[e["parent"]], swatch=colors.get(e["parent"], "")),
             Cell(f"{e['confidence']:.2f}"),
+            Cell(e.get("said_by", "")),
             Cell(e["evidence"] if isinstance(e["evidence"], str) else json.dumps(e["evidence"])),
         ]
         for e in edges
@@ -259,7 +260,7 @@ def graph_section(g: Gathered) -> Section:
     text = "Solid: supported by. Dashed: attached to. The fainter, the less sure."
     blocks: list[Block] = [
         Plots([plots.scene_graph(edges, g.names, colors)], wide=True, caption=text),
-        Table(["object", "relation", "parent", "sure", "evidence"], rows, numeric=[3]),
+        Table(["object", "relation", "parent", "sure", "said by", "evidence"], rows, numeric=[3]),
     ]
     return Section("graph", "Scene graph", blocks)
 

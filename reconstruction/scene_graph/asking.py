@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 from reconstruction.conversation import Conversation, VlmError, VlmUnavailable
 from reconstruction.scene_graph.base import LocalGraph, Question, SaidEdge
-from reconstruction.scene_graph.checking import Triple, examine
+from reconstruction.scene_graph.checking import Findings, Triple, examine
 from reconstruction.scene_graph.looking import RegionPicture
 from reconstruction.scene_graph.relations import GeometryRelations
 from reconstruction.types import AssetSet
@@ -66,6 +66,7 @@ class PictureRelations:
         self._model, self._viewer, self._geometry, self._reach_m = model, viewer, geometry, reach_m
         self._labels = {item.id: item.label for item in (*assets.base, *assets.objects)}
         self._base = tuple(item.id for item in assets.base)
+        self._walls = tuple(item.id for item in assets.base if item.label != "floor")
         self._prompt = (Path(__file__).parent / "prompt.txt").read_text()
         self._away = ""  # why the model is asked no more
         self.name = model.name
@@ -105,8 +106,9 @@ class PictureRelations:
 
         return self._model.ask(prompt, [view.picture], Relations, check)
 
-    def _examine(self, triples: list[Triple], view: RegionPicture, silent: list[int]):
-        return examine(triples, view.visible, self._base, silent, self._geometry.distance_m, self._reach_m)
+    def _examine(self, triples: list[Triple], view: RegionPicture, silent: list[int]) -> Findings:
+        near = self._geometry.distance_m
+        return examine(triples, view.visible, self._base, silent, self._walls, near, self._reach_m)
 
     def _graph(self, answer: Relations, problem: str, question: Question, view: RegionPicture) -> LocalGraph:
         """Take what can be used; geometry decides on the rest, among what the view shows."""

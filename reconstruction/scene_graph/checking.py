@@ -26,6 +26,7 @@ def examine(
     visible: Collection[int],
     base: Collection[int],
     silent: Collection[int] = (),
+    walls: Collection[int] = (),
     distance_m: Callable[[int, int], float] | None = None,
     reach_m: float = float("inf"),
 ) -> Findings:
@@ -36,6 +37,7 @@ def examine(
         visible: ids of the objects that it is about.
         base: ids of floor, walls and ceiling.
         silent: objects of which it says that it cannot tell.
+        walls: those of the base that nothing stands on.
         distance_m: between an object and its parent-to-be, for what cannot touch.
         reach_m: the largest such distance.
     """
@@ -52,6 +54,8 @@ def examine(
             out.add(f"{said}: nothing is its own parent", child)
         elif parent not in visible and parent not in base:
             out.add(f"{said}: there is no {parent}; parents are {_listed({*visible, *base})}", child)
+        elif parent in walls and relation == "supported_by":
+            out.add(f"{said}: nothing stands on {parent}; what hangs there is attached_to it", child)
         elif parents.setdefault(child, (relation, parent)) != (relation, parent):
             out.add(f"object {child} has two parents, {parents[child][1]} and {parent}; name one", child)
         elif distance_m is not None and distance_m(child, parent) > reach_m:

@@ -72,6 +72,20 @@ def load_model(config: SceneGraphConfig, records: Path | None = None) -> Convers
     return QwenModel(request, records)
 
 
+def check_backend(config: SceneGraphConfig) -> None:
+    """Say before the run what the backend lacks; whether weights are there shows when they are loaded.
+
+    Raises:
+        EnvironmentMissing: no endpoint or no model is named, transformers is missing or too old.
+    """
+    if config.backend == "qwen2.5-vl":
+        from reconstruction.learned import transformers_class
+
+        transformers_class("Qwen2_5_VLForConditionalGeneration", "scene_graph.backend")
+    elif config.backend == "vlm":
+        load_model(config)
+
+
 def backend_name(config: SceneGraphConfig) -> str:
     """Say who decides, for the bundle."""
     if config.backend == "geometry":

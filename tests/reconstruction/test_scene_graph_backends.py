@@ -18,7 +18,7 @@ from reconstruction.scene_graph import Question, SceneGraphConfig, infer_scene_g
 from reconstruction.scene_graph.asking import PictureRelations
 from reconstruction.scene_graph.base import RELATIONS
 from reconstruction.scene_graph.checking import examine
-from reconstruction.scene_graph.load import load_relations
+from reconstruction.scene_graph.load import check_backend, load_relations
 from reconstruction.scene_graph.looking import RegionViewer
 from reconstruction.scene_graph.relations import GeometryRelations
 from reconstruction.types import AssetSet
@@ -218,3 +218,18 @@ def test_another_model_does_not_reuse_a_result(monkeypatch):
     first = outside_inputs(replace(CONFIG, backend="vlm"))
     monkeypatch.setenv("SIMRECON_VLM_MODEL", "two")
     assert outside_inputs(replace(CONFIG, backend="vlm")) != first
+
+
+def test_what_a_backend_lacks_is_said_before_the_run(monkeypatch):
+    monkeypatch.delenv("SIMRECON_VLM_URL", raising=False)
+    monkeypatch.delenv("SIMRECON_VLM_RECORDS", raising=False)
+    check_backend(CONFIG)
+    check_backend(replace(CONFIG, backend="qwen2.5-vl"))
+    with pytest.raises(EnvironmentMissing, match=r"scene_graph\.backend needs .* set SIMRECON_VLM_URL"):
+        check_backend(replace(CONFIG, backend="vlm"))
+
+
+def test_nothing_stands_on_a_wall():
+    found = examine([(5, "supported_by", 2), (6, "attached_to", 2)], {5, 6}, {1, 2}, walls={2})
+    assert found.children == {5}
+    assert "attached_to it" in found.problems[0]
