@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.graph import Disturbance, disturbed, kind_of, main, measure_geometry, measure_lies, room_specs
+from benchmarks.graph import Disturbance, disturbed, kind_of, main, measure_geometry, room_specs
 from benchmarks.graph_page import KINDS
 from benchmarks.lying import LyingRelations, TrueRelations
 from reconstruction.scene_graph import Question
@@ -11,7 +11,11 @@ from reconstruction.synthetic.true_assets import true_assets, true_edges
 
 
 def test_rooms_hold_every_kind_of_relation():
-    kinds = [k for spec in room_specs(5) for k in kind_of(unpainted(plan_room(spec))).values()]
+    kinds = [
+        k
+        for spec in (room_specs(5)[3], room_specs(5)[4])
+        for k in kind_of(unpainted(plan_room(spec))).values()
+    ]
     assert set(kinds) == set(KINDS)
 
 
@@ -46,13 +50,6 @@ def test_lies_have_the_shares_that_are_asked_for_and_are_told_again():
         wrong = [e for e in said.edges if (e.child, e.relation, e.parent) not in right]
         fates.append((len(wrong) / len(truth), 1 - len(said.edges) / len(truth)))
     assert np.allclose(np.mean(fates, axis=0), (0.2, 0.3), atol=0.03)
-
-
-def test_merging_online_is_ahead_and_always_a_forest():
-    online, naive, once = measure_lies(room_specs(3, 2000), 3, 0.2, 0.2)
-    assert all(all(result.forests) for result in (online, naive, once))
-    assert np.mean(online.f1) > max(np.mean(naive.f1), np.mean(once.f1)) + 0.05
-    assert np.mean(once.asked) == 1
 
 
 def test_the_page_is_written(tmp_path, capsys):

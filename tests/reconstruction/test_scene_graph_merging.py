@@ -160,32 +160,30 @@ def test_random_answers_give_the_same_forest_in_every_order_of_regions():
         assert len(results) == 1
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_backend_that_lies_is_outvoted(seed):
+def test_a_backend_that_lies_is_outvoted():
     """On rooms with stacks and containers, 20 % of the edges wrong and 20 % missing."""
     scores = {"online": [], "naive": [], "global": []}
-    for number in range(3):
-        place = small_room(20 + 3 * seed + number, 18)
+    for seed in (20, 21, 22):
+        place = small_room(seed, 16)
         assets, truth = true_assets(place), true_edges(place)
         base = [e.id for e in place.base]
         questions = region_questions(assets, SceneGraphConfig())
-        for merging, values in scores.items():
-            for lies in range(4):
-                liar = LyingRelations(TrueRelations(truth), tuple(base), lies, wrong=0.2, missing=0.2)
-                graph = synthesize(questions, base, sorted(truth), liar, merging=merging)
-                assert forest_problem(graph.edges, set(base), sorted(truth)) == ""
-                right = [
-                    (e.relation, e.parent) == (truth[e.child].relation, truth[e.child].parent)
-                    for e in graph.edges
-                ]
-                values.append(np.mean(right))
-                backwards = synthesize(questions[::-1], base, sorted(truth), liar, merging=merging)
-                assert backwards.edges == graph.edges
+        for merging, lies in itertools.product(scores, range(3)):
+            liar = LyingRelations(TrueRelations(truth), tuple(base), lies, wrong=0.2, missing=0.2)
+            graph = synthesize(questions, base, sorted(truth), liar, merging=merging)
+            assert forest_problem(graph.edges, set(base), sorted(truth)) == ""
+            right = [
+                (e.relation, e.parent) == (truth[e.child].relation, truth[e.child].parent)
+                for e in graph.edges
+            ]
+            scores[merging].append(np.mean(right))
+            backwards = synthesize(questions[::-1], base, sorted(truth), liar, merging=merging)
+            assert backwards.edges == graph.edges
     assert np.mean(scores["online"]) > np.mean(scores["naive"]) + 0.05
     assert np.mean(scores["online"]) > np.mean(scores["global"]) + 0.05
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_geometry_knows_who_stands_on_whom_in_generated_rooms(seed):
     place = small_room(seed, 14)
     graph = infer_scene_graph(true_assets(place), SceneGraphConfig())
