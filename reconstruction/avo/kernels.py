@@ -3,6 +3,9 @@
 They extend `gaussians.kernels` (projection, sorting, tiles) by what a viewpoint needs and drop what it does not: no
 colors, no normals, no derivatives by the Gaussians. Every Gaussian stops light; only those of the target are summed,
 once plainly (what of the target is seen, and at what depth) and once by their weight (what seeing it is still worth).
+
+Unlike there, a splat fades to nothing at its edge, alpha = o (f - f_edge) / (1 - f_edge), and its depth is within a
+tenth of its center's: both are continuous in the pose, so that the derivative is that of what is computed.
 """
 
 import math
@@ -10,6 +13,7 @@ import math
 import numba
 import numpy as np
 
+from reconstruction.gaussians.blend_kernels import _FAST, _FLAT_HIGH, _FLAT_LOW, _HALF, _ONE, _TWO, _falloff
 from reconstruction.gaussians.kernels import (
     AX,
     AY,
@@ -26,13 +30,6 @@ from reconstruction.gaussians.kernels import (
     ZC,
 )
 
-_HALF = np.float32(0.5)
-_ONE = np.float32(1.0)
-_TWO = np.float32(2.0)
-_FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
-_FALLOFF_STEP = np.float32(-1.0 / 128.0)
-_E2, _E3, _E4, _E5 = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120)
-_FLAT_LOW, _FLAT_HIGH = np.float32(0.9), np.float32(1.1)  # as in gaussians.blend_kernels
 # Planes of the blended image: sums of alpha T over the target's splats, plain, times weight, times depth.
 SEEN, WORTH, DEPTH = 0, 1, 2
 N_PLANES = 3
@@ -84,20 +81,6 @@ def last_of_target(tile_start, entries, own):  # pragma: no cover - compiled
             end -= 1
         ends[t] = end
     return ends
-
-
-@numba.njit(cache=True, inline="always", fastmath=_FAST)
-def _falloff(rho):  # pragma: no cover - compiled
-    """Return exp(-rho / 2) by plain arithmetic, as `gaussians.blend_kernels` does."""
-    x = rho * _FALLOFF_STEP
-    e = _ONE + x * (_ONE + x * (_E2 + x * (_E3 + x * (_E4 + x * _E5))))
-    e = max(e, x - x)
-    e = e * e
-    e = e * e
-    e = e * e
-    e = e * e
-    e = e * e
-    return e * e
 
 
 @numba.njit(cache=True, nogil=True)
@@ -160,7 +143,9 @@ def _blend_tile(
         mine, value = own[entries[e]], worth[entries[e]]
         row_sums[:] = 0
         xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
-        ax, bx, wx, reach2, opacity = s[AX], s[BX], s[WX], s[REACH2], s[OPACITY]
+        ax, bx, wx, reach2 = s[AX], s[BX], s[WX], s[REACH2]
+        edge = _falloff(reach2)
+        opacity = s[OPACITY] / (_ONE - edge)
         for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
             dy = ys[i] - yc
             u_row, v_row, w_row, dy2 = s[AY] * dy, s[BY] * dy, _ONE + s[WY] * dy, dy * dy
@@ -173,9 +158,8 @@ def _blend_tile(
                 rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
                 on_disk = (w > zero) & (rho3 <= rho2)
                 rho = rho3 if on_disk else rho2
-                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
-                w = w if on_disk else w_flat
-                alpha = min(opacity * _falloff(rho), alpha_max)
+                w = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                alpha = min(opacity * (_falloff(rho) - edge), alpha_max)
                 alpha = alpha if (rho <= reach2) & (t >= stop) else zero
                 weight = alpha * t
                 sums[SEEN, i, j] += weight * mine
@@ -252,7 +236,9 @@ def _blend_tile_backward(
         mine, value = own[entries[e]], worth[entries[e]]
         xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
         ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
-        opacity, reach2 = s[OPACITY], s[REACH2]
+        reach2 = s[REACH2]
+        edge = _falloff(reach2)
+        opacity = s[OPACITY] / (_ONE - edge)
         lanes[:] = 0
         for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
             dy = ys[i] - yc
@@ -266,15 +252,13 @@ def _blend_tile_backward(
                 rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
                 on_disk = (w > zero) & (rho3 <= rho2)
                 rho = rho3 if on_disk else rho2
-                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
-                moves = on_disk | (w == w_flat)
-                w = w if on_disk else w_flat
-                inverse_w = _ONE / w
-                z = zc * inverse_w
-                falloff = _falloff(rho)
+                w_near = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                inverse_near = _ONE / w_near
+                z = zc * inverse_near
                 inside = (rho <= reach2) & (t >= stop)
-                falloff = falloff if inside else zero
-                full = opacity * falloff
+                slope = opacity * _falloff(rho)
+                full = slope - opacity * edge
+                full = full if inside else zero
                 alpha = min(full, alpha_max)
                 weight = alpha * t
                 light[i, j] = t - weight
@@ -285,15 +269,16 @@ def _blend_tile_backward(
                 d_z = weight * g_z
                 d_alpha = t * q - rest / (_ONE - alpha)
                 d_alpha = d_alpha if inside & (full <= alpha_max) else zero
-                d_rho = -_HALF * d_alpha * alpha
+                d_rho = -_HALF * d_alpha * slope
                 disk_rho = d_rho if on_disk else zero
                 flat_rho = zero if on_disk else d_rho
                 d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
-                d_w = -(d_u * u + d_v * v) - d_z * z * inverse_w
-                d_w = d_w if moves else zero
+                d_w = -d_z * z * inverse_near
+                d_w = d_w if w == w_near else zero
+                d_w -= d_u * u + d_v * v
                 lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
                 lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
-                lanes[ZC, j] += d_z * inverse_w
+                lanes[ZC, j] += d_z * inverse_near
                 lanes[AX, j] += d_u * dx
                 lanes[AY, j] += d_u * dy
                 lanes[BX, j] += d_v * dx
