@@ -31,7 +31,8 @@ DEFAULT_PAGE = ROOT / "docs" / "avo_benchmark.md"
 STRATEGY_ORDER = ("avo", "max-visibility", "canonical", "avo-no-depth")
 _HIDDEN_POSES, _FILM_POSES = 20, 40
 _PICTURE_PX = 160
-_STEPS = (3e-4, 6e-4, 1e-3)  # metres and radians, of the differences that the gradient is held against
+_STEPS = (1e-5, 3e-5, 1e-4)  # metres and radians, of the differences that the gradient is held against
+_WIDE_STEPS = (3e-4, 6e-4, 1e-3)  # over these, splats change their order
 
 
 def measure_capture(
@@ -83,7 +84,9 @@ def measure_capture(
         points, filmed = points_of[entity.id], filmed_of[entity.id]
         record = {
             "capture": capture.name, "name": entity.name, "hidden": hidden[entity.id], "filmed": float(filmed.mean()),
-            "radius_m": target.radius_m, "gradient_error": _gradient_error(scene, target, config), "strategies": {},
+            "radius_m": target.radius_m, "gradient_error": _gradient_error(scene, target, config, _STEPS),
+            "gradient_error_wide": _gradient_error(scene, target, config, _WIDE_STEPS),
+            "seeable": _seeable(scene, target, points, true_views, alignment, config), "strategies": {},
         }  # fmt: skip
         row = []
         for name in STRATEGY_ORDER:
@@ -142,7 +145,20 @@ def _figures(
     }
 
 
-def _gradient_error(scene: Any, target: Any, config: Any) -> float:
+def _seeable(
+    scene: Any, target: Any, points: np.ndarray, true_views: Any, alignment: Any, config: Any
+) -> float:
+    """Return the share of the true surface that cameras in free space all around the target see together."""
+    from reconstruction.avo.cameras import square_camera
+    from reconstruction.avo.starts import input_starts, starts_around
+
+    poses = np.concatenate([starts_around(scene, target, config), input_starts(scene, target, config)[::4]])
+    camera = square_camera(config.picture_side_px, config.fov_deg)
+    seen = [true_views.seen(points, camera, alignment.pose_to_true(pose)) for pose in poses]
+    return float(np.any(seen, axis=0).mean())
+
+
+def _gradient_error(scene: Any, target: Any, config: Any, steps: Sequence[float]) -> float:
     """Return the relative error of the pose gradient beside central differences, at the nearest input camera."""
     from reconstruction.avo.cameras import look_at, square_camera
     from reconstruction.avo.objective import Objective
@@ -165,7 +181,7 @@ def _gradient_error(scene: Any, target: Any, config: Any) -> float:
     found = value(np.zeros(6), True).gradient
     differences = np.array(
         [
-            np.median([(value(h * axis).loss - value(-h * axis).loss) / (2 * h) for h in _STEPS])
+            np.median([(value(h * axis).loss - value(-h * axis).loss) / (2 * h) for h in steps])
             for axis in np.eye(6)
         ]
     )

@@ -27,7 +27,7 @@ class AvoConfig:
     """What the back of a Gaussian counts beside its front. Backs show through sides of a thing that no frame saw: the
     view is where a completed shape can be looked at, but its picture shows a shell from within. 0: no such views."""
 
-    side_px: int = 128
+    side_px: int = 96
     """Side of the square picture that is optimized."""
 
     scan_side_px: int = 64
@@ -46,7 +46,7 @@ class AvoConfig:
     """Lambda: of the squared difference to the target distance, relative to it. Information counts as a share of
     what the best start shows."""
 
-    steps: int = 24
+    steps: int = 15
     """Gradient steps of a view."""
 
     rate: float = 0.06
@@ -99,7 +99,7 @@ class AvoConfig:
 
 
 AVO_PRESETS = {
-    "fast": AvoConfig(views=3, steps=16),
+    "fast": AvoConfig(views=3, steps=9),
     "default": AvoConfig(),
-    "quality": AvoConfig(steps=36, restarts=3, picture_side_px=512),
+    "quality": AvoConfig(side_px=128, steps=24, restarts=3, picture_side_px=512),
 }

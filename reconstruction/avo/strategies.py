@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 _APART_DEG = 25.0  # starts that are optimized look from directions at least this far apart
 _CANONICAL_PITCH_DEG = 25.0
 _BY_PIXELS = 0.15  # of the ranking of starts; the rest is by what is seen anew
-_SEEN_AT, _CLEAR_SHARE = 0.33, 0.05
+_SEEN_AT, _CLEAR_SHARE = 0.1, 0.2
 _FRONTS_FROM = 2  # every second input camera tells fronts from backs
-_BETTER = 1.1  # by this factor a start must show more than what the search made of it, to stay
+_BETTER = 1.03  # by this factor a start must show more than what the search made of it, to stay
 _LEAST_PX = 0.05  # of a Gaussian; less is never a good view of it
 
 
