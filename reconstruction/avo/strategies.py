@@ -55,7 +55,7 @@ class Coverage:
 
     A Gaussian has a front, which frames saw, and a back, which shows through sides that no frame saw: it stands for
     what is there, with less weight. What a view shows of a side is its rendered contribution beside the most that any
-    start shows of it. A third of that counts as seen; a small part of the weight waits for a view as good as the best.
+    start shows of it. A tenth of that counts as seen; a fifth of the weight waits for a view as good as the best.
     """
 
     def __init__(self, opacities: np.ndarray, most: np.ndarray, back_weight: float) -> None:

@@ -16,8 +16,9 @@ def record(hidden, avo, other):
         name: figures(other) for name in ("max-visibility", "canonical", "avo-no-depth")
     }
     return {
-        "capture": "a", "name": "mug", "hidden": hidden, "gradient_error": 0.01, "gradient_error_wide": 0.02, "seeable": 0.51,
-            "strategies": strategies}  # fmt: skip
+        "capture": "a", "name": "mug", "hidden": hidden, "gradient_error": 0.01, "gradient_error_wide": 0.02,
+        "seeable": 0.51, "strategies": strategies,
+    }  # fmt: skip
 
 
 def test_wins_ties_and_hidden_objects_are_told_apart(tmp_path):
@@ -31,9 +32,7 @@ def test_wins_ties_and_hidden_objects_are_told_apart(tmp_path):
     assert "| `max-visibility` | four views | 50 % | 25 % | 25 % |" in every
     assert "| `canonical` | 50.0 | 90.0 | 30.0 | 30.0 | 4.0 | 1 | 1.0 |" in hidden
     # One object is seen as far as anything in free space sees it: nothing was left to win there.
-    assert (
-        "| `canonical` | four views, of the 1 objects of which it leaves more than a tie | 100 % | 0 % | 0 % |"
-        in hidden
-    )
+    left = "four views, of the 1 objects of which it leaves more than a tie"
+    assert f"| `canonical` | {left} | 100 % | 0 % | 0 % |" in hidden
     assert "0 of 16" in page
     assert "## Pictures" not in page
