@@ -68,14 +68,14 @@ def measure_capture(
     scene = prepare_scene(gaussians, surface, found, posed.camera)
     prepared_s = time.perf_counter() - started
     config = AvoConfig(remaining_share=0.0, min_gain=0.0)  # the same number of views for all
-    numbers = _instance_of(truth, alignment, surface, found)
+    numbers = instance_of(truth, alignment, surface, found)
     true_views, film = TrueViews(truth), [pose for _, pose in sorted(truth.world_from_camera.items())]
-    hidden = true_views.hidden_shares(_spread(film, _HIDDEN_POSES))
+    hidden = true_views.hidden_shares(spread(film, _HIDDEN_POSES))
     warm = replace(config, views=1, steps=2, picture_side_px=32)
     find_views(scene, [o.id for o in found.objects[:1]], warm)  # compiles
     chosen = [e for e in truth.evaluated if e.id in numbers and hidden.get(e.id, -1.0) >= least_hidden]
     points_of = {entity.id: true_views.points_of(entity) for entity in chosen}
-    filmed_of = true_views.seen_by_any(points_of, truth.camera, _spread(film, _FILM_POSES))
+    filmed_of = true_views.seen_by_any(points_of, truth.camera, spread(film, _FILM_POSES))
     objects, drawn = [], []
     for entity in chosen:
         target = make_target(scene, numbers[entity.id], config)
@@ -84,8 +84,8 @@ def measure_capture(
         points, filmed = points_of[entity.id], filmed_of[entity.id]
         record = {
             "capture": capture.name, "name": entity.name, "hidden": hidden[entity.id], "filmed": float(filmed.mean()),
-            "radius_m": target.radius_m, "gradient_error": _gradient_error(scene, target, config, _STEPS),
-            "gradient_error_wide": _gradient_error(scene, target, config, _WIDE_STEPS),
+            "radius_m": target.radius_m, "gradient_error": gradient_error(scene, target, config, _STEPS),
+            "gradient_error_wide": gradient_error(scene, target, config, _WIDE_STEPS),
             "seeable": _seeable(scene, target, points, true_views, alignment, config), "strategies": {},
         }  # fmt: skip
         row = []
@@ -106,11 +106,11 @@ def measure_capture(
     }  # fmt: skip
 
 
-def _spread(poses: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
+def spread(poses: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
     return [poses[i] for i in np.unique(np.linspace(0, len(poses) - 1, count).round().astype(int))]
 
 
-def _instance_of(truth: Any, alignment: Any, surface: Any, found: Any) -> dict[int, int]:
+def instance_of(truth: Any, alignment: Any, surface: Any, found: Any) -> dict[int, int]:
     """Return which instance shows most of each true thing, by true id."""
     from scipy.spatial import cKDTree
 
@@ -158,7 +158,7 @@ def _seeable(
     return float(np.any(seen, axis=0).mean())
 
 
-def _gradient_error(scene: Any, target: Any, config: Any, steps: Sequence[float]) -> float:
+def gradient_error(scene: Any, target: Any, config: Any, steps: Sequence[float]) -> float:
     """Return the relative error of the pose gradient beside central differences, at the nearest input camera."""
     from reconstruction.avo.cameras import look_at, square_camera
     from reconstruction.avo.objective import Objective
@@ -250,7 +250,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 measured = measure_capture(
                     capture, variant, arguments.out.resolve(), arguments.pictures, arguments.least_hidden
                 )
-                _save_pictures(measured.pop("pictures"), arguments.page, capture.name)
+                save_pictures(measured.pop("pictures"), arguments.page, capture.name)
                 path.write_text(json.dumps(measured, indent=1) + "\n")
             if path.is_file():
                 kept.append(json.loads(path.read_text()))
@@ -262,7 +262,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _save_pictures(pictures: Sequence[tuple[str, np.ndarray]], page: Path, capture: str) -> None:
+def save_pictures(pictures: Sequence[tuple[str, np.ndarray]], page: Path, capture: str) -> None:
     import cv2
 
     if not pictures:

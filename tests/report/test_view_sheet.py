@@ -4,8 +4,11 @@ import json
 import shutil
 
 import cv2
+import numpy as np
 import pytest
 
+from benchmarks.avo import gradient_error
+from reconstruction.avo import AvoConfig, make_target, prepare_scene
 from reconstruction.cli import main
 
 QUICK = [
@@ -60,3 +63,14 @@ def test_what_is_wrong_is_said(home, tmp_path, capsys):
     assert "takes options of avo alone" in capsys.readouterr().err
     assert main(command(home, tmp_path, "--work-dir", str(tmp_path / "elsewhere"))) == 2
     assert "is gone; reconstruct the scene again" in capsys.readouterr().err
+
+
+def test_the_gradient_is_that_of_what_is_computed_on_fitted_gaussians(reconstructed):
+    _, stages = reconstructed.open()
+    gaussians, _ = stages.refined_in_world()
+    found, config = stages.get("instances"), AvoConfig(side_px=64)
+    scene = prepare_scene(gaussians, stages.get("surface"), found, stages.get("poses").camera)
+    targets = [make_target(scene, item.id, config) for item in found.objects]
+    errors = [gradient_error(scene, target, config, (1e-6, 3e-6, 1e-5)) for target in targets if target]
+    assert len(errors) >= 2
+    assert np.max(errors) < 0.03
