@@ -29,7 +29,9 @@ class View:
     color: np.ndarray  # uint8 (h, w, 3) RGB of the whole scene, black where nothing is known
     alpha: np.ndarray  # float32 (h, w) the target's own opacity, behind what hides it
     depth: np.ndarray  # float32 (h, w) z-depth of the target where alpha > 0.5, else 0
-    outline: np.ndarray  # bool (h, w) where the target would be seen if nothing hid it
+    outline: (
+        np.ndarray
+    )  # bool (h, w) where the target would be seen if nothing hid it, what no frame saw of it too
     visibility: float  # share of the outline that nothing hides
     fronts: (
         float  # share of what is seen of it that frames saw; the rest are backs, through sides that none saw
@@ -97,6 +99,8 @@ def draw_view(
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(outline > 1e-6, alone[..., 3] / outline, 0.0)
     clean, holes = _without_occluders(scene, own, camera, pose, outline > _OPAQUE, depth)
+    behind = _hidden_holes(outline > _OPAQUE, depth, whole)
+    holes |= _grown(behind)
     total = float(outline.sum())
     return View(
         target=target.ids,
@@ -107,7 +111,7 @@ def draw_view(
         color=_uint8(whole[..., :3]),
         alpha=alpha,
         depth=np.where(alpha > _OPAQUE, depth, 0.0).astype(np.float32),
-        outline=outline > _OPAQUE,
+        outline=(outline > _OPAQUE) | behind,
         fronts=fronts,
         visibility=min(float(alpha.sum()) / total, 1.0) if total > 0 else 0.0,
         clean=inpainter.inpaint(clean, holes),
@@ -135,6 +139,29 @@ def _without_occluders(
     opacity = features[..., 7]
     color = features[..., :3] / np.maximum(opacity, 1e-3)[..., None]
     return _uint8(np.where(opacity[..., None] > _OPAQUE, color, 0.0)), _grown(opacity <= _OPAQUE)
+
+
+def _hidden_holes(outline: np.ndarray, depth: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return what the outline (h, w) surrounds that no frame saw because other things hide it, bool (h, w).
+
+    There the scene (features (h, w, c)) is nearer than the target (depth (h, w)) around; through open ones it is not.
+    """
+    import cv2
+
+    edges, _ = cv2.findContours(outline.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    filled = cv2.drawContours(np.zeros(outline.shape, np.uint8), edges, -1, 1, cv2.FILLED)
+    count, parts = cv2.connectedComponents(filled & ~outline, connectivity=4)
+    scene_depth = whole[..., 3] / np.maximum(whole[..., 7], 1e-6)
+    known = whole[..., 7] > _OPAQUE
+    out = np.zeros(outline.shape, bool)
+    for number in range(1, count):
+        hole = parts == number
+        around = cv2.dilate(hole.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool) & outline
+        if not (hole & known).any() or not around.any():
+            continue
+        if np.median(scene_depth[hole & known]) < np.median(depth[around]):
+            out |= hole
+    return out
 
 
 def _before_target(

@@ -14,6 +14,7 @@ from reconstruction import artifacts
 from reconstruction.assets.generation.pictures import object_pictures
 from reconstruction.assets.physics.vlm import shown_pictures
 from reconstruction.avo import AvoConfig, SceneViews, find_views, make_views
+from reconstruction.avo.pictures import _hidden_holes
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
 from reconstruction.instances.naming.views import ObjectView
@@ -110,6 +111,19 @@ def test_what_hides_a_thing_is_not_in_its_cleared_picture(hidden_view):
     red, green = picture[mask].mean(axis=0)[:2]
     assert red > 3 * green  # the box is red, the panel before it green
     assert mask.sum() > hidden_view.mask.sum()
+
+
+def test_what_things_hide_from_all_frames_is_of_the_target_and_open_holes_are_not():
+    outline = np.zeros((40, 60), bool)
+    outline[5:35, 5:55] = True
+    outline[10:20, 10:20] = outline[10:20, 40:50] = False
+    depth = np.where(outline, 2.0, 0.0)
+    whole = np.zeros((40, 60, 8))
+    whole[..., 7], whole[..., 3] = 1.0, 3.0
+    whole[10:20, 10:20, 3] = 1.5  # something stands before the left gap
+    hidden = _hidden_holes(outline, depth, whole)
+    assert hidden[10:20, 10:20].all()
+    assert hidden.sum() == 100
 
 
 def frames(found: InstanceSet) -> PosedFrames:
