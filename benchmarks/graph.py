@@ -25,6 +25,7 @@ from reconstruction.scene_graph import (
     region_questions,
     synthesize,
 )
+from reconstruction.synthetic.containers import CONTAINER_KINDS
 from reconstruction.synthetic.procedural import RoomSpec, plan_room, unpainted
 from reconstruction.synthetic.room import Room
 from reconstruction.synthetic.true_assets import true_assets, true_edges
@@ -35,7 +36,7 @@ from registry.geometry import rigid
 DEFAULT_PAGE = ROOT / "docs" / "scene_graph_benchmark.md"
 MERGINGS = ("online", "naive", "global")
 LIES = ((0.0, 0.0), (0.1, 0.1), (0.2, 0.2), (0.3, 0.3))  # shares of edges wrong, missing
-_CONTAINERS = ("crate", "box", "bowl", "tray", "basket")
+_CONTAINERS = {"crate", *(kind.label for kind in CONTAINER_KINDS.values())}
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def kind_of(room: Room) -> dict[int, str]:
             below, parent = below + 1, entities[parent.parent]
         if item.relation == "attached_to":
             out[item.id] = "on a wall"
-        elif entities[item.parent].label in _CONTAINERS and below > 0:
+        elif entities[item.parent].label in _CONTAINERS:
             out[item.id] = "in a container"
         else:
             out[item.id] = ("on the floor", "on one thing", "on two things", "on three or more")[
