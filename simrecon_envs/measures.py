@@ -86,7 +86,10 @@ class Measures:
 
     def position(self, key: int) -> torch.Tensor:
         """Return where a thing's box centre is (b, 3)."""
-        return self.positions[:, self._row[key]]
+        if ("position", key) not in self._cache:
+            pose, row = self.poses[:, self._row[key]], self._row[key]
+            self._cache["position", key] = pose[:, :3] + rotate(pose[:, 3:], self._centers[:, row])
+        return self._cache["position", key]
 
     def pose(self, key: int) -> torch.Tensor:
         """Return the pose (b, 7) of a thing's box centre, with the orientation of its actor."""

@@ -3,6 +3,7 @@
 Robots and cameras are placed with it, before anything is built in the simulator.
 """
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,12 +25,12 @@ class ConvexSolid:
     vertices: np.ndarray  # float64 (v, 3)
     half_spaces: np.ndarray  # float64 (f, 4): inside where n . x + d <= 0
 
-    @property
+    @functools.cached_property
     def lower(self) -> np.ndarray:
         """Return the least corner of its bounding box (3,)."""
         return self.vertices.min(axis=0)
 
-    @property
+    @functools.cached_property
     def upper(self) -> np.ndarray:
         """Return the greatest corner of its bounding box (3,)."""
         return self.vertices.max(axis=0)

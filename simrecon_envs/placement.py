@@ -208,6 +208,7 @@ def _place_near(
     reach = traits.reach_m[2] + 1.2
     lower = np.array([*(target.center[:2] - reach), -0.1])
     upper = np.array([*(target.center[:2] + reach), max(target.top_m + 1.0, 2.0)])
+    solids = [s for s in solids if (s.lower <= upper).all() and (s.upper >= lower).all()]
     grid = OccupancyGrid(solids, lower, upper, margin_m=config.clearance_m)
     walls = OccupancyGrid([s for s in solids if s.owner in wall_ids], lower, upper, margin_m=0.0)
     others = OccupancyGrid([s for s in solids if s.owner != target.id], lower, upper, margin_m=0.0)
@@ -283,12 +284,12 @@ def _stands(
     below, floor = placement.position[2], 0.0
     if not traits.mobile:
         disk = _disk(traits.footprint_radius_m)
-        top = _support_top(solids, placement.to_world(disk), below)
         column = np.arange(0.03, max(below - 0.03, 0.03), 0.04)
         free = not grid.occupied(placement.to_world(disk[None] - [0, 0, 1] * column[:, None, None])).any()
-        if not free and top is None:
-            return None
         if not free:
+            top = _support_top(solids, placement.to_world(disk), below)
+            if top is None:
+                return None
             # It stands on the support: what is below 5 cm is its foot, which touches on purpose.
             floor = top
             points = points[points[:, 2] > 0.05]

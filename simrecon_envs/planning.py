@@ -10,6 +10,7 @@ from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
 
 _TRIES = 8  # tasks of a kind that are tried before one out of reach is taken
+_HARD_TRIES = 2  # of those that something speaks against
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ def plan_task(facts: SceneFacts, task: str, target: str | int, shape: RobotShape
     if not specs:
         raise UsageError(unknown_task(facts, task))
     plans = []
-    for spec in sorted(specs, key=lambda spec: not spec.feasible)[:_TRIES]:
+    feasible, hard = ([s for s in specs if s.feasible is wanted] for wanted in (True, False))
+    for spec in feasible[:_TRIES] + hard[:_HARD_TRIES]:
         plans.append(_place(facts, spec, shape))
         if not plans[-1].note:
             return plans[-1]

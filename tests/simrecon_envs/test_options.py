@@ -172,7 +172,7 @@ def test_wrong_vectors_say_what_is_right(scenes_root: Path) -> None:
 
 def test_many_scenes_in_one_environment(scenes_root: Path) -> None:
     simrecon_envs.register_scenes(scenes_root)
-    env = gym.make("SimRecon/Multi-v0", registry=str(scenes_root), task="pick", cache_size=1)
+    env = gym.make("SimRecon/Multi-v0", registry=str(scenes_root), task="pick", cache_size=2)
     assert EnvSpec.from_json(env.spec.to_json()).kwargs["task"] == "pick"
     check_env(env.unwrapped, skip_render_check=True)
 
@@ -184,7 +184,11 @@ def test_many_scenes_in_one_environment(scenes_root: Path) -> None:
     assert first == run()
     assert {scene for scene, _ in first} == {"room", "things"}
     assert list(env.unwrapped.skipped) == ["bare"]
-    assert len(env.unwrapped._made) == 1
+    assert len(env.unwrapped._made) == 2
+    env.unwrapped._size = 1  # then the one that was not used for longest is closed
+    env.unwrapped._made.pop("room").close()
+    assert env.reset(options={"scene": "room"})[1]["scene"] == "room"
+    assert list(env.unwrapped._made) == ["room"]
     assert env.reset(options={"scene": "room"})[1]["scene"] == "room"
     with pytest.raises(UsageError, match="bare: nothing in this scene can move"):
         env.reset(options={"scene": "bare"})

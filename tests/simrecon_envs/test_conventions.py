@@ -1,0 +1,108 @@
+"""Every task, robot and observation mode: the checkers of Gymnasium and stable-baselines3, and ManiSkill's ways."""
+
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import psutil
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import simrecon_envs
+
+TASKS = ("reach", "pick", "place", "put", "stack", "push", "rearrange", "none")
+STATE_MODES, PICTURE_MODES = ("state", "state_dict"), ("rgb", "rgbd", "segmentation", "pointcloud")
+SMALL = {"sensor_configs": {"width": 32, "height": 32}}
+SCENES = {"things": TASKS, "room": ("reach", "pick", "place", "push", "none")}  # `room` has no container
+
+FAST = [
+    ("things", "put", "panda", "state"),
+    ("room", "pick", "fetch", "state_dict"),
+    ("things", "none", "panda", "state"),
+]
+MATRIX = [
+    (scene, task, robot, mode)
+    for scene, tasks in SCENES.items()
+    for robot in ("panda", "fetch")
+    for task in (*tasks, *(("navigate",) if robot == "fetch" else ()))
+    for mode in (*STATE_MODES, *PICTURE_MODES)
+]
+
+
+def _parameters() -> list:
+    fast = [pytest.param(*case, id="-".join(case)) for case in FAST]
+    slow = []
+    for case in MATRIX:
+        marks = [pytest.mark.slow, *([pytest.mark.render] if case[3] in PICTURE_MODES else [])]
+        slow.append(pytest.param(*case, marks=marks, id="-".join(case)))
+    return fast + [case for case in slow if case.values not in FAST]
+
+
+def _kwargs(task: str, mode: str) -> dict:
+    return {"task": task, "obs_mode": mode, **(SMALL if mode in PICTURE_MODES else {})}
+
+
+@pytest.mark.parametrize(("scene", "task", "robot", "mode"), _parameters())
+def test_checkers_pass(scene: str, task: str, robot: str, mode: str, scenes_root: Path) -> None:
+    env = simrecon_envs.make_cpu(scene, registry=scenes_root, robot_uids=robot, **_kwargs(task, mode))
+    batched = env.env
+    with warnings.catch_warnings():
+        # The checkers advise against unbounded boxes and small pictures, which ManiSkill's observations are.
+        warnings.simplefilter("ignore")
+        check_env(env, skip_render_check=True)
+        if mode in ("state", "rgb"):
+            sb3_check_env(env, warn=False, skip_render_check=True)
+    # ManiSkill's ways: torch, one row an environment, "success" in the info.
+    obs, info = batched.reset(seed=0)
+    assert batched.observation_space.contains(_numpy(obs))
+    obs, reward, terminated, truncated, info = batched.step(batched.action_space.sample())
+    for value in (reward, terminated, truncated, *([info["success"]] if task != "none" else [])):
+        assert isinstance(value, torch.Tensor)
+        assert value.shape == (1,)
+    assert 0 <= float(reward) <= 1
+    state = batched.unwrapped.get_state()
+    batched.unwrapped.set_state(state)
+    assert torch.allclose(batched.unwrapped.get_state(), state, atol=1e-6)
+    env.close()
+
+
+def _numpy(obs: object) -> object:
+    return {key: _numpy(value) for key, value in obs.items()} if isinstance(obs, dict) else np.asarray(obs)
+
+
+def _run_at_the_bounds(env: gym.Env, steps: int) -> None:
+    low, high = env.action_space.low, env.action_space.high
+    rng = np.random.default_rng(0)
+    for step in range(steps):
+        obs, reward, _, _, _ = env.step(np.where(rng.random(low.shape) < 0.5, low, high))
+        assert torch.isfinite(obs).all(), f"step {step}"
+        assert 0 <= float(reward) <= 1
+        if step % 200 == 199:
+            env.reset()
+
+
+@pytest.mark.parametrize("steps", [300, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_actions_at_the_bounds_give_finite_numbers(steps: int, scenes_root: Path) -> None:
+    env = simrecon_envs.make(
+        "things", registry=scenes_root, task="rearrange", randomize="all", max_episode_steps=10**9
+    )
+    env.reset(seed=0)
+    _run_at_the_bounds(env, steps)
+    env.close()
+
+
+@pytest.mark.parametrize("resets", [60, pytest.param(500, marks=pytest.mark.slow)])
+def test_memory_does_not_grow_with_resets(resets: int, scenes_root: Path) -> None:
+    env = simrecon_envs.make("things", registry=scenes_root, task="rearrange", randomize="all")
+    process = psutil.Process()
+    for number in range(40):
+        env.reset(seed=number)
+    before = process.memory_info().rss
+    for number in range(resets):
+        env.reset(seed=number)
+        env.step(env.action_space.sample())
+    assert process.memory_info().rss - before < 3e6
+    env.close()
