@@ -1,6 +1,6 @@
 """Make the environment of a reconstructed scene, look at what is in it, and take one step.
 
-You will see the scene's objects, the task in words, and the shapes of the observations.
+You will see the scene's tasks and objects, the chosen task in words, and the shapes of the observations.
 
     python examples/03_make_env.py --env-id SimRecon/scene0001 --robot fetch
 """
@@ -20,7 +20,9 @@ def main() -> None:
         "--registry", default=None, help="the registry's folder; the default registry if left out"
     )
     parser.add_argument("--robot", default="panda")
-    parser.add_argument("--target", default="auto", help="what to pick up: auto, an object's id, or a label")
+    parser.add_argument(
+        "--task", default="pick", help="a kind of task, or a name from the list that is printed"
+    )
     arguments = parser.parse_args()
 
     # `import simrecon_envs` has registered the default registry already; another one is registered by hand.
@@ -30,9 +32,13 @@ def main() -> None:
         arguments.env_id,
         registry=arguments.registry,
         robot_uids=arguments.robot,
-        target=arguments.target,
+        task=arguments.task,
         obs_mode="state_dict",
     )
+    for task in simrecon_envs.list_tasks(
+        arguments.env_id, registry=arguments.registry, robot=arguments.robot
+    ):
+        print(f"  {task.id}: {task.instruction}")
     scene = env.unwrapped
     for item in scene.bundle.objects:
         kind = "movable" if scene.builder.objects[item.id].dynamic else "fixed"

@@ -1,18 +1,15 @@
-"""Train PPO of stable-baselines3 to pick up the target: short, to show that everything fits together.
+"""Train PPO of stable-baselines3 on a task of a scene: short, to show that everything fits together.
 
-You will see the mean reward of an episode rise as the hand learns to come near the target. Really picking it
-up takes some millions of steps; use more environments (`--envs`, one process each) and a longer run for that.
+You will see the mean reward of an episode rise as the hand learns to come near the target. Reaching takes tens of
+thousands of steps, picking up some millions: use more environments (`--envs`, one process each) and a longer run.
 
-    python examples/05_train_ppo.py --env-id SimRecon/scene0001 --steps 4000
+    python examples/05_train_ppo.py --env-id SimRecon/scene0001 --task reach --steps 4000
 """
 
 import argparse
-import functools
 
 from stable_baselines3 import PPO
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import simrecon_envs
 
@@ -25,29 +22,23 @@ def main() -> None:
         "--registry", default=None, help="the registry's folder; the default registry if left out"
     )
     parser.add_argument("--robot", default="panda")
+    parser.add_argument("--task", default="reach", help="a kind of task or a task's name")
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--envs", type=int, default=1, help="environments in parallel, one process each")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default=None, help="where to save the policy (.zip)")
     arguments = parser.parse_args()
 
-    make_one = functools.partial(
-        simrecon_envs.make_cpu,
+    env = simrecon_envs.make_vec(
         arguments.env_id,
+        arguments.envs,
+        kind="sb3",
+        seed=arguments.seed,
         registry=arguments.registry,
         robot_uids=arguments.robot,
+        task=arguments.task,
         control_mode="pd_joint_delta_pos",
-        reward_mode="normalized_dense",
         max_episode_steps=100,
-    )
-    # A simulator must not be forked: each process starts afresh and makes its own.
-    parallel = arguments.envs > 1
-    env = make_vec_env(
-        make_one,
-        n_envs=arguments.envs,
-        seed=arguments.seed,
-        vec_env_cls=SubprocVecEnv if parallel else DummyVecEnv,
-        vec_env_kwargs={"start_method": "spawn"} if parallel else None,
     )
     n_steps = min(256, max(arguments.steps // arguments.envs, 32))
     model = PPO(
