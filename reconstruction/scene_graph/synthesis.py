@@ -106,11 +106,11 @@ def _tell(steps: Sequence[MergeStep], missing: Sequence[int], progress: Progress
     """Say what was not plain: conflicts, problems of the backend, objects that nothing was said of."""
     for step in steps:
         for line in step.notes:
-            progress.note(f"scene graph: {line}")
+            progress.note(line)
         for done in step.decisions:
             if done.verdict == "conflict":
-                progress.note(f"scene graph: {done.child} {done.relation} {done.parent}: {done.why}")
+                progress.note(f"{done.child} {done.relation} {done.parent}: {done.why}")
             elif done.verdict == "replaced":
-                progress.note(f"scene graph: settled: {done.child} {done.relation} {done.parent}, {done.why}")
+                progress.note(f"settled: {done.child} {done.relation} {done.parent}, {done.why}")
     if missing:
-        progress.note(f"scene graph: no view says what {', '.join(map(str, missing))} rest on")
+        progress.note(f"no view says what {', '.join(map(str, missing))} rest on")
