@@ -1,0 +1,62 @@
+"""The report card where people meet it: `simrecon verify --physics` and `--require-stable`."""
+
+import json
+import shutil
+from types import SimpleNamespace
+
+import pytest
+from boxes import box, room
+from exports_room import BOOK, HANDLE, KNOB, MUG, PICTURE, TABLE
+
+from reconstruction.assembly import AssemblyConfig, assemble
+from reconstruction.cli import main
+from reconstruction.commands.scenes import describe_physics
+from reconstruction.publish import publish_scene
+from reconstruction.types import Edge, SceneGraph
+from registry import SceneRegistry
+from registry.errors import SimReconError
+
+
+@pytest.fixture(scope="module")
+def verified(bundle, tmp_path_factory):
+    """What `simrecon verify --physics --json` says of the room that exports are tested with."""
+    folder, root = tmp_path_factory.mktemp("staged") / "bundle", tmp_path_factory.mktemp("registry")
+    shutil.copytree(bundle.root, folder)
+    SceneRegistry(root, create=True).publish(folder, "room")
+    return root
+
+
+def test_verify_measures_the_published_scene_again(verified, capsys):
+    assert main(["verify", "room", "--registry", str(verified), "--physics", "--json"]) == 0
+    physics = json.loads(capsys.readouterr().out)["physics"]
+    assert physics["stable_rate"] == physics["at_rest_rate"] == 1.0
+    contacts = physics["contacts"]
+    assert contacts["support_edges_real"] == contacts["support_edges"] == 5
+    assert contacts["supports_without_edge"] == []
+    assert {o["id"] for o in physics["fixed"]} >= {HANDLE, PICTURE} - {o["id"] for o in physics["objects"]}
+    assert {TABLE, MUG, BOOK} <= {o["id"] for o in physics["objects"]}
+    hung = {e["child"] for e in contacts["edges_without_contact"]}
+    assert KNOB not in hung
+
+
+def test_verify_says_it_in_words(verified, capsys):
+    assert main(["verify", "room", "--registry", str(verified), "--physics"]) == 0
+    said = capsys.readouterr().out
+    assert "all files are as published" in said
+    assert "physics: stable 100%" in said
+    assert "edges are real" in said
+
+
+def test_a_scene_that_does_not_rest_is_not_published(tmp_path):
+    assets = room(box(10, (0.3, 0.2, 0.1), (0, 0, 0.3)), box(11, (0.1, 0.1, 0.1), (1, 0, -0.004)))
+    graph = SceneGraph((Edge(10, "supported_by", 1, 1.0, ""), Edge(11, "supported_by", 10, 1.0, "")))
+    scene = assemble(assets, graph, AssemblyConfig(method="in-situ"))
+    lines = "\n".join(describe_physics(scene.physics_report))
+    assert "11 supported_by 10 is no contact" in lines
+    assert "11 rests on 1, which is no edge" in lines
+    assert "box_10 floats at the start" in lines
+    registry = SceneRegistry(tmp_path / "registry", create=True)
+    run = SimpleNamespace(results={"assembly": scene})
+    with pytest.raises(SimReconError, match=r"box_10 does not stay put.*overlap by 4\.0 mm.*--overrides"):
+        publish_scene(run, registry, "falls", require_stable=True)
+    assert not registry.list()
