@@ -38,9 +38,14 @@ _SAME_THING = 0.25  # box IoU
 
 
 def measure(
-    name: str, group: str, assets: AssetSet, graph: SceneGraph, true_centers: dict[int, np.ndarray]
+    name: str,
+    group: str,
+    assets: AssetSet,
+    graph: SceneGraph,
+    true_centers: dict[int, np.ndarray],
+    methods: Sequence[str] = METHODS,
 ) -> dict[str, Any]:
-    """Assemble one scene with every method.
+    """Assemble one scene with some methods.
 
     Args:
         name: Of the scene.
@@ -48,10 +53,11 @@ def measure(
         assets: What is assembled.
         graph: What carries what.
         true_centers: By object, where the middle (3,) of its box truly is, in the scene's world.
+        methods: Of `assembly.method`.
     """
     record = {"scene": name, "group": group, "objects": len(assets.objects), "methods": {}}
     record |= {"machine": describe_machine(), **describe_code()}
-    for method in METHODS:
+    for method in methods:
         wall, cpu = time.perf_counter(), time.process_time()
         scene = assemble(assets, graph, replace(AssemblyConfig(), method=method))
         cost = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
@@ -94,21 +100,23 @@ def _center(item: Any, pose: np.ndarray) -> np.ndarray:
     return transform_points(pose, 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))[None])[0]
 
 
-def measure_room(seed: int, objects: int) -> dict[str, Any]:
+def measure_room(seed: int, objects: int, methods: Sequence[str] = METHODS) -> dict[str, Any]:
     """Measure one generated room."""
     task = room_task(seed, objects)
     centers = {item.id: _center(item, task.true_poses[item.id]) for item in task.assets.objects}
-    return measure(f"generated_{seed}_{objects}", "generated rooms", task.assets, task.graph, centers)
+    return measure(
+        f"generated_{seed}_{objects}", "generated rooms", task.assets, task.graph, centers, methods
+    )
 
 
-def measure_capture(capture: Capture, out: Path) -> dict[str, Any]:
+def measure_capture(capture: Capture, out: Path, methods: Sequence[str] = METHODS) -> dict[str, Any]:
     """Measure one capture, reconstructed with default options."""
     run = stage_run(capture.source, work_of(out, capture), [])
     run.execute("scene_graph")
     assets, graph = run.results["assets"], run.results["scene_graph"].plain()
     centers = _true_centers(capture, run, assets) if capture.truth == "scene" else {}
     group = "captures with truth" if capture.truth == "scene" else "captures without objects in their truth"
-    return measure(capture.name, group, assets, graph, centers)
+    return measure(capture.name, group, assets, graph, centers, methods)
 
 
 def _true_centers(capture: Capture, run: Any, assets: AssetSet) -> dict[int, np.ndarray]:
@@ -153,6 +161,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--rooms", type=int, default=0, metavar="N", help="generated rooms of 5 to 40 objects"
     )
     parser.add_argument("--first-room", type=int, default=0, metavar="SEED", help="seed of the first of them")
+    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS, help="default: all")
     parser.add_argument("--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="where results are kept")
     parser.add_argument("--page", type=Path, default=DEFAULT_PAGE, metavar="FILE", help="the page to write")
     parser.add_argument("--page-only", action="store_true", help="measure nothing")
@@ -169,9 +178,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         captures = find_captures(arguments.captures, arguments.only) if arguments.captures else []
         if not arguments.page_only:
             for capture in captures:
-                _keep(folder, measure_capture(capture, out))
+                _keep(folder, measure_capture(capture, out, arguments.methods))
             for seed in range(arguments.first_room, arguments.first_room + arguments.rooms):
-                _keep(folder, measure_room(seed, objects_of(seed)))
+                _keep(folder, measure_room(seed, objects_of(seed), arguments.methods))
     except SimReconError as error:
         print(f"benchmarks.assembly: {error}", file=sys.stderr)
         return error.exit_code

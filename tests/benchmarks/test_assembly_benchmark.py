@@ -62,7 +62,7 @@ def test_the_page_is_written_from_what_is_kept(record, tmp_path):
     assert main(["--page-only", "--out", str(tmp_path), "--page", str(page)]) == 0
     text = page.read_text()
     assert "## Generated rooms (1, 8 objects)" in text
-    assert "| `hierarchical` | 100.0 | 100 |" in text
+    assert "| `hierarchical` | 1 | 100.0 | 100 |" in text
     capture = record | {"group": "captures with truth", "scene": "a room"}
     write_assembly_page([capture], page)
     assert "| a room | 8 |" in page.read_text()
