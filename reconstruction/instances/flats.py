@@ -7,7 +7,6 @@ compact, of one height, and around it the image shows another color or the line 
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -15,6 +14,8 @@ from scipy.spatial import cKDTree
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.image_colors import SurfaceSamples, surface_samples, with_colors
+from reconstruction.instances.merging import join
+from reconstruction.instances.outlines import filled_hull
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.supports import SupportRegion, find_supports
 from reconstruction.progress import Progress
@@ -169,9 +170,7 @@ def _flat_areas(plan: _Plan, support: SupportRegion) -> list[np.ndarray]:
 def _is_flat_thing(plan: _Plan, area: np.ndarray, least: float) -> bool:
     if ndimage.distance_transform_edt(np.pad(area, 1)).max() * _CELL_M < _MIN_RADIUS_M:
         return False
-    hull = cv2.convexHull(np.argwhere(area)[:, ::-1].astype(np.int32))
-    filled = cv2.fillConvexPoly(np.zeros(area.shape, np.uint8), hull, 1)
-    if area.sum() < _MIN_SOLIDITY * filled.sum():
+    if area.sum() < _MIN_SOLIDITY * filled_hull(area).sum():
         return False
     rise = plan.rise[area & plan.own]
     rise = rise[np.isfinite(rise)]
@@ -235,22 +234,16 @@ def _with_flat(
     taken = inside & grown[cells[:, 0], cells[:, 1]] & (rise > 0.5 * _LEAST_RISE_M) & (rise < _RIM_HEIGHT_M)
     flat = Thing(carrier.vertices[taken], carrier, carrier.depth + 1)
     carrier.vertices = carrier.vertices[~taken]
-    out = []
+    beside = [thing for thing in things if thing.rests_on is carrier and not thing.attached]
+    for rim in [thing for thing in beside if _is_rim(graph, plan, area, thing, support)]:
+        things = join(things, rim, flat)
     for thing in things:
-        if thing.rests_on is carrier and not thing.attached and _is_rim(graph, plan, area, thing, support):
-            flat.vertices = np.union1d(flat.vertices, thing.vertices)
-            for other in things:
-                if other.rests_on is thing:
-                    other.rests_on = flat
-        else:
-            out.append(thing)
-    for thing in out:
         if thing.rests_on is carrier and not thing.attached:
             points = graph.points[thing.vertices]
             foot = points[points[:, 2] < points[:, 2].min() + _FOOT_M]
             if plan.share_over(area, foot) > 0.5:
                 thing.rests_on = flat
-    return [*out, flat]
+    return [*things, flat]
 
 
 def _is_rim(graph: MeshGraph, plan: _Plan, area: np.ndarray, thing: Thing, support: SupportRegion) -> bool:

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.convexity import MIN_BULGE, bulge, is_within
+from reconstruction.instances.outlines import filled_hull
 from reconstruction.instances.supports import SupportRegion
 from reconstruction.surface.mesh_graph import MeshGraph
 
@@ -81,7 +82,7 @@ class _Plan:
             region = label == number
             hole = region & hollow
             # Free-standing ones have convex outlines; of one that touches others its hole is grown over the rim.
-            if region.sum() > _CONVEX * _filled_hull(region).sum():
+            if region.sum() > _CONVEX * filled_hull(region).sum():
                 tries = [(region, hole)]
             else:
                 parts, many = ndimage.label(hole)
@@ -89,7 +90,7 @@ class _Plan:
             for start, inside in tries:
                 if inside.sum() * self.cell_m**2 < _MIN_HOLE_M2:
                     continue
-                outline = self._outline(_filled_hull(start))
+                outline = self._outline(filled_hull(start))
                 if outline is not None and self._is_container(outline, inside):
                     out.append(outline)
                     break
@@ -222,9 +223,3 @@ def _hull_m2(graph: MeshGraph, vertices: np.ndarray) -> float:
 
 def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2) > 0
-
-
-def _filled_hull(cells: np.ndarray) -> np.ndarray:
-    grid = np.zeros(cells.shape, np.uint8)
-    cv2.fillConvexPoly(grid, cv2.convexHull(np.argwhere(cells)[:, ::-1].astype(np.int32)), 1)
-    return grid > 0

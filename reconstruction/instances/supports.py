@@ -9,6 +9,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.outlines import filled_hull, filled_polygon
 from reconstruction.surface.levels import horizontal_levels, joined_levels
 from reconstruction.surface.mesh_graph import MeshGraph
 
@@ -35,11 +36,10 @@ class Footprint:
         kernel = np.ones((3, 3), np.uint8)
         occupied = cv2.morphologyEx(occupied, cv2.MORPH_CLOSE, kernel).astype(bool)
         hull = cv2.convexHull(np.ascontiguousarray(cells[:, ::-1]))
-        convex = np.zeros(occupied.shape, np.uint8)
-        cv2.fillConvexPoly(convex, hull, 1)
+        convex = filled_polygon(occupied.shape, hull)
         filled = binary_fill_holes(occupied)
         if filled.sum() >= 0.5 * convex.sum():
-            filled = filled | convex.astype(bool)
+            filled = filled | convex
         else:  # an L-shaped top, or one full of holes: bridge what things standing on it hide
             radius = max(1, round(0.06 / cell_m))
             disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
@@ -297,10 +297,8 @@ def _gap_to_sides(
 
 
 def _convex(footprint: Footprint) -> Footprint:
-    cells = np.argwhere(footprint.occupied).astype(np.int32)
-    grid = np.zeros(footprint.occupied.shape, np.uint8)
-    cv2.fillConvexPoly(grid, cv2.convexHull(np.ascontiguousarray(cells[:, ::-1])), 1)
-    return Footprint(footprint.origin, footprint.cell_m, grid.astype(bool), footprint.occupied)
+    filled = filled_hull(footprint.occupied)
+    return Footprint(footprint.origin, footprint.cell_m, filled, footprint.occupied)
 
 
 def span_ratio(graph: MeshGraph, support: SupportRegion, candidate: np.ndarray) -> float:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from reconstruction.instances.outlines import filled_hull, filled_polygon
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _CELL_M = 0.02
@@ -56,16 +57,12 @@ class _Plan:
         self.away_from_whole: list[np.ndarray] = []  # and from its rectangle: things hide corners of a top
         for top in _tops(self.heights):
             at = np.argwhere(top)[:, ::-1].astype(np.int32)
-            self.outlines.append(self._filled(cv2.convexHull(at)))
+            self.outlines.append(filled_hull(top))
             self.height.append(float(np.median(self.heights[top & (self.heights > 0)])))
-            rectangle = self._filled(cv2.boxPoints(cv2.minAreaRect(at)).round().astype(np.int32))
+            corners = cv2.boxPoints(cv2.minAreaRect(at)).round().astype(np.int32)
+            rectangle = filled_polygon(top.shape, corners)
             self.away.append(ndimage.distance_transform_edt(~self.outlines[-1]) * _CELL_M)
             self.away_from_whole.append(ndimage.distance_transform_edt(~rectangle) * _CELL_M)
-
-    def _filled(self, polygon: np.ndarray) -> np.ndarray:
-        grid = np.zeros(self.heights.shape, np.uint8)
-        cv2.fillConvexPoly(grid, polygon, 1)
-        return grid > 0
 
     def apart(self, i: int, j: int) -> bool:
         """Tell whether there is an open gap between two tops."""
