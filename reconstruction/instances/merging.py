@@ -3,8 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from reconstruction.instances.segmentation import Thing
+from reconstruction.surface.mesh_graph import MeshGraph
 
 
 def merge_pairs(
@@ -38,3 +40,10 @@ def join(things: list[Thing], gone: Thing, kept: Thing) -> list[Thing]:
         if other.rests_on is gone:
             other.rests_on = kept
     return things
+
+
+def nearest_of(graph: MeshGraph, thing: Thing, parts: tuple[Thing, Thing]) -> Thing:
+    """Return the part of what a thing rested on that its foot is nearest to, the first of equals."""
+    points = graph.points[thing.vertices]
+    foot = points[points[:, 2] < points[:, 2].min() + 0.02]
+    return min(parts, key=lambda part: float(np.median(cKDTree(graph.points[part.vertices]).query(foot)[0])))

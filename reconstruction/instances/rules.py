@@ -12,6 +12,8 @@ from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.scraps import without_fragments, without_skirts
 from reconstruction.instances.segmentation import Thing, segment
+from reconstruction.instances.side_by_side import cut_side_by_side
+from reconstruction.instances.smears import without_smears
 from reconstruction.instances.stacks import cut_stacks
 from reconstruction.instances.stands import merge_stands
 from reconstruction.progress import Progress
@@ -46,6 +48,8 @@ def cut_by_rules(
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)
+    things = without_smears(shell, surface, things, owner, posed, depth, config, progress)
+    things = cut_side_by_side(graph, surface, things, config, progress)
     things = cut_stacks(graph, surface, things, posed, depth, config, progress)
     things = without_skirts(graph, things, progress)
     things = without_fragments(graph, things, shell.base[0].observed, config, progress)

@@ -48,16 +48,15 @@ def without_fragments(
 
 def without_skirts(graph: MeshGraph, things: list[Thing], progress: Progress) -> list[Thing]:
     """Leave out what depth smeared behind and beside things: low sheets without a top, close to something larger."""
-    carriers = {id(thing.rests_on) for thing in things}
     kept = [
         thing
         for thing in things
-        if thing.attached
-        or thing.container
-        or thing.rests_on is None
-        or id(thing) in carriers
-        or not _is_skirt(graph, thing, things)
+        if thing.attached or thing.container or thing.rests_on is None or not _is_skirt(graph, thing, things)
     ]
+    left = {id(thing) for thing in kept}
+    for thing in kept:  # what was thought to lie on a skirt rests on what that lies on
+        while thing.rests_on is not None and id(thing.rests_on) not in left:
+            thing.rests_on = thing.rests_on.rests_on
     if len(kept) < len(things):
         progress.note(f"{len(things) - len(kept)} skirts of smeared surface beside things are not kept")
     return kept
@@ -73,7 +72,9 @@ def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
     if areas[top].sum() > _SKIRT_TOP * cv2.contourArea(hull):
         return False
     for other in things:
-        if other is thing or other.attached or graph.areas[other.vertices].sum() < areas.sum():
+        if other is thing or other.rests_on is thing or other.attached:
+            continue  # what lies on a plate hides its top
+        if graph.areas[other.vertices].sum() < areas.sum():
             continue
         reach = quantiles(graph.points[other.vertices, 2], graph.areas[other.vertices], (0.98,))[0]
         if (middle > reach - _TOP_M) if other is thing.rests_on else (high > reach + _TOP_M):

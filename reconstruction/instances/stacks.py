@@ -14,11 +14,11 @@ it, with what is right below:
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.image_colors import SurfaceSamples, surface_samples, with_colors
+from reconstruction.instances.merging import nearest_of
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
@@ -93,7 +93,7 @@ def cut_stacks(
         upper = Thing(seam.upper, lower, lower.depth + 1)
         lower.vertices = np.setdiff1d(lower.vertices, seam.upper, assume_unique=True)
         for other in out:
-            if other.rests_on is lower and _nearer(graph, other, upper, lower):
+            if other.rests_on is lower and nearest_of(graph, other, (lower, upper)) is upper:
                 other.rests_on = upper
         out.append(upper)
         waiting += [lower, upper]
@@ -102,13 +102,6 @@ def cut_stacks(
             f"{len(out) - len(things)} things are cut off what they are stacked on, by outline and color"
         )
     return out
-
-
-def _nearer(graph: MeshGraph, thing: Thing, upper: Thing, lower: Thing) -> bool:
-    points = graph.points[thing.vertices]
-    foot = points[points[:, 2] < points[:, 2].min() + 0.02]
-    gaps = [np.median(cKDTree(graph.points[t.vertices]).query(foot)[0]) for t in (upper, lower)]
-    return bool(gaps[0] < gaps[1])
 
 
 def _best_seam(

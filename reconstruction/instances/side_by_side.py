@@ -1,0 +1,161 @@
+"""Two things that touch side by side, held for one: cut where the outline from above is pinched from both sides.
+
+Depth smears over a gap of a centimetre or two, and a thin wall of that has no crease at which the mesh could be cut.
+Seen from above the two still tell: whatever the height at which one looks, the outline has bays on both sides at one
+place, and what lies on either side of it is about as long as wide. One thing has no such waist: handles and spouts are
+slimmer than things, and notches of L-shaped ones are on one side.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from reconstruction.instances.boxes import quantiles
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.image_colors import SurfaceSamples, surface_samples
+from reconstruction.instances.merging import nearest_of
+from reconstruction.instances.outlines import filled_hull
+from reconstruction.instances.segmentation import Thing
+from reconstruction.progress import Progress
+from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.types import Surface
+
+_LARGEST_M = 0.6
+_CELL_M = 0.005
+_LEVELS = (0.25, 0.45, 0.65, 0.8)  # of the height: skirts are below, and a top of one thing has no waist
+_AXES = np.radians(np.arange(0.0, 180.0, 10.0))
+_PINCH = 0.07  # depth of the shallower bay, as a share of the narrower part's width
+_LONG = 0.75  # each part's length along the axis, as a share of its width
+_MIN_CELLS, _MIN_SHARE = 60, 0.2  # of an outline; of it on either side
+
+
+@dataclass(frozen=True)
+class _Waist:
+    depth: float  # share of the narrower part's width
+    axis: np.ndarray  # float64 (2,) unit, across the waist
+    at_m: float  # along the axis
+
+
+def cut_side_by_side(
+    graph: MeshGraph, surface: Surface, things: list[Thing], config: InstancesConfig, progress: Progress
+) -> list[Thing]:
+    """Cut small things with a waist in two.
+
+    Args:
+        graph: the surface as a graph.
+        surface: the surface in world space.
+        things: what was found; theirs are the vertices.
+        config: how large a thing is at least.
+        progress: told of how many were cut.
+
+    Returns:
+        The things, the smaller parts at the end; what rested on a cut one rests on the part that is nearest.
+    """
+    out = list(things)
+    for thing in things:
+        extents = np.ptp(graph.points[thing.vertices], axis=0)
+        if thing.attached or thing.container or extents.max() > _LARGEST_M:
+            continue
+        parts = _parts(graph, thing.vertices, surface_samples(graph, surface, thing.vertices), config)
+        if parts is None:
+            continue
+        thing.vertices = parts[0]
+        beside = Thing(parts[1], thing.rests_on, thing.depth)
+        for other in out:
+            if other.rests_on is thing and nearest_of(graph, other, (thing, beside)) is beside:
+                other.rests_on = beside
+        out.append(beside)
+    if len(out) > len(things):
+        progress.note(
+            f"{len(out) - len(things)} things are cut off what they touch from the side, by their outline"
+        )
+    return out
+
+
+def _parts(
+    graph: MeshGraph, body: np.ndarray, samples: SurfaceSamples, config: InstancesConfig
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the vertices of two things that touch, the larger first; None if there is but one."""
+    if not len(samples.points):
+        return None
+    waist = _waist(samples.points, samples.areas, config.min_object_m)
+    if waist is None or waist.depth < _PINCH:
+        return None
+    along = graph.points[body, :2] @ waist.axis - waist.at_m
+    across = graph.points[body, :2] @ np.array([-waist.axis[1], waist.axis[0]])
+    bottom, top = quantiles(graph.points[body, 2], graph.areas[body], (0.01, 0.99))
+    high = graph.points[body, 2] > bottom + _LEVELS[0] * (top - bottom)
+    parts = []
+    for side in (along < 0, along >= 0):
+        if graph.areas[body[side]].sum() < config.min_object_area_m2 or not (side & high).any():
+            return None
+        width = np.ptp(np.percentile(across[side & high], [3, 97]))
+        if np.percentile(np.abs(along[side & high]), 95) < _LONG * width:
+            return None
+        if np.ptp(graph.points[body[side], 2]) < config.min_object_m:
+            return None
+        parts.append(body[side])
+    first, second = sorted(parts, key=lambda part: -graph.areas[part].sum())
+    return first, second
+
+
+def _waist(points: np.ndarray, areas: np.ndarray, slim_m: float) -> _Waist | None:
+    """Return the deepest waist that the outlines of points (n, 3) above several heights share."""
+    low = points[:, :2].min(axis=0) - 4 * _CELL_M
+    bottom, top = quantiles(points[:, 2], areas, (0.01, 0.99))
+    cells = np.floor((points[:, :2] - low) / _CELL_M).astype(int)
+    outlines = []
+    for level in _LEVELS:
+        mask = np.zeros(cells.max(axis=0) + 5, bool)
+        mask[tuple(cells[points[:, 2] > bottom + level * (top - bottom)].T)] = True
+        mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, np.ones((3, 3))))
+        mask = ndimage.binary_opening(mask, _disc(slim_m))
+        if mask.sum() < _MIN_CELLS:
+            return None
+        outlines.append((mask, filled_hull(mask)))
+    best: _Waist | None = None
+    for angle in _AXES:
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        depth = np.min([_bays(mask, hull, axis, slim_m) for mask, hull in outlines], axis=0)
+        strip = int(np.argmax(depth))
+        if depth[strip] > (0.0 if best is None else best.depth):
+            reach = len(depth) // 2
+            best = _Waist(float(depth[strip]), axis, float(low @ axis) + (strip - reach + 0.5) * _CELL_M)
+    return best
+
+
+def _bays(mask: np.ndarray, hull: np.ndarray, axis: np.ndarray, slim_m: float) -> np.ndarray:
+    """Return for each strip across an axis how deep the shallower of the bays at its ends is, 0 where it is no waist.
+
+    Strips are as wide as a cell, the middle one begins at the first cell of the grid.
+    """
+    reach = int(np.ceil(np.hypot(*mask.shape))) + 1
+    ends = [_ends(cells, axis, reach) for cells in (mask, hull)]
+    (low, high), (outer_low, outer_high) = ends
+    there = high >= low
+    width = np.subtract(high, low, out=np.full(2 * reach, -1.0), where=there) + 1.0
+    bay = np.zeros(2 * reach)
+    bay[there] = np.minimum(outer_high[there] - high[there], low[there] - outer_low[there])
+    lobe = np.minimum(np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1])
+    share = np.cumsum(width) / width.sum()
+    fits = there & (lobe * _CELL_M > slim_m) & (np.minimum(share, 1.0 - share) > _MIN_SHARE)
+    depth = np.where(fits, bay / np.maximum(lobe, 1.0), 0.0)
+    return ndimage.maximum_filter1d(depth, 3)
+
+
+def _ends(cells: np.ndarray, axis: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest place across an axis of the cells in each strip, in cells."""
+    at = np.argwhere(cells) + 0.5
+    strip = np.floor(at @ axis).astype(int) + reach
+    across = at @ np.array([-axis[1], axis[0]])
+    low, high = np.full(2 * reach, np.inf), np.full(2 * reach, -np.inf)
+    np.minimum.at(low, strip, across)
+    np.maximum.at(high, strip, across)
+    return low, high
+
+
+def _disc(diameter_m: float) -> np.ndarray:
+    size = 2 * round(0.5 * diameter_m / _CELL_M) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)) > 0

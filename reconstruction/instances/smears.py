@@ -1,0 +1,194 @@
+"""What shows the wall is the wall, however far in front of it depth put it.
+
+Behind the outline of a thing that stands before a wall, depth fills in what lies between the two: sheets that go
+from the thing to the wall, with the wall's picture on them. They hide the thing's shape and make it twice as large. In
+the frames they give themselves away: along the line of sight, what they show is the color that the wall has there,
+from wherever one looks, while a thing has a color of its own before a changing background.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from reconstruction.instances.boxes import quantiles
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.cut import Shell
+from reconstruction.instances.segmentation import Thing
+from reconstruction.progress import Progress
+from reconstruction.rasterize import rasterize_mesh
+from reconstruction.surface.base_planes import FittedPlane, plane_axes
+from reconstruction.surface.mesh_graph import MeshGraph, lab_from_rgb, pieces
+from reconstruction.types import DepthMaps, PosedFrames, Surface
+from registry.geometry import invert_rigid
+
+_LARGEST_M = 0.6  # furniture stands along walls and may have their color
+_REACHES_M = 0.06  # a smear goes on to the wall
+_MAX_FRAMES, _MIN_SEEN, _SURE_SHARE = 36, 2, 0.6
+_ALIKE = 6.0
+_CELL_M, _NEAR_M = 0.015, 0.25  # of the wall's picture; beyond what is known of it
+_ON_WALL_M, _ON_WALL = 0.015, 0.01  # depth this near shows the wall: metres, share of depth
+_SLACK = 0.012  # of depth: surface this far behind what is drawn is seen all the same
+_LEAST_M2 = 5e-4  # of a smear
+_SCRAP_SHARE = 0.1  # of the largest piece that is left
+_MOST_SHARE = 0.6  # of a thing's area: one of the wall's color cannot be told from the wall
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A keyframe at depth resolution."""
+
+    camera_from_world: np.ndarray  # float64 (4, 4)
+    eye: np.ndarray  # float64 (3,)
+    lab: np.ndarray  # float32 (h, w, 3) weighted CIELAB
+    measured: np.ndarray  # float32 (h, w) depth
+    drawn: np.ndarray  # float32 (h, w) depth of the fused surface
+
+
+def without_smears(
+    shell: Shell,
+    surface: Surface,
+    things: list[Thing],
+    owner: np.ndarray,
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: InstancesConfig,
+    progress: Progress,
+) -> list[Thing]:
+    """Give the smears between small things and the walls behind them to the walls.
+
+    Args:
+        shell: the surface and its base.
+        surface: the surface in world space.
+        things: what was found; theirs are the vertices.
+        owner: int32 (v,) base entity of each vertex; smears are written into it.
+        posed: keyframes with cameras in world space.
+        depth: their depth in metres.
+        config: how large a thing is at least.
+        progress: told of how many things had smears.
+
+    Returns:
+        The same things.
+    """
+    graph, cleaned = shell.graph, 0
+    frames: list[_Frame] = []
+    for row, wall in enumerate(shell.planes):
+        near = [thing for thing in things if wall.label == "wall" and _reaches(graph, thing, wall)]
+        if not near:
+            continue
+        frames = frames or _frames(surface, posed, depth)
+        picture = _WallPicture(graph, wall, frames, depth)
+        for thing in near:
+            smear = _smear(graph, thing.vertices, wall, picture, frames, depth)
+            smear = _with_scraps(graph, thing.vertices, smear)
+            left = graph.areas[thing.vertices].sum() - graph.areas[smear].sum()
+            enough = left > (1.0 - _MOST_SHARE) * graph.areas[thing.vertices].sum()
+            if len(smear) and enough and left > config.min_object_area_m2:
+                thing.vertices = np.setdiff1d(thing.vertices, smear, assume_unique=True)
+                owner[smear] = shell.entity_id(row)
+                cleaned += 1
+    if cleaned:
+        progress.note(f"{cleaned} things are freed of surface that is smeared to the wall behind them")
+    return things
+
+
+def _reaches(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
+    points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
+    if thing.attached or np.ptp(points, axis=0).max() > _LARGEST_M:
+        return False
+    return bool(quantiles(wall.distance(points), areas, (0.02,))[0] < _REACHES_M)
+
+
+def _frames(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[_Frame]:
+    count, camera = len(posed.images), depth.camera
+    out = []
+    for row in np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int)):
+        pose = np.asarray(posed.world_from_camera[row], np.float64)
+        image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        drawn = rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth
+        lab = lab_from_rgb(image) * LIGHTNESS_WEIGHT
+        out.append(_Frame(invert_rigid(pose), pose[:3, 3], lab, np.asarray(depth.depth[row]), drawn))
+    return out
+
+
+def _seen_at(
+    points: np.ndarray, frame: _Frame, depth: DepthMaps
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pixel row and column of points (n, 3), clipped, and their z-depth, 0 where they are outside."""
+    camera, pose = depth.camera, frame.camera_from_world
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    z = np.maximum(local[:, 2], 1e-6)
+    u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
+    inside = (local[:, 2] > 0.1) & (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
+    row = np.clip(v, 0, camera.height - 1).astype(int)
+    column = np.clip(u, 0, camera.width - 1).astype(int)
+    return row, column, np.where(inside, local[:, 2], 0.0)
+
+
+class _WallPicture:
+    """The colors of a wall where frames see it."""
+
+    def __init__(self, graph: MeshGraph, wall: FittedPlane, frames: list[_Frame], depth: DepthMaps) -> None:
+        self.axes = np.stack(plane_axes(wall.plane), axis=1)
+        flat = graph.points[wall.members] @ self.axes
+        low, high = np.percentile(flat, 0.2, axis=0), np.percentile(flat, 99.8, axis=0)
+        i, j = np.meshgrid(*(np.arange(a, b, _CELL_M) for a, b in zip(low, high)), indexing="ij")
+        cells = np.stack([i.ravel(), j.ravel()], axis=1)
+        points = cells @ self.axes.T - wall.plane[3] * wall.plane[:3]
+        total, count = np.zeros((len(points), 3)), np.zeros(len(points))
+        for frame in frames:
+            row, column, z = _seen_at(points, frame, depth)
+            off = np.abs(frame.measured[row, column] - z)
+            seen = (z > 0) & (frame.measured[row, column] > 0) & (off < np.maximum(_ON_WALL * z, _ON_WALL_M))
+            total[seen] += frame.lab[row[seen], column[seen]]
+            count[seen] += 1
+        known = count > 0
+        self.lab = total[known] / count[known, None]
+        self.tree = cKDTree(cells[known]) if known.any() else None
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Return the color (n, 3) at points on the wall, nan where nothing is known near."""
+        out = np.full((len(points), 3), np.nan)
+        if self.tree is not None:
+            gap, nearest = self.tree.query(points @ self.axes, distance_upper_bound=_NEAR_M)
+            out[np.isfinite(gap)] = self.lab[nearest[np.isfinite(gap)]]
+        return out
+
+
+def _smear(
+    graph: MeshGraph, body: np.ndarray, wall: FittedPlane, picture: _WallPicture, frames: list[_Frame], depth: DepthMaps
+) -> np.ndarray:  # fmt: skip
+    """Return the vertices of a body that show the wall and go on to it."""
+    points = graph.points[body]
+    like, seen = np.zeros(len(body)), np.zeros(len(body))
+    for frame in frames:
+        row, column, z = _seen_at(points, frame, depth)
+        shown = (z > 0) & (z < frame.drawn[row, column] * (1.0 + _SLACK))
+        rays = points - frame.eye
+        toward = rays @ wall.plane[:3]
+        behind = shown & (toward < 0) & (wall.distance(points) > 0)
+        hit = frame.eye + (-wall.distance(frame.eye[None]) / np.where(behind, toward, -1.0))[:, None] * rays
+        gap = np.linalg.norm(frame.lab[row, column] - picture.at(hit), axis=1)
+        like += behind & (gap < _ALIKE)
+        seen += shown
+    shows = body[(seen >= _MIN_SEEN) & (like >= _SURE_SHARE * seen)]
+    reaching = [
+        piece
+        for piece in pieces(graph, shows)
+        if graph.areas[piece].sum() > _LEAST_M2 and wall.distance(graph.points[piece]).min() < _REACHES_M
+    ]
+    return np.sort(np.concatenate(reaching)) if reaching else body[:0]
+
+
+def _with_scraps(graph: MeshGraph, body: np.ndarray, smear: np.ndarray) -> np.ndarray:
+    """Add what hangs on a body by its smear alone."""
+    left = pieces(graph, np.setdiff1d(body, smear, assume_unique=True))
+    if not len(smear) or len(left) < 2:
+        return smear
+    near = cKDTree(graph.points[smear])
+    least = _SCRAP_SHARE * graph.areas[left[0]].sum()
+    small = [piece for piece in left if graph.areas[piece].sum() < least]
+    hanging = [piece for piece in small if near.query(graph.points[piece])[0].min() < 2.0 * graph.spacing_m]
+    return np.sort(np.concatenate([smear, *hanging]))

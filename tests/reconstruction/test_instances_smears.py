@@ -1,0 +1,82 @@
+"""Surface that is smeared from a thing to the wall behind it goes to the wall; a thing of the wall's color stays."""
+
+from dataclasses import replace
+
+import numpy as np
+from surfaces import frames_of, looking_at, merged, sheet, solid_box, surface_from
+
+from reconstruction.instances import InstancesConfig
+from reconstruction.instances.cut import Shell
+from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.smears import without_smears
+from reconstruction.progress import NO_PROGRESS
+from reconstruction.rasterize import rasterize_mesh
+from reconstruction.types import Camera, DepthMaps
+
+LOW, HIGH = (-0.08, 0.3, 0.0), (0.08, 0.42, 0.25)
+WALL_Y = 0.6
+
+
+def filmed(color, striped):
+    """A carton before a wall, as fused with smears from its sides to the wall, and films of the truth."""
+    room = (
+        sheet((-1.0, -1.0, 0.0), (2.0, 0, 0), (0, 1.0 + WALL_Y, 0), (120, 100, 80), 0.025),
+        sheet((-1.0, WALL_Y, 0.0), (2.0, 0, 0), (0, 0, 1.8), (200, 200, 190), 0.02),
+    )
+    carton = solid_box(LOW, HIGH, color)
+    away = WALL_Y - 0.02 - HIGH[1]
+    smears = (
+        sheet((LOW[0] - 0.1, HIGH[1] + away, 0.0), (0.1, -away, 0), (0, 0, 0.25), (170, 170, 165)),
+        sheet((HIGH[0], HIGH[1], 0.0), (0.1, away, 0), (0, 0, 0.25), (170, 170, 165)),
+    )
+    surface = surface_from(merged(*room, carton, *smears))
+    truth = merged(*room, carton)
+    paint = truth.colors.copy()
+    stripes = (
+        striped & (truth.vertices[:, 1] > WALL_Y - 1e-3) & (np.floor(truth.vertices[:, 0] / 0.2) % 2 == 0)
+    )
+    paint[stripes] = (90, 150, 120)
+    middle = np.array([0.0, 0.36, 0.15])
+    places = [(x, -1.0, z) for z in (0.5, 0.8) for x in (-0.6, -0.3, 0.0, 0.3, 0.6)]
+    poses = np.stack([looking_at(middle + place, middle) for place in places])
+    camera = Camera(240, 180, 220.0, 220.0, 120.0, 90.0)
+    images = []
+    for pose in poses:
+        raster = rasterize_mesh(truth.vertices.astype(np.float32), truth.faces.astype(np.int32), camera, pose)
+        images.append(raster.interpolate(truth.faces, paint).round().astype(np.uint8))
+    drawn = [rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth for pose in poses]
+    posed = replace(
+        frames_of(surface)[0], camera=camera, images=np.stack(images), indices=np.arange(len(poses), dtype=np.int32),
+        times_s=np.arange(len(poses)) / 10, world_from_camera=poses, sharpness=np.ones(len(poses), np.float32),
+    )  # fmt: skip
+    depth = np.stack(drawn)
+    return surface, posed, DepthMaps(camera, depth, np.where(depth > 0, 2, 0).astype(np.uint8))
+
+
+def cleaned(color, striped=True):
+    """Return the shell, the thing's vertices before and after, who owns what, and what of it is smear."""
+    surface, posed, depth = filmed(color, striped)
+    shell = Shell.of(surface, NO_PROGRESS)
+    points = shell.graph.points
+    thing = Thing(np.flatnonzero((shell.owner == 0) & (points[:, 2] > 0.02)))
+    before, owner = thing.vertices, shell.owner.copy()
+    without_smears(shell, surface, [thing], owner, posed, depth, InstancesConfig(), NO_PROGRESS)
+    smear = before[points[before, 1] > HIGH[1] + 0.02]
+    return shell, before, thing.vertices, owner, smear
+
+
+def test_smears_go_to_the_wall():
+    shell, before, after, owner, smear = cleaned((180, 40, 40))
+    assert len(smear) > 200
+    assert np.isin(smear, after).mean() < 0.25
+    front = np.setdiff1d(before, before[shell.graph.points[before, 1] > HIGH[1] - 0.01])
+    assert np.isin(front, after).mean() > 0.98
+    wall = next(base.id for base in shell.base if base.label == "wall")
+    assert (owner[np.setdiff1d(before, after)] == wall).all()
+
+
+def test_what_has_the_color_of_the_wall_is_not_taken_apart():
+    shell, before, after, _, smear = cleaned((200, 200, 190), striped=False)
+    assert any(base.label == "wall" for base in shell.base)
+    assert len(smear) > 200
+    np.testing.assert_array_equal(before, after)
