@@ -260,7 +260,7 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     body, how = embedded_solid(volume, frame, config, furniture=furniture)
     if frame.wall_y is not None:
         fused = fused_points(item.id, frame, scene.surface, scene.found)
-        if len(fused) and not _covers(body, fused, _HUNG_SHARE):
+        if len(fused) and not _covers(body, fused, _HUNG_SHARE, outer=1.0):
             body, how = relief(fused, frame.wall_y, config), "observed+relief"
     elif not furniture and not _covers(body, frame.points):
         body, how = mound(frame.points, config), "observed+relief"
@@ -292,11 +292,13 @@ def embedded_solid(
     return body, "observed+" + ("+".join(field.symmetries) or "carved")
 
 
-def _covers(body: Solid | None, points: np.ndarray, share: float = _COVERED_SHARE) -> bool:
+def _covers(
+    body: Solid | None, points: np.ndarray, share: float = _COVERED_SHARE, outer: float = 3.0
+) -> bool:
     """Tell whether a body is as large as what was seen: a wrong symmetry frees what was there, as do few pixels."""
     if body is None:
         return False
-    seen = np.ptp(np.percentile(points, [3, 97], axis=0), axis=0)
+    seen = np.ptp(np.percentile(points, [outer, 100 - outer], axis=0), axis=0)
     return bool((body.extents > share * seen).all())
 
 
