@@ -103,16 +103,14 @@ class SceneEnv(BaseEnv):
         Args:
             scene_id: Scene of the registry.
             revision: Which revision of it was registered. Where the scene has a newer one by now, the newer
-                one is
-                used, with a warning and a text in `revision_note`: the old files are gone with it.
+                one is used, with a warning and a text in `revision_note`: the old files are gone with it.
             registry: The registry's folder; the default registry where None.
             strict_revision: Raise instead of using another revision.
             task: A task's name (`list_tasks`), a kind of task ("pick", "stack" ...; the easiest of it that the
                 robot reaches), or "none" (no success, reward 0).
             target: What a kind of task is about: "auto" (the easiest), an object's id, or a label.
             pose_noise: Standard deviation of a random shift of each movable object at reset (m), or of shift
-                and
-                turn (m, rad). A little noise can make objects overlap where they stand close together.
+                and turn (m, rad). A little noise can make objects overlap where they stand close together.
             randomize: What differs from reset to reset: None, "all", or a dict of `Randomization`'s fields.
             robot_uids: A robot of ManiSkill, or "none".
             cameras: Which cameras observe, by name or names with commas: "workspace" (`base_camera`), "overview",
@@ -122,8 +120,9 @@ class SceneEnv(BaseEnv):
             obs_mode: As in ManiSkill; "state" where None.
             render_mode: None, "rgb_array", "sensors", "all" or "human".
             render_backend: "auto" renders only if a mode asks for pictures; "gpu", "cpu" and "none" as in
-            ManiSkill. **kwargs: As for ManiSkill's `BaseEnv` (num_envs, control_mode, reward_mode,
-            sim_backend, sensor_configs …).
+                ManiSkill.
+            **kwargs: As for ManiSkill's `BaseEnv` (num_envs, control_mode, reward_mode, sim_backend,
+                sensor_configs …).
 
         Raises:
             SceneNotFound: the registry has no such scene; the message lists what there is.
