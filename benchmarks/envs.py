@@ -1,10 +1,10 @@
 """Measure environments: import, make, reset, step rate, memory, and which tasks the scripts do.
 
 Usage:
-    python -m benchmarks.envs SCENE... [--registry DIR] [--robot panda] [--tasks] [--seeds 2] [--json FILE]
+    python -m benchmarks.envs SCENE... [--registry DIR] [--robot panda] [--task pick] [--tasks] [--seeds 2]
 
 CPU time stands beside wall time, because a shared machine stretches only the latter. "Bare" is SAPIEN alone with the
-same scene, robot and drive targets: 12 time steps and reading the joints.
+same scene, robot and drive targets, so that the same happens: setting the targets, 12 time steps, reading the joints.
 """
 
 import argparse
@@ -40,6 +40,7 @@ def main() -> int:
     parser.add_argument("scenes", nargs="+", help="ids of scenes")
     parser.add_argument("--registry", type=Path, default=None, help="the registry's folder")
     parser.add_argument("--robot", default="panda")
+    parser.add_argument("--task", default="pick", help="what is stepped")
     parser.add_argument(
         "--tasks", action="store_true", help="let the script do every task that is listed, too"
     )
@@ -54,7 +55,7 @@ def main() -> int:
     print(f"import with 10,000 scenes: {_both(out['import_10000'])}")
     try:
         for scene in arguments.scenes:
-            out[scene] = measure(scene, arguments.registry, arguments.robot)
+            out[scene] = measure(scene, arguments.registry, arguments.robot, arguments.task)
             print(f"{scene}: " + ", ".join(f"{key} {value}" for key, value in out[scene].items()))
             if arguments.tasks:
                 out[scene]["tasks"] = tasks(scene, arguments.registry, arguments.robot, arguments.seeds)
@@ -86,12 +87,17 @@ def import_time(count: int) -> tuple[float, float]:
     return wall, cpu
 
 
-def measure(scene: str, registry: Path | None, robot: str) -> dict:
+def measure(scene: str, registry: Path | None, robot: str, task: str = "pick") -> dict:
     """Return the figures of one scene; times are (wall, CPU) seconds."""
     import simrecon_envs
 
     simrecon_envs.make(scene, registry=registry, robot_uids=robot).close()  # imports, and the robot's shape
-    kwargs = {"robot_uids": robot, "control_mode": "pd_joint_delta_pos", "max_episode_steps": 10**9}
+    kwargs = {
+        "robot_uids": robot,
+        "control_mode": "pd_joint_delta_pos",
+        "max_episode_steps": 10**9,
+        "task": task,
+    }
     made: list = []
     out = {"objects": SceneRegistry(registry).get(scene).n_objects}
     out["make"] = _timed(lambda: made.append(simrecon_envs.make(scene, registry=registry, **kwargs)))
@@ -100,7 +106,8 @@ def measure(scene: str, registry: Path | None, robot: str) -> dict:
     out["reset"] = _timed(lambda: env.reset(seed=1), 20)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(_STEPS)]
-    rounds = [(_steps(env, actions), _bare_steps(env, actions)) for _ in range(_ROUNDS)]
+    targets = _targets(env, actions)
+    rounds = [(_steps(env, actions), _bare_steps(env, targets)) for _ in range(_ROUNDS)]
     ours, bare = (min(pair[k] for pair in rounds) for k in range(2))
     out |= {"steps_per_cpu_s": round(_STEPS / ours), "share_of_bare": round(bare / ours, 3)}
     process = psutil.Process()
@@ -148,18 +155,26 @@ def _steps(env: object, actions: list) -> float:
     return time.process_time() - start
 
 
-def _bare_steps(env: object, actions: list) -> float:
-    """Step SAPIEN alone; joint deltas of 0.1 rad, the gripper left as it is."""
+def _targets(env: object, actions: list) -> list[list[float]]:
+    """Return which drive targets the actions give to the joints."""
+    env.reset(seed=0)
+    joints, targets = env.unwrapped.agent.robot._objs[0].get_active_joints(), []
+    for action in actions:
+        env.step(action)
+        targets.append([float(joint.drive_target[0]) for joint in joints])
+    return targets
+
+
+def _bare_steps(env: object, targets: list[list[float]]) -> float:
+    """Step SAPIEN alone; the robot does what the actions made it do."""
     env.reset(seed=0)
     scene = env.unwrapped.scene.sub_scenes[0]
     robot = env.unwrapped.agent.robot._objs[0]
-    joints, target = robot.get_active_joints(), robot.get_qpos()
-    count = min(7, len(joints))
+    joints = robot.get_active_joints()
     start = time.process_time()
-    for action in actions:
-        target[:count] = robot.get_qpos()[:count] + 0.1 * action[:count]
+    for target in targets:
         for joint, value in zip(joints, target, strict=True):
-            joint.set_drive_target(float(value))
+            joint.set_drive_target(value)
         for _ in range(env.unwrapped._sim_steps_per_control):
             scene.step()
         np.concatenate([robot.get_qpos(), robot.get_qvel()])

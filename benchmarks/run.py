@@ -265,12 +265,8 @@ def _stopped_on_error(process: subprocess.Popen) -> Iterator[None]:
 
 
 def _stop(process: subprocess.Popen) -> None:
-    """Ask a command and its children to stop as Ctrl-C does, then make them.
-
-    What a shell started in the background has Ctrl-C ignored, and so have its children: they are not asked.
-    """
-    asked = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
-    for number, patience_s in ((signal.SIGINT, _GRACE_S), (signal.SIGKILL, _GRACE_S))[not asked :]:
+    """Ask a command and its children to stop as Ctrl-C does, then make them."""
+    for number, patience_s in ((signal.SIGINT, _GRACE_S), (signal.SIGKILL, _GRACE_S)):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
         try:

@@ -1,6 +1,7 @@
-"""What tasks read of the simulator, each quantity once a control step. Batched torch; b environments, n movable things.
+"""What tasks read of the simulator, each quantity once a control step; b environments, n movable things.
 
-On the CPU one read a body goes straight to SAPIEN: ManiSkill's structs cost more than the physics does.
+With many environments on a GPU these are tensors of ManiSkill's structs. On the CPU, where there is one, they are
+NumPy's and come straight from SAPIEN (`direct`): the structs and tensors cost more than the physics does.
 """
 
 from typing import Any
@@ -9,6 +10,8 @@ import numpy as np
 import torch
 
 from registry.geometry import invert_rigid, transform_points
+from simrecon_envs.arrays import Array, atan2, largest, norm, rotate
+from simrecon_envs.direct import DirectReads
 
 _GRASP_REACH_M = 0.12  # nothing farther from the hand than this and its own half diagonal is held
 _GRAVITY_M_S2 = 9.81
@@ -17,15 +20,21 @@ _GRAVITY_M_S2 = 9.81
 class Measures:
     """Poses, velocities and contacts of the movable things and of the robot."""
 
-    def __init__(self, env: Any) -> None:
-        """Find the bodies; `env` is a `SceneEnv` that is built."""
+    def __init__(self, env: Any, direct: bool | None = None) -> None:
+        """Find the bodies.
+
+        Args:
+            env: A `SceneEnv` that is built.
+            direct: Read straight from SAPIEN, in NumPy; where None, if the simulation runs on the CPU.
+        """
         self._env = env
+        direct = not env.gpu_sim_enabled if direct is None else direct
         self._actors = [placed.actor for placed in env.builder.movable_actors]
         self._row: dict[int, int] = {}
         centers = np.zeros((len(self._actors), 3))
         self._half_diagonal: dict[int, float] = {}
         self._nominal_n: dict[int, float] = {}
-        self._weight_n: dict[int, torch.Tensor] = {}
+        self._weight_n: dict[int, Array] = {}
         for number, placed in enumerate(env.builder.movable_actors):
             self._row[placed.id] = number
             target = env.facts.targets[placed.id]
@@ -35,20 +44,25 @@ class Measures:
             cloud = np.concatenate([s.vertices for s in env.facts.solids if s.owner == placed.id])
             self._half_diagonal[placed.id] = float(np.linalg.norm(cloud - target.center, axis=1).max())
             self._nominal_n[placed.id] = item.mass_kg * _GRAVITY_M_S2
-            self._weight_n[placed.id] = torch.full(
-                (env.num_envs,), self._nominal_n[placed.id], device=env.device
-            )
-        self._centers = torch.as_tensor(centers, dtype=torch.float32, device=env.device)[None]
-        self._cpu = not env.gpu_sim_enabled
-        self._supported: dict[tuple[int, int], torch.Tensor] = {}
-        self._cache: dict[Any, torch.Tensor] = {}
-        if self._cpu:
-            self._entities = [actor._objs[0] for actor in self._actors]
-            self._bodies = [actor._bodies[0] for actor in self._actors]
+        self._direct = DirectReads(env, self._actors, centers) if direct else None
+        for key, weight in self._nominal_n.items():
+            self._weight_n[key] = self.array(np.full(env.num_envs, weight))
+        self._centers = self.array(centers)[None]
+        self._supported: dict[tuple[int, int], Array] = {}
+        self._cache: dict[Any, Array] = {}
+        self._axes: dict[tuple[int, int], np.ndarray] = {}
+
+    def array(self, numbers: np.ndarray) -> Array:
+        """Return numbers as an array of the kind that is computed with here, float32."""
+        if self._direct is not None:
+            return np.array(numbers, np.float32)
+        return torch.as_tensor(numbers, dtype=torch.float32, device=self._env.device)
 
     def refresh(self) -> None:
         """Forget what was read: the simulator has moved on."""
         self._cache = {}
+        if self._direct is not None:
+            self._direct.refresh()
 
     def forget(self, env_idx: torch.Tensor) -> None:
         """Forget what carried what in the environments that start anew."""
@@ -63,60 +77,47 @@ class Measures:
     # ---- Things.
 
     @property
-    def poses(self) -> torch.Tensor:
+    def poses(self) -> Array:
         """Return the actors' poses (b, n, 7): position, quaternion wxyz; world."""
         if "poses" not in self._cache:
-            if self._cpu:
-                rows = np.empty((1, len(self._entities), 7), np.float32)
-                for row, entity in zip(rows[0], self._entities):
-                    pose = entity.pose
-                    row[:3], row[3:] = pose.p, pose.q
-                self._cache["poses"] = torch.from_numpy(rows)
+            if self._direct is not None:
+                self._cache["poses"] = self._direct.poses()
             else:
                 self._cache["poses"] = torch.stack([a.pose.raw_pose for a in self._actors], dim=1)
         return self._cache["poses"]
 
-    @property
-    def positions(self) -> torch.Tensor:
-        """Return where the things' box centres are (b, n, 3)."""
-        if "positions" not in self._cache:
-            poses = self.poses
-            self._cache["positions"] = poses[..., :3] + rotate(poses[..., 3:], self._centers)
-        return self._cache["positions"]
-
-    def position(self, key: int) -> torch.Tensor:
+    def position(self, key: int) -> Array:
         """Return where a thing's box centre is (b, 3)."""
-        if ("position", key) not in self._cache:
-            pose, row = self.poses[:, self._row[key]], self._row[key]
-            self._cache["position", key] = pose[:, :3] + rotate(pose[:, 3:], self._centers[:, row])
-        return self._cache["position", key]
+        return self.pose(key)[:, :3]
 
-    def pose(self, key: int) -> torch.Tensor:
+    def pose(self, key: int) -> Array:
         """Return the pose (b, 7) of a thing's box centre, with the orientation of its actor."""
-        return torch.cat([self.position(key), self.poses[:, self._row[key], 3:]], dim=1)
+        name = ("pose", key)
+        if name not in self._cache:
+            row = self._row[key]
+            if self._direct is not None:
+                self._cache[name] = self._direct.pose(row)
+            else:
+                pose = self.poses[:, row]
+                center = pose[:, :3] + rotate(pose[:, 3:], self._centers[:, row])
+                self._cache[name] = torch.cat([center, pose[:, 3:]], dim=1)
+        return self._cache[name]
 
-    def up(self, key: int) -> torch.Tensor:
+    def up(self, key: int) -> Array:
         """Return by which cosine (b,) a thing's upright axis still points up, as in the bundle."""
-        quat = self.poses[:, self._row[key], 3:]
-        return rotate(quat, self._start_axis(key, 2))[:, 2]
+        return self._turned(key, 2)[:, 2]
 
-    def yaw(self, key: int) -> torch.Tensor:
+    def yaw(self, key: int) -> Array:
         """Return by which angle (b,) a thing is turned about +z from how it was captured."""
-        quat = self.poses[:, self._row[key], 3:]
-        side = rotate(quat, self._start_axis(key, 0))
-        return torch.atan2(side[:, 1], side[:, 0])
+        side = self._turned(key, 0)
+        return atan2(side[:, 1], side[:, 0])
 
-    def speeds(self, key: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def speeds(self, key: int) -> tuple[Array, Array]:
         """Return the linear (m/s) and angular (rad/s) speed (b,) of a thing."""
         name = ("speed", key)
         if name not in self._cache:
-            if self._cpu:
-                body = self._bodies[self._row[key]]
-                pair = [
-                    float(np.linalg.norm(body.linear_velocity)),
-                    float(np.linalg.norm(body.angular_velocity)),
-                ]
-                self._cache[name] = torch.tensor([pair])
+            if self._direct is not None:
+                self._cache[name] = self._direct.speeds(self._row[key])
             else:
                 actor = self._actors[self._row[key]]
                 pair = [torch.linalg.norm(v, dim=1) for v in (actor.linear_velocity, actor.angular_velocity)]
@@ -124,7 +125,7 @@ class Measures:
         both = self._cache[name]
         return both[:, 0], both[:, 1]
 
-    def at_rest(self, key: int, linear_m_s: float = 0.05, angular_rad_s: float = 0.6) -> torch.Tensor:
+    def at_rest(self, key: int, linear_m_s: float = 0.05, angular_rad_s: float = 0.6) -> Array:
         """Return whether a thing hardly moves (b,)."""
         linear, angular = self.speeds(key)
         return (linear <= linear_m_s) & (angular <= angular_rad_s)
@@ -132,44 +133,54 @@ class Measures:
     # ---- The robot.
 
     @property
-    def tcp(self) -> torch.Tensor:
+    def tcp(self) -> Array:
         """Return the pose (b, 7) of the point between the fingers."""
         if "tcp" not in self._cache:
-            link = self._env.agent.tcp
-            if self._cpu:
-                pose = link._objs[0].entity_pose
-                self._cache["tcp"] = torch.from_numpy(
-                    np.concatenate([pose.p, pose.q])[None].astype(np.float32)
-                )
-            else:
-                self._cache["tcp"] = link.pose.raw_pose
+            self._cache["tcp"] = self.link_pose(self._env.agent.tcp)
         return self._cache["tcp"]
 
+    def tcp_distance(self, key: int) -> Array:
+        """Return how far (b,) the point between the fingers is from a thing's box centre."""
+        name = ("tcp_distance", key)
+        if name not in self._cache:
+            self._cache[name] = norm(self.position(key) - self.tcp[:, :3])
+        return self._cache[name]
+
     @property
-    def joint_speed(self) -> torch.Tensor:
+    def joint_speed(self) -> Array:
         """Return the speed (b,) of the robot's fastest joint, fingers left out."""
         if "joint_speed" not in self._cache:
-            qvel = self._env.agent.robot.get_qvel()
+            qvel = self.qvel
             keep = qvel.shape[1] - 2 if qvel.shape[1] > 2 else qvel.shape[1]
-            self._cache["joint_speed"] = torch.abs(qvel[:, :keep]).amax(dim=1)
+            self._cache["joint_speed"] = largest(abs(qvel[:, :keep]))
         return self._cache["joint_speed"]
 
-    def held(self, key: int) -> torch.Tensor:
+    @property
+    def qvel(self) -> Array:
+        """Return the speeds (b, d) of the robot's joints (rad/s, m/s)."""
+        return self._env.agent.robot.get_qvel() if self._direct is None else self._direct.qvel()
+
+    def link_pose(self, link: Any) -> Array:
+        """Return the pose (b, 7) of one of the robot's links."""
+        return link.pose.raw_pose if self._direct is None else self._direct.link_pose(link)
+
+    def held(self, key: int) -> Array:
         """Return whether the robot holds a thing between its fingers (b,)."""
         name = ("held", key)
         if name not in self._cache:
-            agent = self._env.agent
-            distance = torch.linalg.norm(self.position(key) - self.tcp[:, :3], dim=1)
-            near = distance <= self._half_diagonal[key] + _GRASP_REACH_M
-            if self._cpu and not bool(near[0]):
-                self._cache[name] = near
+            near = self.tcp_distance(key) <= self._half_diagonal[key] + _GRASP_REACH_M
+            row = self._row[key]
+            if self._direct is None:
+                self._cache[name] = self._env.agent.is_grasping(self._actors[row]) & near
+            elif near[0] and self._direct.between_links(row):
+                self._cache[name] = self._env.agent.is_grasping(self._actors[row]).numpy()
             else:
-                self._cache[name] = agent.is_grasping(self._actors[self._row[key]]) & near
+                self._cache[name] = np.zeros(1, bool)
         return self._cache[name]
 
     # ---- Contacts.
 
-    def supported(self, key: int, support: int) -> torch.Tensor:
+    def supported(self, key: int, support: int) -> Array:
         """Return whether a support carries a good part of a thing's weight (b,).
 
         PhysX reports no contacts of bodies that sleep; what was so when they fell asleep still is.
@@ -178,34 +189,33 @@ class Measures:
         if name not in self._cache:
             linear, angular = self.speeds(key)
             asleep = (linear == 0) & (angular == 0)
-            known = self._supported.setdefault(
-                (key, support), torch.zeros(len(asleep), dtype=torch.bool, device=asleep.device)
-            )
+            known = self._supported.get((key, support))
+            known = self.array(np.zeros(self._env.num_envs)) > 0 if known is None else known
             if not bool(asleep.all()):
-                force = self._force_on(key, support)
-                known = torch.where(asleep, known, force[:, 2] >= 0.25 * self._weight_n[key])
-                self._supported[(key, support)] = known
+                enough = self._force_on(key, support)[:, 2] >= 0.25 * self._weight_n[key]
+                known = asleep & known | ~asleep & enough
+            self._supported[key, support] = known
             self._cache[name] = known
         return self._cache[name]
 
-    def _force_on(self, key: int, support: int) -> torch.Tensor:
+    def _force_on(self, key: int, support: int) -> Array:
+        others = self._env.builder.carrying_actors(support)
+        if self._direct is not None:
+            return self._direct.force(self._row[key], others)
         scene, actor = self._env.scene, self._actors[self._row[key]]
         total = torch.zeros((self._env.num_envs, 3), device=self._env.device)
-        for other in self._env.builder.carrying_actors(support):
+        for other in others:
             total = total + scene.get_pairwise_contact_forces(actor, other)
         return total
 
-    def _start_axis(self, key: int, axis: int) -> torch.Tensor:
-        """Return which direction (1, 3) of the actor was the world's x or z when it was captured."""
-        placed = self._env.builder.objects[key]
-        item = next(o for o in self._env.bundle.objects if o.id == key)
-        direction = (placed.actor_from_object[:3, :3] @ item.world_from_object[:3, :3].T)[:, axis]
-        return torch.as_tensor(direction, dtype=torch.float32, device=self._env.device)[None]
-
-
-def rotate(quat: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors (..., 3) by unit quaternions wxyz (..., 4)."""
-    vector = vector.expand(*quat.shape[:-1], 3)
-    axis = quat[..., 1:]
-    twice = 2.0 * torch.linalg.cross(axis, vector)
-    return vector + quat[..., :1] * twice + torch.linalg.cross(axis, twice)
+    def _turned(self, key: int, axis: int) -> Array:
+        """Return where (b, 3) what was the world's x or z (axis 0 or 2) when a thing was captured points now."""
+        if (key, axis) not in self._axes:
+            placed = self._env.builder.objects[key]
+            item = next(o for o in self._env.bundle.objects if o.id == key)
+            start = placed.actor_from_object[:3, :3] @ item.world_from_object[:3, :3].T
+            self._axes[key, axis] = start[:, axis].astype(np.float32)
+        direction = self._axes[key, axis]
+        if self._direct is not None:
+            return self._direct.turned(self._row[key], direction)
+        return rotate(self.pose(key)[:, 3:], self.array(direction)[None])

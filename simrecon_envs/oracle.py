@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from registry import UsageError
+from simrecon_envs.arrays import numpy
 
 CONTROL_MODE = "pd_ee_delta_pose"
 _HOVER_M = 0.09
@@ -77,11 +78,11 @@ class Hand:
 
     def tip(self) -> np.ndarray:
         """Return the point between the fingers (3,), world."""
-        return self._env.measures.tcp[0, :3].cpu().numpy().astype(np.float64)
+        return numpy(self._env.measures.tcp)[0, :3].astype(np.float64)
 
     def place(self, key: int) -> np.ndarray:
         """Return a thing's box centre (3,), world."""
-        return self._env.measures.position(key)[0].cpu().numpy().astype(np.float64)
+        return numpy(self._env.measures.position(key))[0].astype(np.float64)
 
     # ---- What it does.
 
@@ -220,7 +221,7 @@ class Hand:
         return action
 
     def _on_floor(self, base: Callable, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        here, ahead = (x[0].cpu().numpy().astype(np.float64) for x in base())
+        here, ahead = (numpy(x)[0].astype(np.float64) for x in base())
         return here, ahead, goal[:2] - here
 
     def _turn(self, yaw: float) -> float:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, tanh
 from simrecon_envs.placement import Placement
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -14,13 +15,14 @@ if TYPE_CHECKING:
     from simrecon_envs.oracle import Hand
     from simrecon_envs.scene_env import SceneEnv
 
-Info = dict[str, torch.Tensor]
+Info = dict[str, Array]
 
 
 class Task:
     """A task in an environment: when it is done, the reward on the way, and how a script does it.
 
-    Every tensor has the number of parallel environments first. Distances are in metres, world space.
+    Every array has the number of parallel environments first, b; they are NumPy's or torch's (`arrays`). Distances are
+    in metres, world space.
     """
 
     kind: ClassVar[str]
@@ -73,11 +75,11 @@ class Task:
         """Return "success" (b,) and what it depends on."""
         raise NotImplementedError
 
-    def reward(self, info: Info) -> torch.Tensor:
+    def reward(self, info: Info) -> Array:
         """Return the dense reward (b,) between 0 and `max_reward`, which success gives."""
         raise NotImplementedError
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+    def observe(self, info: Info) -> dict[str, Array]:
         """Return what an agent may know of the task, each (b, k)."""
         return {}
 
@@ -85,8 +87,8 @@ class Task:
         """Yield actions that do the task, one a control step."""
         raise NotImplementedError
 
-    def _zeros(self, width: int) -> torch.Tensor:
-        return torch.zeros((self.env.num_envs, width), device=self.env.device)
+    def _zeros(self, width: int) -> Array:
+        return self.env.measures.array(np.zeros((self.env.num_envs, width)))
 
 
 def subject_problems(facts: SceneFacts, subject: int | None) -> list[str]:
@@ -105,6 +107,6 @@ def draw(rng: Any, env_idx: torch.Tensor, width: int) -> np.ndarray:
     return np.asarray(rng[index].uniform(size=width), np.float64).reshape(len(index), width)
 
 
-def nearness(distance: torch.Tensor) -> torch.Tensor:
+def nearness(distance: Array) -> Array:
     """Return 1 at distance 0 (m), falling to 0; half at 11 cm, as in ManiSkill's tasks."""
-    return 1 - torch.tanh(5.0 * distance)
+    return 1 - tanh(5.0 * distance)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, norm, numpy, real, where
 from simrecon_envs.tasks.base import Info, Task, draw, nearness, subject_problems
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -56,12 +57,12 @@ class Carry(Task):
         if not hasattr(self, "goal"):
             self.goal, self._home = self._zeros(3), self._zeros(3)
         chosen = (draw(rng, env_idx, 1)[:, 0] * len(self.goals)).astype(int)
-        bottom = torch.as_tensor(self.goals[chosen], dtype=torch.float32, device=self.env.device)
+        bottom = self.env.measures.array(self.goals[chosen])
         bottom[:, 2] += self.facts.height_m(self.subject) / 2
         self.goal[env_idx] = bottom
         self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
 
-    def live_goal(self) -> torch.Tensor:
+    def live_goal(self) -> Array:
         """Return where the object's box centre should come to rest (b, 3)."""
         return self.goal
 
@@ -80,24 +81,24 @@ class Carry(Task):
             "success": there["is_there"] & rest & ~held,
             "is_grasped": held,
             "is_at_rest": rest,
-            "tcp_to_target_m": torch.linalg.norm(position - measures.tcp[:, :3], dim=1),
-            "target_to_goal_m": torch.linalg.norm(position - self.live_goal(), dim=1),
+            "tcp_to_target_m": measures.tcp_distance(self.subject),
+            "target_to_goal_m": norm(position - self.live_goal()),
         }
 
-    def reward(self, info: Info) -> torch.Tensor:
+    def reward(self, info: Info) -> Array:
         measures = self.env.measures
         position, goal = measures.position(self.subject), self.live_goal()
-        aside = torch.linalg.norm(position[:, :2] - goal[:, :2], dim=1)
+        aside = norm(position[:, :2] - goal[:, :2])
         # First over it, then down to it: a straight line leads through what stands in between.
-        height = goal[:, 2] + torch.where(aside > _NEAR_GOAL_M, OVER_THINGS_M, ABOVE_GOAL_M / 2)
-        way = aside + torch.abs(position[:, 2] - height)
-        held = info["is_grasped"].float()
+        height = goal[:, 2] + where(aside > _NEAR_GOAL_M, OVER_THINGS_M, ABOVE_GOAL_M / 2)
+        way = aside + abs(position[:, 2] - height)
+        held = real(info["is_grasped"])
         reward = nearness(info["tcp_to_target_m"]) * (1 - held) + held * (2 + 2 * nearness(way))
         near = (info["target_to_goal_m"] <= _NEAR_GOAL_M) | info["is_there"]
-        reward = torch.where(near, 4.0 + (1 - held) * (0.5 + 0.5 * info["is_at_rest"].float()), reward)
-        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+        reward = where(near, 4.0 + (1 - held) * (0.5 + 0.5 * real(info["is_at_rest"])), reward)
+        return where(info["success"], self.max_reward, reward)
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+    def observe(self, info: Info) -> dict[str, Array]:
         measures = self.env.measures
         pose, goal = measures.pose(self.subject), self.live_goal()
         return {
@@ -111,8 +112,6 @@ class Carry(Task):
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
         yield from hand.grip(self.subject)
         yield from hand.lift(OVER_THINGS_M + 0.03)
-        yield from hand.carry(
-            self.subject, lambda: self.live_goal()[0].cpu().numpy(), OVER_THINGS_M, ABOVE_GOAL_M
-        )
+        yield from hand.carry(self.subject, lambda: numpy(self.live_goal())[0], OVER_THINGS_M, ABOVE_GOAL_M)
         yield from hand.let_go()
         yield from hand.wait(30)

@@ -6,7 +6,21 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from simrecon_envs.measures import rotate
+from simrecon_envs.arrays import (
+    Array,
+    atan2,
+    clamp,
+    largest,
+    norm,
+    numpy,
+    pick,
+    real,
+    rotate,
+    smallest,
+    stack,
+    tanh,
+    where,
+)
 from simrecon_envs.occupancy import ConvexSolid, OccupancyGrid
 from simrecon_envs.placement import Placement, describe_target
 from simrecon_envs.tasks.base import Info, Task, draw
@@ -77,44 +91,42 @@ class Navigate(Task):
             np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1), dtype=torch.float32
         )
         self.env.agent.robot.set_pose(Pose.create_from_pq(position, quat, device=self.env.device))
-        self._points = torch.as_tensor(self._outline, dtype=torch.float32, device=self.env.device)
+        self._points = self.env.measures.array(self._outline)
 
-    def _base(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _base(self) -> tuple[Array, Array]:
         """Return where the base is (b, 2) and where it faces (b, 2)."""
-        pose = self.env.agent.base_link.pose.raw_pose
-        ahead = torch.tensor([[1.0, 0.0, 0.0]], device=self.env.device)
+        measures = self.env.measures
+        pose, ahead = measures.link_pose(self.env.agent.base_link), measures.array([[1.0, 0.0, 0.0]])
         return pose[:, :2], rotate(pose[:, 3:], ahead)[:, :2]
 
     def evaluate(self) -> Info:
         here, ahead = self._base()
         ways = self._points[None] - here[:, None]
-        lengths = torch.linalg.norm(ways, dim=2)
-        distance, nearest = lengths.min(dim=1)
-        way = ways[torch.arange(len(here), device=here.device), nearest]
-        middle = self._points.mean(dim=0)[None] - here
-        off = torch.minimum(_angle(ahead, way), _angle(ahead, middle))
-        qvel = self.env.agent.robot.get_qvel()[:, :3]
-        still = torch.abs(qvel).amax(dim=1) <= _STILL_M_S
+        lengths = norm(ways)
+        distance, way = smallest(lengths), pick(ways, lengths.argmin(1))
+        middle = self._points.mean(0)[None] - here
+        off = smallest(stack([_angle(ahead, way), _angle(ahead, middle)]))
+        still = largest(abs(self.env.measures.qvel[:, :3])) <= _STILL_M_S
         near, facing = distance <= WITHIN_M, off <= FACING_RAD
         return {"success": near & facing & still, "is_near": near, "is_facing": facing, "is_still": still,
                 "distance_m": distance, "off_rad": off}  # fmt: skip
 
-    def reward(self, info: Info) -> torch.Tensor:
-        far = torch.clamp(info["distance_m"] - WITHIN_M, min=0.0)
-        facing = 1 - torch.clamp(info["off_rad"] / np.pi, max=1.0)
-        reward = 1.5 * (1 - torch.tanh(0.7 * far)) + info["is_near"].float() * facing
-        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+    def reward(self, info: Info) -> Array:
+        far = clamp(info["distance_m"] - WITHIN_M, 0.0)
+        facing = 1 - clamp(info["off_rad"] / np.pi, most=1.0)
+        reward = 1.5 * (1 - tanh(0.7 * far)) + real(info["is_near"]) * facing
+        return where(info["success"], self.max_reward, reward)
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+    def observe(self, info: Info) -> dict[str, Array]:
         here, ahead = self._base()
-        way = self._points.mean(dim=0)[None] - here
+        way = self._points.mean(0)[None] - here
         # In the base's own axes: forward, left.
-        local = torch.stack([(way * ahead).sum(1), way[:, 1] * ahead[:, 0] - way[:, 0] * ahead[:, 1]], dim=1)
+        local = stack([(way * ahead).sum(1), way[:, 1] * ahead[:, 0] - way[:, 0] * ahead[:, 1]])
         return {"base_position": here, "base_ahead": ahead, "target_from_base": local,
                 "distance": info["distance_m"][:, None]}  # fmt: skip
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
-        here = self._base()[0][0].cpu().numpy()
+        here = numpy(self._base()[0])[0]
         for point in self.floor.path(here, self.near):
             yield from hand.drive(self._base, lambda point=point: point, 0.10)
         middle = self._outline.mean(axis=0)
@@ -122,7 +134,7 @@ class Navigate(Task):
         yield from hand.wait(15)
 
     def _closest(self, middle: np.ndarray) -> np.ndarray:
-        here = self._base()[0][0].cpu().numpy()
+        here = numpy(self._base()[0])[0]
         point = self._outline[np.argmin(np.linalg.norm(self._outline - here, axis=1))]
         return point if np.linalg.norm(point - here) > 0.3 else middle
 
@@ -234,6 +246,6 @@ def outline(facts: SceneFacts, key: int) -> np.ndarray:
     return np.concatenate(points)
 
 
-def _angle(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def _angle(first: Array, second: Array) -> Array:
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    return torch.abs(torch.atan2(cross, (first * second).sum(dim=1)))
+    return abs(atan2(cross, (first * second).sum(1)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, clamp, real, where
 from simrecon_envs.tasks.base import Info, Task, nearness
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -58,17 +59,17 @@ class Pick(Task):
             "is_lifted": lifted,
             "is_still": still,
             "lift_m": lift,
-            "tcp_to_target_m": torch.linalg.norm(position - measures.tcp[:, :3], dim=1),
+            "tcp_to_target_m": measures.tcp_distance(self.subject),
         }
 
-    def reward(self, info: Info) -> torch.Tensor:
-        held = info["is_grasped"].float()
-        lift = torch.clamp(info["lift_m"] / self.config.lift_m, 0.0, 1.0)
-        done = held * info["is_lifted"].float() * info["is_still"].float()
+    def reward(self, info: Info) -> Array:
+        held = real(info["is_grasped"])
+        lift = clamp(info["lift_m"] / self.config.lift_m, 0.0, 1.0)
+        done = held * real(info["is_lifted"]) * real(info["is_still"])
         reward = nearness(info["tcp_to_target_m"]) + held * (1.0 + 2.0 * lift) + done
-        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+        return where(info["success"], self.max_reward, reward)
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+    def observe(self, info: Info) -> dict[str, Array]:
         pose = self.env.measures.pose(self.subject)
         return {
             "is_grasped": info["is_grasped"][:, None],

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, clamp, norm, numpy, real, where
 from simrecon_envs.tasks.base import Info, Task, draw, nearness
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -89,14 +90,14 @@ class Push(Task):
             self.goal, self._home = self._zeros(3), self._zeros(3)
         chosen = (draw(rng, env_idx, 1)[:, 0] * len(self.goals)).astype(int)
         self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
-        goal = torch.as_tensor(self.goals[chosen], dtype=torch.float32, device=self.env.device)
+        goal = self.env.measures.array(self.goals[chosen])
         goal[:, 2] = self._home[env_idx, 2]
         self.goal[env_idx] = goal
 
     def evaluate(self) -> Info:
         measures, support = self.env.measures, self.facts.parent[self.subject]
         position = measures.position(self.subject)
-        away = torch.linalg.norm((position - self.goal)[:, :2], dim=1)
+        away = norm((position - self.goal)[:, :2])
         carried = measures.supported(self.subject, support)
         upright = measures.up(self.subject) >= _UPRIGHT
         rest, held = measures.at_rest(self.subject), measures.held(self.subject)
@@ -108,18 +109,18 @@ class Push(Task):
             "is_at_rest": rest,
             "is_grasped": held,
             "target_to_goal_m": away,
-            "tcp_to_target_m": torch.linalg.norm(position - measures.tcp[:, :3], dim=1),
+            "tcp_to_target_m": measures.tcp_distance(self.subject),
         }
 
-    def reward(self, info: Info) -> torch.Tensor:
-        start = torch.linalg.norm((self._home - self.goal)[:, :2], dim=1).clamp(min=1e-3)
-        progress = torch.clamp(1 - info["target_to_goal_m"] / start, -1.0, 1.0)
-        upright = info["is_upright"].float()
-        reward = torch.clamp(0.5 * nearness(info["tcp_to_target_m"]) + 2.0 * progress * upright, min=0.0)
-        reward = reward + (info["is_near"] & info["is_upright"]).float()
-        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+    def reward(self, info: Info) -> Array:
+        start = clamp(norm((self._home - self.goal)[:, :2]), 1e-3)
+        progress = clamp(1 - info["target_to_goal_m"] / start, -1.0, 1.0)
+        upright = real(info["is_upright"])
+        reward = clamp(0.5 * nearness(info["tcp_to_target_m"]) + 2.0 * progress * upright, 0.0)
+        reward = reward + real(info["is_near"] & info["is_upright"])
+        return where(info["success"], self.max_reward, reward)
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+    def observe(self, info: Info) -> dict[str, Array]:
         measures = self.env.measures
         pose = measures.pose(self.subject)
         return {
@@ -131,7 +132,7 @@ class Push(Task):
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
         for _ in range(3):  # from another side, where the first way went past the goal
-            yield from hand.push(self.subject, lambda: self.goal[0].cpu().numpy(), 0.4 * WITHIN_M)
+            yield from hand.push(self.subject, lambda: numpy(self.goal)[0], 0.4 * WITHIN_M)
             yield from hand.lift(0.10)
             yield from hand.wait(15)
 

@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, cos_sin, largest, smallest, stack
 from simrecon_envs.tasks.base import Info
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
@@ -51,13 +52,12 @@ class Put(Carry):
     def start(self, env_idx: torch.Tensor, rng: object) -> None:
         super().start(env_idx, rng)
         inside = self.facts.container(self.spec.place)
-        device = self.env.device
-        self._cells = torch.as_tensor(inside.cells, dtype=torch.float32, device=device)
+        self._cells = self.env.measures.array(inside.cells)
         target = self.facts.targets.get(self.spec.place)
         center = np.zeros(3) if target is None else target.center
-        self._container_home = torch.as_tensor(center, dtype=torch.float32, device=device)[None]
+        self._container_home = self.env.measures.array(center)[None]
 
-    def _from_captured(self, points: torch.Tensor, back: bool = False) -> torch.Tensor:
+    def _from_captured(self, points: Array, back: bool = False) -> Array:
         """Take points (b, 3) along with the container from where it was captured, or `back` there."""
         if self.spec.place not in self.facts.targets:
             return points
@@ -65,23 +65,24 @@ class Put(Carry):
         here, yaw = measures.position(self.spec.place), measures.yaw(self.spec.place)
         if back:
             here, home, yaw = home, here, -yaw
-        c, s = torch.cos(yaw), torch.sin(yaw)
-        x, y, z = (points - home).unbind(dim=1)
-        return torch.stack([c * x - s * y, s * x + c * y, z], dim=1) + here
+        c, s = cos_sin(yaw)
+        away = points - home
+        x, y, z = away[:, 0], away[:, 1], away[:, 2]
+        return stack([c * x - s * y, s * x + c * y, z]) + here
 
-    def live_goal(self) -> torch.Tensor:
+    def live_goal(self) -> Array:
         """Return the goal inside the container, where that is now."""
         return self._from_captured(self.goal)
 
     def _arrived(self) -> Info:
         inside = self.facts.container(self.spec.place)
         local = self._from_captured(self.env.measures.position(self.subject), back=True)
-        nearest = torch.abs(local[:, None, :2] - self._cells[None]).amax(dim=2).amin(dim=1)
+        nearest = smallest(largest(abs(local[:, None, :2] - self._cells[None])))
         within = nearest <= 0.01
         bottom = local[:, 2] - self.facts.height_m(self.subject) / 2
         # A thing that fell over inside has another height: its middle below the rim will do as well.
         below = (bottom < inside.rim_m - 0.008) | (local[:, 2] < inside.rim_m)
-        upright = torch.ones_like(within)
+        there = within & below
         if self.spec.place in self.facts.targets:
-            upright = self.env.measures.up(self.spec.place) > 0.9
-        return {"is_there": within & below & upright, "is_within_walls": within, "is_below_rim": below}
+            there = there & (self.env.measures.up(self.spec.place) > 0.9)
+        return {"is_there": there, "is_within_walls": within, "is_below_rim": below}

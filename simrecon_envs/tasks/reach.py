@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, norm, numpy, real, tanh, where
 from simrecon_envs.tasks.base import Info, Task, nearness
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -33,29 +34,29 @@ class Reach(Task):
 
     def start(self, env_idx: torch.Tensor, rng: object) -> None:
         if not hasattr(self, "_home"):
-            self._home = self._zeros(3)
+            self._home, self._lift = self._zeros(3), self._zeros(3)
+            self._lift[:, 2] = self.facts.height_m(self.subject) / 2 + ABOVE_M
         self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
 
-    def _goal(self) -> torch.Tensor:
-        lift = torch.tensor([0, 0, self.facts.height_m(self.subject) / 2 + ABOVE_M], device=self.env.device)
-        return self.env.measures.position(self.subject) + lift
+    def _goal(self) -> Array:
+        return self.env.measures.position(self.subject) + self._lift
 
     def evaluate(self) -> Info:
         measures = self.env.measures
-        distance = torch.linalg.norm(self._goal() - measures.tcp[:, :3], dim=1)
-        moved = torch.linalg.norm(measures.position(self.subject) - self._home, dim=1)
+        distance = norm(self._goal() - measures.tcp[:, :3])
+        moved = norm(measures.position(self.subject) - self._home)
         still = measures.joint_speed <= STILL_RAD_S
         near, unmoved = distance <= WITHIN_M, moved <= TOUCHED_M
         return {"success": near & still & unmoved, "is_near": near, "is_still": still, "is_unmoved": unmoved,
                 "tcp_to_goal_m": distance}  # fmt: skip
 
-    def reward(self, info: Info) -> torch.Tensor:
-        near = info["is_near"].float()
-        slow = 1 - torch.tanh(2.0 * self.env.measures.joint_speed)
-        reward = (nearness(info["tcp_to_goal_m"]) + near * slow) * (0.5 + 0.5 * info["is_unmoved"].float())
-        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+    def reward(self, info: Info) -> Array:
+        near = real(info["is_near"])
+        slow = 1 - tanh(2.0 * self.env.measures.joint_speed)
+        reward = (nearness(info["tcp_to_goal_m"]) + near * slow) * (0.5 + 0.5 * real(info["is_unmoved"]))
+        return where(info["success"], self.max_reward, reward)
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+    def observe(self, info: Info) -> dict[str, Array]:
         measures = self.env.measures
         return {
             "target_pose": measures.pose(self.subject),
@@ -63,5 +64,5 @@ class Reach(Task):
         }
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
-        yield from hand.go(lambda: self._goal()[0].cpu().numpy(), within_m=0.008)
+        yield from hand.go(lambda: numpy(self._goal())[0], within_m=0.008)
         yield from hand.wait(20)

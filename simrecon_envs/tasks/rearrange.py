@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, largest, norm, real, stack, where
 from simrecon_envs.tasks.base import Info, Task, draw
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
@@ -56,7 +57,7 @@ class Restore(Carry):
 
     def _arrived(self) -> Info:
         measures = self.env.measures
-        away = torch.linalg.norm((measures.position(self.subject) - self.goal)[:, :2], dim=1)
+        away = norm((measures.position(self.subject) - self.goal)[:, :2])
         near, upright = away <= WITHIN_M, measures.up(self.subject) >= _UPRIGHT
         carried = measures.supported(self.subject, self.facts.parent[self.subject])
         return {"is_there": near & upright & carried, "is_near": near, "is_upright": upright}
@@ -123,19 +124,19 @@ class Rearrange(Task):
 
     def evaluate(self) -> Info:
         self._infos = [stage.evaluate() for stage in self.stages]
-        done = torch.stack([info["success"] for info in self._infos], dim=1)
-        return {"success": done.all(dim=1), "things_done": done.sum(dim=1)}
+        done = stack([info["success"] for info in self._infos])
+        return {"success": done.all(1), "things_done": done.sum(1)}
 
-    def reward(self, info: Info) -> torch.Tensor:
-        rewards = torch.stack([s.reward(one) for s, one in zip(self.stages, self._infos, strict=True)], dim=1)
+    def reward(self, info: Info) -> Array:
+        rewards = stack([s.reward(one) for s, one in zip(self.stages, self._infos, strict=True)])
         shares = rewards / Carry.max_reward
-        done = torch.stack([one["success"] for one in self._infos], dim=1)
+        done = stack([one["success"] for one in self._infos])
         # What is done counts whole, of the rest only what is farthest along: one hand does one thing.
-        best = torch.where(done, torch.zeros_like(shares), shares).amax(dim=1)
-        reward = done.float().sum(dim=1) + 0.98 * best
-        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+        best = largest(where(done, 0.0, shares))
+        reward = real(done).sum(1) + 0.98 * best
+        return where(info["success"], self.max_reward, reward)
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
+    def observe(self, info: Info) -> dict[str, Array]:
         out = {}
         for number, (stage, one) in enumerate(zip(self.stages, self._infos, strict=True)):
             out.update({f"thing_{number}_{key}": value for key, value in stage.observe(one).items()})

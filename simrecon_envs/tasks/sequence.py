@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array, clamp, pick, real, stack, where, whole
 from simrecon_envs.tasks.base import Info, Task
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -45,44 +46,41 @@ class Sequence(Task):
 
     def start(self, env_idx: torch.Tensor, rng: object) -> None:
         if not hasattr(self, "stage"):
-            self.stage = self._zeros(1)[:, 0].long()
+            self.stage = whole(self._zeros(1)[:, 0])
         self.stage[env_idx] = 0
         for stage in self.stages:
             stage.start(env_idx, rng)
 
     def evaluate(self) -> Info:
         infos = [stage.evaluate() for stage in self.stages]
-        done = torch.stack([info["success"] for info in infos], dim=1)
-        present = self.stage.clamp(max=len(infos) - 1)
-        advance = (self.stage < len(infos)) & done.gather(1, present[:, None])[:, 0]
-        self.stage = self.stage + advance.long()
-        lasting = torch.tensor([stage.lasting for stage in self.stages], device=done.device)
-        kept = (done | ~lasting).all(dim=1)
+        done = stack([info["success"] for info in infos])
+        advance = (self.stage < len(infos)) & pick(done, self._present())
+        self.stage = self.stage + whole(advance)
+        kept = stack(
+            [done[:, k] if stage.lasting else done[:, k] | True for k, stage in enumerate(self.stages)]
+        )
         self._infos = infos
         return {
-            "success": (self.stage >= len(infos)) & kept,
-            "stage": self.stage.clone(),
-            "stages_done": done.sum(dim=1),
+            "success": (self.stage >= len(infos)) & kept.all(1),
+            "stage": self.stage + 0,
+            "stages_done": done.sum(1),
         }
 
-    def reward(self, info: Info) -> torch.Tensor:
-        shares = torch.stack(
-            [
-                stage.reward(one) / stage.max_reward
-                for stage, one in zip(self.stages, self._infos, strict=True)
-            ],
-            dim=1,
-        )
-        present = self.stage.clamp(max=len(self.stages) - 1)
-        reward = self.stage.float() * 0.98 + 0.98 * shares.gather(1, present[:, None])[:, 0]
-        reward = torch.clamp(reward, max=0.98 * len(self.stages))
-        return torch.where(info["success"], torch.full_like(reward, self.max_reward), reward)
+    def reward(self, info: Info) -> Array:
+        shares = [s.reward(one) / s.max_reward for s, one in zip(self.stages, self._infos, strict=True)]
+        reward = real(self.stage) * 0.98 + 0.98 * pick(stack(shares), self._present())
+        reward = clamp(reward, most=0.98 * len(self.stages))
+        return where(info["success"], self.max_reward, reward)
 
-    def observe(self, info: Info) -> dict[str, torch.Tensor]:
-        out = {"stage": torch.nn.functional.one_hot(self.stage, len(self.stages) + 1).float()}
+    def observe(self, info: Info) -> dict[str, Array]:
+        out = {"stage": stack([real(self.stage == k) for k in range(len(self.stages) + 1)])}
         for number, (stage, one) in enumerate(zip(self.stages, self._infos, strict=True)):
             out.update({f"stage_{number}_{key}": value for key, value in stage.observe(one).items()})
         return out
+
+    def _present(self) -> Array:
+        """Return the number (b,) of the stage that is to be done, the last one at the end."""
+        return clamp(self.stage, most=len(self.stages) - 1)
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
         for number, stage in enumerate(self.stages):

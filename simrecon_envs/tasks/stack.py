@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from simrecon_envs.arrays import Array
 from simrecon_envs.tasks.base import Info
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
@@ -49,14 +50,13 @@ class Stack(Carry):
     def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
         return f"Stack the {facts.thing(spec.subject)} on the {facts.thing(spec.place)}."
 
-    def live_goal(self) -> torch.Tensor:
+    def live_goal(self) -> Array:
         moved = self.env.measures.position(self.spec.place) - self._lower_home
         return self.goal + moved
 
     def start(self, env_idx: torch.Tensor, rng: object) -> None:
         super().start(env_idx, rng)
-        center = torch.as_tensor(self.facts.targets[self.spec.place].center, dtype=torch.float32)
-        self._lower_home = center.to(self.env.device)[None]
+        self._lower_home = self.env.measures.array(self.facts.targets[self.spec.place].center)[None]
 
     def _arrived(self) -> Info:
         measures = self.env.measures

@@ -44,7 +44,7 @@ def test_poses_stay_on_their_support_and_apart(scenes_root: Path) -> None:
             assert not any(_overlap(hull, other) for other in hulls[:number])
         for _ in range(3):
             env.step(None)
-        heights = env.unwrapped.measures.positions[0, :, 2].numpy()
+        heights = [float(env.unwrapped.measures.position(key)[0, 2]) for key in env.unwrapped.movable_ids]
         expected = [env.unwrapped.facts.targets[key].center[2] for key in env.unwrapped.movable_ids]
         np.testing.assert_allclose(heights, expected, atol=1e-3)
     assert np.std(seen, axis=0).min() > 0.01  # every thing did move

@@ -204,11 +204,7 @@ def test_things_are_moved_about_by_seed_and_may_be_anywhere_but_home(scenes_root
 
     def places(seed: int) -> np.ndarray:
         env.reset(seed=seed)
-        return (
-            torch.cat([env.unwrapped.measures.position(stage.subject) for stage in task.stages])
-            .numpy()
-            .copy()
-        )
+        return np.concatenate([env.unwrapped.measures.position(stage.subject) for stage in task.stages])
 
     first = places(3)
     np.testing.assert_array_equal(first, places(3))

@@ -1,0 +1,176 @@
+"""One environment on the CPU, straight from and to SAPIEN.
+
+ManiSkill's structs hold every quantity as a batched tensor: for one environment, a tensor of three numbers costs more
+than reading them, and all of them together more than the physics does. What is here gives the same numbers.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosMimicController
+
+
+class DirectReads:
+    """Poses, velocities and contacts of things and robot; each thing's contacts once a control step."""
+
+    def __init__(self, env: Any, actors: list, centers: np.ndarray) -> None:
+        """Find the bodies.
+
+        Args:
+            env: A `SceneEnv` that is built, with one environment on the CPU.
+            actors: The movable things' actors, n of them.
+            centers: Their box centres (n, 3) in the actors' space (m).
+        """
+        self._env = env
+        self._entities = [actor._objs[0] for actor in actors]
+        self._bodies = [actor._bodies[0] for actor in actors]
+        self._centers = [sapien.Pose(center) for center in centers]
+        self._links = set() if env.agent is None else {id(link._objs[0]) for link in env.agent.robot.links}
+        self._touching: dict[int, list] = {}
+
+    def refresh(self) -> None:
+        """Forget the contacts: the simulator has moved on."""
+        self._touching = {}
+
+    def poses(self) -> np.ndarray:
+        """Return the actors' poses (1, n, 7): position (m), quaternion wxyz; world."""
+        rows = [entity.pose.__getstate__() for entity in self._entities]
+        return np.array(rows, np.float32).reshape(1, len(rows), 7)
+
+    def pose(self, row: int) -> np.ndarray:
+        """Return the pose (1, 7) of a thing's box centre, with the orientation of its actor."""
+        return _row(self._entities[row].pose * self._centers[row])
+
+    def turned(self, row: int, direction: np.ndarray) -> np.ndarray:
+        """Return where (1, 3) a direction (3,) of a thing's actor points in the world."""
+        return (self._entities[row].pose.to_transformation_matrix()[:3, :3] @ direction)[None]
+
+    def speeds(self, row: int) -> np.ndarray:
+        """Return the linear (m/s) and angular (rad/s) speed (1, 2) of a thing."""
+        body = self._bodies[row]
+        pair = [math.hypot(*v.tolist()) for v in (body.linear_velocity, body.angular_velocity)]
+        return np.array([pair], np.float32)
+
+    def link_pose(self, link: Any) -> np.ndarray:
+        """Return the pose (1, 7) of one of the robot's links."""
+        return _row(link._objs[0].entity_pose)
+
+    def qvel(self) -> np.ndarray:
+        """Return the speeds (1, d) of the robot's joints (rad/s, m/s)."""
+        return self._env.agent.robot._objs[0].qvel[None]
+
+    def between_links(self, row: int) -> bool:
+        """Return whether at least two links of the robot touch a thing: less cannot hold it."""
+        return len({id(other) for _, other, _ in self._contacts(row)} & self._links) > 1
+
+    def force(self, row: int, others: list) -> np.ndarray:
+        """Return the force (1, 3) (N) of other actors on a thing."""
+        wanted, total = {id(other._bodies[0]) for other in others}, np.zeros(3)
+        for contact, other, sign in self._contacts(row):
+            if id(other) in wanted:
+                total += sign * np.sum([point.impulse for point in contact.points], axis=0)
+        return (total / self._env.scene.px.timestep).astype(np.float32)[None]
+
+    def _contacts(self, row: int) -> list[tuple[Any, Any, int]]:
+        """Return a thing's contacts, what it touches there, and 1 where the impulse acts on it, else -1.
+
+        SAPIEN gives one and the same object for a body as long as somebody holds it, as ManiSkill's structs do.
+        """
+        if row not in self._touching:
+            self._touching[row], mine = [], self._bodies[row]
+            for contact in self._env.scene.px.get_contacts():
+                first, second = contact.bodies
+                if first is mine:
+                    self._touching[row].append((contact, second, 1))
+                elif second is mine:
+                    self._touching[row].append((contact, first, -1))
+        return self._touching[row]
+
+
+class DirectDrive:
+    """ManiSkill's joint position controllers of one robot on the CPU; other controllers do as they always do."""
+
+    def __init__(self, agent: BaseAgent) -> None:
+        """Look at the controllers that the agent has now."""
+        self.controller = agent.controller
+        self._parts: list[tuple[slice, BaseController, _Joints | None]] = []
+        if type(self.controller) is CombinedController:
+            for name, child in self.controller.controllers.items():
+                share = slice(*self.controller.action_mapping[name])
+                self._parts.append((share, child, _Joints(child) if _Joints.fits(child) else None))
+        idle = {BaseController.before_simulation_step, PDJointPosController.before_simulation_step}
+        self.idle = (
+            bool(self._parts)
+            and type(agent).before_simulation_step is BaseAgent.before_simulation_step
+            and all(
+                type(child).before_simulation_step in idle and not getattr(child.config, "interpolate", False)
+                for _, child, _ in self._parts
+            )
+        )
+        """Whether controllers have nothing to do between a control step's time steps."""
+
+    def set_action(self, action: torch.Tensor) -> None:
+        """Give the controllers an action (1, k), as `controller.set_action` does."""
+        if not self._parts:
+            self.controller.set_action(action)
+            return
+        numbers = action.numpy()[0]
+        for share, child, joints in self._parts:
+            if joints is not None:
+                joints.drive(numbers[share])
+            else:
+                child.set_action(action[:, share])
+
+
+class _Joints:
+    """A `PDJointPosController`, or one with mimicked joints, without interpolation and virtual targets."""
+
+    @staticmethod
+    def fits(controller: BaseController) -> bool:
+        """Return whether a controller does nothing but what `drive` does."""
+        plain = type(controller) in (PDJointPosController, PDJointPosMimicController)
+        return plain and not (controller.config.interpolate or controller.config.use_target)
+
+    def __init__(self, controller: PDJointPosController) -> None:
+        self._controller = controller
+        self._robot = controller.articulation._objs[0]
+        self._joints = [joint._objs[0] for joint in controller.joints]
+        self._indices = controller.active_joint_indices.numpy()
+        self._delta = controller.config.use_delta
+        self._scale = None
+        if controller._normalize_action:
+            low, high = controller.action_space_low.numpy(), controller.action_space_high.numpy()
+            self._scale = 0.5 * (high + low), 0.5 * (high - low)
+        self._mimic = None
+        if type(controller) is PDJointPosMimicController:
+            columns = (controller.control_joint_indices, controller.mimic_joint_indices,
+                       controller.mimic_control_joint_indices, controller._multiplier, controller._offset)  # fmt: skip
+            self._mimic = [column.numpy().reshape(-1) for column in columns]
+
+    def drive(self, action: np.ndarray) -> None:
+        """Set the joints' targets from an action (k,)."""
+        if self._scale is not None:
+            action = self._scale[0] + self._scale[1] * np.minimum(np.maximum(action, -1), 1)
+        start = self._robot.qpos[self._indices]
+        if self._mimic is None:
+            target = start + action if self._delta else np.zeros_like(start) + action
+        else:
+            control, mimic, source, multiplier, offset = self._mimic
+            target = np.empty_like(start)
+            target[control] = start[control] + action if self._delta else action
+            target[mimic] = target[source] * multiplier + offset
+        # What `get_state`, and whoever converts trajectories, reads of the controller.
+        self._controller._step = 0
+        self._controller._start_qpos = torch.from_numpy(start[None])
+        self._controller._target_qpos = torch.from_numpy(target[None])
+        for joint, value in zip(self._joints, target.tolist(), strict=True):
+            joint.set_drive_target(value)
+
+
+def _row(pose: sapien.Pose) -> np.ndarray:
+    return np.array([pose.__getstate__()], np.float32)

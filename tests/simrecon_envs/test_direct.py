@@ -1,0 +1,113 @@
+"""What is read and driven straight through SAPIEN, in NumPy, is what ManiSkill's structs and controllers give."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import simrecon_envs
+from simrecon_envs import scene_env
+from simrecon_envs.direct import DirectDrive
+from simrecon_envs.measures import Measures
+from simrecon_envs.oracle import CONTROL_MODE, Oracle
+
+TASKS = (
+    "push_block",
+    "put_cube_in_crate-then-pick_cup",
+    *(
+        pytest.param(task, marks=pytest.mark.slow)
+        for task in (
+            "reach_crate",
+            "place_cube_on_shelf",
+            "put_cup_in_crate",
+            "stack_cup_on_block",
+            "rearrange",
+        )
+    ),
+)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_tasks_in_numpy_are_tasks_in_torch(
+    scenes_root: Path, monkeypatch: pytest.MonkeyPatch, task: str
+) -> None:
+    _same_by_both(scenes_root, monkeypatch, task, "panda")
+
+
+def test_driving_in_numpy_is_driving_in_torch(scenes_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _same_by_both(scenes_root, monkeypatch, "navigate_shelf", "fetch")
+
+
+def _same_by_both(root: Path, monkeypatch: pytest.MonkeyPatch, task: str, robot: str) -> None:
+    make = functools.partial(
+        simrecon_envs.make, "things", registry=root, task=task, robot_uids=robot,
+        control_mode=CONTROL_MODE, max_episode_steps=10_000,
+    )  # fmt: skip
+    env = make()
+    monkeypatch.setattr(scene_env, "Measures", functools.partial(Measures, direct=False))
+    other = make()
+    assert isinstance(env.unwrapped.measures.tcp, np.ndarray)
+    assert isinstance(other.unwrapped.measures.tcp, torch.Tensor)
+    _compare(env.reset(seed=2)[0], other.reset(seed=2)[0])
+    seen: dict[str, set] = {}
+    for _, action in zip(range(250), Oracle(env).actions(), strict=False):
+        (obs, reward, done, _, info), twin = env.step(action), other.step(action)
+        _compare(obs, twin[0])
+        _compare(reward, twin[1])
+        assert info.keys() == twin[4].keys()
+        for key, value in info.items():
+            _compare(value, twin[4][key])
+            seen.setdefault(key, set()).add(float(value[0]))
+        if done:
+            break
+    assert max(len(values) for values in seen.values()) > 20  # something did move
+    env.close()
+    other.close()
+
+
+def _compare(ours: torch.Tensor, theirs: torch.Tensor) -> None:
+    assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
+    # Heights of what is lifted are differences of nearly equal numbers.
+    torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("robot", "mode", "direct"),
+    [
+        ("panda", "pd_joint_delta_pos", True),
+        ("panda", "pd_joint_pos", True),
+        ("panda", "pd_joint_target_delta_pos", False),
+        ("panda", "pd_ee_delta_pose", False),
+        ("panda", "pd_joint_vel", False),
+        ("fetch", "pd_joint_delta_pos", True),
+    ],
+)
+def test_joints_get_the_targets_of_the_controllers(
+    scenes_root: Path, robot: str, mode: str, direct: bool
+) -> None:
+    env = simrecon_envs.make("room", registry=scenes_root, robot_uids=robot, control_mode=mode)
+    env.reset(seed=0)
+    agent = env.unwrapped.agent
+    drive = DirectDrive(agent)
+    assert (drive._parts[0][2] is not None) == direct
+    joints = [joint._objs[0] for joint in agent.robot.active_joints]
+    generator = np.random.default_rng(0)
+    for _ in range(5):
+        scale = 1.5 if mode != "pd_joint_pos" else 0.3
+        action = generator.uniform(-scale, scale, agent.single_action_space.shape).astype(np.float32)
+        state = agent.controller.get_state()
+        agent.controller.set_action(torch.from_numpy(action)[None])
+        theirs = _targets(joints)
+        agent.controller.set_state(state)
+        drive.set_action(torch.from_numpy(action)[None])
+        np.testing.assert_array_equal(_targets(joints), theirs)
+        env.step(action)
+    env.close()
+
+
+def _targets(joints: list) -> np.ndarray:
+    return np.array(
+        [[float(joint.drive_target[0]), float(joint.drive_velocity_target[0])] for joint in joints]
+    )
