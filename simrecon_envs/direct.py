@@ -12,6 +12,7 @@ import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController, PDEEPoseController
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosMimicController
 
 
@@ -93,16 +94,17 @@ class DirectReads:
 
 
 class DirectDrive:
-    """ManiSkill's joint position controllers of one robot on the CPU; other controllers do as they always do."""
+    """ManiSkill's controllers of joints and hand on the CPU; other controllers do as they always do."""
 
     def __init__(self, agent: BaseAgent) -> None:
         """Look at the controllers that the agent has now."""
         self.controller = agent.controller
-        self._parts: list[tuple[slice, BaseController, _Joints | None]] = []
+        self._parts: list[tuple[slice, BaseController, _Joints | _Tip | None]] = []
         if type(self.controller) is CombinedController:
             for name, child in self.controller.controllers.items():
                 share = slice(*self.controller.action_mapping[name])
-                self._parts.append((share, child, _Joints(child) if _Joints.fits(child) else None))
+                kind = next((kind for kind in (_Joints, _Tip) if kind.fits(child)), None)
+                self._parts.append((share, child, None if kind is None else kind(child)))
         idle = {BaseController.before_simulation_step, PDJointPosController.before_simulation_step}
         self.idle = (
             bool(self._parts)
@@ -164,12 +166,73 @@ class _Joints:
             target = np.empty_like(start)
             target[control] = start[control] + action if self._delta else action
             target[mimic] = target[source] * multiplier + offset
-        # What `get_state`, and whoever converts trajectories, reads of the controller.
-        self._controller._step = 0
-        self._controller._start_qpos = torch.from_numpy(start[None])
-        self._controller._target_qpos = torch.from_numpy(target[None])
-        for joint, value in zip(self._joints, target.tolist(), strict=True):
-            joint.set_drive_target(value)
+        _drive(self._controller, self._joints, start, target)
+
+
+class _Tip:
+    """A `PDEEPoseController` or `PDEEPosController` of changes, in the frame that ManiSkill's robots have it in."""
+
+    @staticmethod
+    def fits(controller: BaseController) -> bool:
+        """Return whether a controller does nothing but what `drive` does."""
+        frames = {
+            PDEEPoseController: "root_translation:root_aligned_body_rotation",
+            PDEEPosController: "root_translation",
+        }
+        if type(controller) not in frames or controller.config.interpolate or controller.config.use_target:
+            return False
+        plain = controller.config.use_delta and controller._normalize_action
+        return plain and controller.config.frame == frames[type(controller)]
+
+    def __init__(self, controller: PDEEPosController) -> None:
+        self._controller = controller
+        self._robot = controller.articulation._objs[0]
+        self._joints = [joint._objs[0] for joint in controller.joints]
+        self._indices = controller.active_joint_indices.numpy()
+        self._root, self._tip = controller.root_link._objs[0], controller.ee_link._objs[0]
+        low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
+        self._scale = 0.5 * (high + low), 0.5 * (high - low)
+        self._turn = controller.config.rot_lower if type(controller) is PDEEPoseController else None
+        kinematics = controller.kinematics
+        self._known = kinematics.pmodel_active_joint_indices.numpy()
+        self._solved = kinematics.pmodel_controlled_joint_indices.numpy()
+        self._mask = kinematics.qmask.numpy()
+
+    def drive(self, action: np.ndarray) -> None:
+        """Set the joints' targets to where the hand is moved and turned by an action (3,) or (6,)."""
+        here = self._root.entity_pose.inv() * self._tip.entity_pose
+        move = self._scale[0] + self._scale[1] * np.minimum(np.maximum(action[:3], -1), 1)
+        quat = here.q
+        if self._turn is not None:
+            turn = action[3:] / max(float(np.linalg.norm(action[3:])), 1.0) * self._turn
+            quat = (_about(turn, 0) * _about(turn, 1) * _about(turn, 2) * sapien.Pose(q=quat)).q
+        kinematics, qpos = self._controller.kinematics, self._robot.qpos
+        solution, found, _ = kinematics.pmodel.compute_inverse_kinematics(
+            kinematics.end_link_idx,
+            sapien.Pose(here.p + move, quat),
+            initial_qpos=qpos[self._known],
+            active_qmask=self._mask,
+            max_iterations=100,
+        )
+        start = qpos[self._indices]
+        target = solution[self._solved].astype(np.float32) if found else start
+        _drive(self._controller, self._joints, start, target)
+
+
+def _drive(controller: PDJointPosController, joints: list, start: np.ndarray, target: np.ndarray) -> None:
+    """Set joints' targets, and what `get_state` and whoever converts trajectories reads of the controller."""
+    controller._step = 0
+    controller._start_qpos = torch.from_numpy(start[None])
+    controller._target_qpos = torch.from_numpy(target[None].copy())
+    for joint, value in zip(joints, target.tolist(), strict=True):
+        joint.set_drive_target(value)
+
+
+def _about(turn: np.ndarray, axis: int) -> sapien.Pose:
+    """Return the turn about one axis by its part of (3,) angles (rad)."""
+    quat = [math.cos(turn[axis] / 2), 0.0, 0.0, 0.0]
+    quat[1 + axis] = math.sin(turn[axis] / 2)
+    return sapien.Pose(q=quat)
 
 
 def _row(pose: sapien.Pose) -> np.ndarray:
