@@ -62,7 +62,7 @@ def _same_by_both(root: Path, monkeypatch: pytest.MonkeyPatch, task: str, robot:
             seen.setdefault(key, set()).add(float(value[0]))
         if done:
             break
-    assert max(len(values) for values in seen.values()) > 20  # something did move
+    assert max(len(values) for values in seen.values()) > 5  # something did move
     env.close()
     other.close()
 
