@@ -188,6 +188,7 @@ def blend_target_backward(
     tiles_x,
     scalars,
     image,
+    contributions,
     image_gradients,
     entry_gradients,
 ):  # pragma: no cover - compiled
@@ -196,20 +197,21 @@ def blend_target_backward(
     Args:
         start: As for `blend_target`, up to scalars.
         image: (h, w, 3) of `blend_target`.
+        contributions: (e, 1) of `blend_target`: entries that stop no light have no derivative.
         image_gradients: (h, w, 3).
         entry_gradients: (e, 9) filled.
     """  # fmt: skip
     for tile in range(start, stop):
         _blend_tile_backward(
-            tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, image_gradients,
-            entry_gradients,
+            tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions,
+            image_gradients, entry_gradients,
         )  # fmt: skip
 
 
 @numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy", forceinline=True)
 def _blend_tile_backward(
-    tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, image_gradients,
-    entry_gradients,
+    tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions,
+    image_gradients, entry_gradients,
 ):  # fmt: skip  # pragma: no cover - compiled
     height, width = image.shape[0], image.shape[1]
     alpha_max, stop = scalars[0], scalars[1]
@@ -231,6 +233,8 @@ def _blend_tile_backward(
     for e in range(tile_start[tile], tile_end[tile]):
         if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
             break
+        if contributions[e, 0] == zero:
+            continue
         s = splats[entries[e]]
         box = boxes[entries[e]]
         mine, value = own[entries[e]], worth[entries[e]]

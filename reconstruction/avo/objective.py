@@ -187,8 +187,9 @@ class Objective:
         tiles = len(blended.bins[0]) - 1
         entry_gradients = np.empty((len(blended.bins[1]), kernels.N_GRADIENTS), dtype)
         run_over(
-            tiles, kernels.blend_target_backward, *blended.common, by_image.astype(dtype), entry_gradients
-        )
+            tiles, kernels.blend_target_backward, *blended.common, blended.weights, by_image.astype(dtype),
+            entry_gradients,
+        )  # fmt: skip
         splat_gradients = np.zeros((n, shared.N_SPLAT_GRADIENTS), dtype)
         run_over(
             len(rows), kernels.sum_entries, entry_gradients, blended.bins[2], blended.bins[3], rows, splat_gradients

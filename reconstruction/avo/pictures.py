@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.avo.inpainting import Inpainter
-from reconstruction.avo.scene import Target, ViewScene
+from reconstruction.avo.scene import Target, ViewScene, reach_of
 from reconstruction.gaussians.model import SH_C0
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize
 from reconstruction.types import Camera
@@ -88,17 +88,13 @@ def draw_view(
     """
     own = np.zeros(len(scene.packed), bool)
     own[target.rows] = True
-    marked = scene.packed.copy()
-    marked[:, 10:13] = (
-        np.where(own[:, None], 0.5, -0.5) / SH_C0
-    )  # rendered as 1 where it is the target's, else 0
     whole = rasterize(scene.packed, camera, pose, _SETTINGS).features
-    alpha = rasterize(marked, camera, pose, _SETTINGS).features[..., 0]
     alone = rasterize(scene.packed[own], camera, pose, _SETTINGS).features
     outline = alone[..., 7]
+    alpha = _own_alpha(scene, own, camera, pose, outline)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(outline > 1e-6, alone[..., 3] / outline, 0.0)
-    clean, holes = _without_occluders(scene, own, camera, pose, outline > _OPAQUE, depth)
+    clean, holes = _without_occluders(scene, own, camera, pose, outline > _OPAQUE, depth, whole)
     behind = _hidden_holes(outline > _OPAQUE, depth, whole)
     holes |= _grown(behind)
     total = float(outline.sum())
@@ -119,6 +115,41 @@ def draw_view(
     )
 
 
+def _own_alpha(
+    scene: ViewScene, own: np.ndarray, camera: Camera, pose: np.ndarray, outline: np.ndarray
+) -> np.ndarray:
+    """Return the opacity (h, w) of the target behind what hides it; only what may lie before it is drawn."""
+    out = np.zeros(outline.shape, np.float32)
+    window = _window_of(outline > 0)
+    if window is None:
+        return out
+    local = (scene.packed[:, :3] - pose[:3, 3]) @ pose[:3, :3]
+    reach = reach_of(scene.packed, _SETTINGS.sigma_cutoff)
+    far = float((local[own, 2] + reach[own]).max())
+    marked = scene.packed[local[:, 2] <= far]  # sorted by the depth of their centers
+    mine = own[local[:, 2] <= far]
+    marked[:, 10:13] = (
+        np.where(mine[:, None], 0.5, -0.5) / SH_C0
+    )  # drawn as 1 where it is the target's, else 0
+    out[window] = rasterize(marked, _cropped(camera, window), pose, _SETTINGS).features[..., 0]
+    return out
+
+
+def _window_of(mask: np.ndarray) -> tuple[slice, slice] | None:
+    """Return rows and columns of the box around a mask (h, w); None where it is empty."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
+
+
+def _cropped(camera: Camera, window: tuple[slice, slice]) -> Camera:
+    """Return the camera of a part of its picture."""
+    rows, columns = window
+    width, height = int(columns.stop - columns.start), int(rows.stop - rows.start)
+    return Camera(
+        width, height, camera.fx, camera.fy, camera.cx - float(columns.start), camera.cy - float(rows.start)
+    )
+
+
 def _without_occluders(
     scene: ViewScene,
     own: np.ndarray,
@@ -126,16 +157,27 @@ def _without_occluders(
     pose: np.ndarray,
     outline: np.ndarray,
     depth: np.ndarray,
+    whole: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the picture (h, w, 3) without what lies before the target, and where nothing is left to show (h, w)."""
+    """Return the picture (h, w, 3) without what lies before the target, and where nothing is left to show (h, w).
+
+    Outside of what is taken away it is that of the whole scene (features (h, w, c)), which is not drawn again.
+    """
     before = _before_target(scene, own, camera, pose, outline, depth)
     share = {
         int(i): _covered(scene, (scene.instance == i) & before, camera, pose, outline)
         for i in np.unique(scene.instance[before])
     }
     things = [i for i, covered in share.items() if i and i not in scene.base and covered > _WHOLE_HIDES]
-    kept = ~(before | (np.isin(scene.instance, things) & ~own))
-    features = rasterize(scene.packed[kept], camera, pose, _SETTINGS).features
+    taken = before | (np.isin(scene.instance, things) & ~own)
+    features = whole
+    if taken.any():
+        touched = rasterize(scene.packed[taken], camera, pose, _SETTINGS).features[..., 7] > 0
+        window = _window_of(touched)
+        if window is not None:
+            features = whole.copy()
+            drawn = rasterize(scene.packed[~taken], _cropped(camera, window), pose, _SETTINGS)
+            features[window] = drawn.features
     opacity = features[..., 7]
     color = features[..., :3] / np.maximum(opacity, 1e-3)[..., None]
     return _uint8(np.where(opacity[..., None] > _OPAQUE, color, 0.0)), _grown(opacity <= _OPAQUE)

@@ -2,7 +2,7 @@
 
 import math
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -25,6 +25,7 @@ _BY_PIXELS = 0.15  # of the ranking of starts; the rest is by what is seen anew
 _SEEN_AT, _CLEAR_SHARE = 0.1, 0.2
 _FRONTS_FROM = 2  # every second input camera tells fronts from backs
 _BETTER = 1.03  # by this factor a start must show more than what the search made of it, to stay
+_LARGE_STEPS = 2 / 3  # of the steps are taken for large targets
 _LEAST_PX = 0.05  # of a Gaussian; less is never a good view of it
 
 
@@ -122,6 +123,7 @@ class ActiveViews:
     def choose(self, scene: ViewScene, target: Target, config: AvoConfig) -> list[Viewpoint]:
         """See `Strategy.choose`."""
         weight = config.depth_weight if self._with_depth else 0.0
+        config = _affordable(config, target)
         coarse = _objective(scene, target, square_camera(config.scan_side_px, config.fov_deg), config)
         fine = _objective(scene, target, square_camera(config.side_px, config.fov_deg), config)
         search = Search(fine, scene.clearance, target.distance_m, weight, config)
@@ -158,6 +160,14 @@ class ActiveViews:
             if coverage.remaining < config.remaining_share:
                 break
         return out
+
+
+def _affordable(config: AvoConfig, target: Target) -> AvoConfig:
+    """Return the settings for a target: coarser and shorter where it is large."""
+    if not 0 < config.large_gaussians < len(target.rows):
+        return config
+    side, steps = min(config.side_px, config.scan_side_px), round(_LARGE_STEPS * config.steps)
+    return replace(config, side_px=side, steps=steps)
 
 
 def _scan(

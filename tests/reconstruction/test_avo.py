@@ -18,6 +18,8 @@ from reconstruction.avo.scene import reach_of
 from reconstruction.avo.search import Search
 from reconstruction.avo.strategies import STRATEGIES, Coverage
 from reconstruction.gaussians.fit import exponential
+from reconstruction.gaussians.model import SH_C0
+from reconstruction.gaussians.rasterizer import RasterSettings, rasterize
 from reconstruction.types import SpaceGrid
 from registry.errors import UsageError
 
@@ -188,6 +190,33 @@ def test_what_a_view_shows(scene):
     assert red.sum() > 1.5 * view.mask.sum()
     green = (view.clean[..., 1] > 150) & (view.clean[..., 0] < 90)
     assert green.sum() < 0.1 * view.mask.sum()
+
+
+def test_only_what_matters_is_drawn(scene, found):
+    """The opacity behind what hides the target is that of a picture of the whole scene."""
+    own = np.isin(np.arange(len(scene.packed)), make_target(scene, room.BOX, QUICK).rows)
+    marked = scene.packed.copy()
+    marked[:, 10:13] = np.where(own[:, None], 0.5, -0.5) / SH_C0
+    frames = find_views(scene, [room.BOX], replace(QUICK, strategy="max-visibility"))[0].views
+    assert min(view.visibility for view in frames) < 0.8  # something is in the way
+    for view in (*frames, *found.views):
+        drawn = rasterize(marked, view.camera, view.world_from_camera, RasterSettings(near=0.02)).features
+        np.testing.assert_allclose(view.alpha, drawn[..., 0], atol=1e-3)
+
+
+def test_large_targets_are_optimized_coarser_and_seen_as_well(scene, found):
+    count = len(make_target(scene, room.BOX, QUICK).rows)
+    (same,) = find_views(scene, [room.BOX], replace(QUICK, large_gaussians=count))
+    (never,) = find_views(scene, [room.BOX], replace(QUICK, large_gaussians=0))
+    for other in (same, never):
+        for a, b in zip(other.views, found.views, strict=True):
+            np.testing.assert_array_equal(a.world_from_camera, b.world_from_camera)
+    large = replace(QUICK, large_gaussians=count - 1)
+    points = STRATEGIES["avo"].choose(scene, make_target(scene, room.BOX, large), large)
+    assert {point.camera.width for point in points} == {QUICK.scan_side_px}
+    (coarse,) = find_views(scene, [room.BOX], large)
+    assert coarse.views[0].visibility > 0.9
+    assert coarse.views[0].color.shape == found.views[0].color.shape
 
 
 def test_views_stop_at_k_and_at_the_remaining_share(scene, found):
