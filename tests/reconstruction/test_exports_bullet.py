@@ -7,9 +7,7 @@ from exports_room import names, solid_box
 from reconstruction.exports import export_scene
 from registry.geometry import quat_from_matrix, transform_points
 
-pybullet = pytest.importorskip(
-    "pybullet", reason="needs simrecon[bullet]"
-)
+pybullet = pytest.importorskip("pybullet", reason="needs simrecon[bullet]")
 
 OWN_INERTIA = pybullet.URDF_USE_INERTIA_FROM_FILE
 _MARGIN_M = 0.004  # that Bullet puts around the box of a convex hull
