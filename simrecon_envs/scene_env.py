@@ -358,6 +358,18 @@ class SceneEnv(BaseEnv):
 
     # ---- Observations.
 
+    def get_obs(self, info: dict | None = None, unflattened: bool = False) -> Any:
+        """Return the observation; ManiSkill's point clouds leave an empty "sensor_data", which Gymnasium forbids."""
+        obs = super().get_obs(info, unflattened)
+        if isinstance(obs, dict) and not obs.get("sensor_data", True):
+            del obs["sensor_data"]
+        return obs
+
+    def get_sensor_params(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Return the cameras' parameters; copies, since whoever gets an observation may keep it."""
+        known = super().get_sensor_params()
+        return {name: {key: value.clone() for key, value in of.items()} for name, of in known.items()}
+
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
         data = super()._get_obs_sensor_data(apply_texture_transforms)
         return self._randomizer.pictures(data, self._batched_episode_rng)
