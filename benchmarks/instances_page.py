@@ -18,6 +18,7 @@ _BREAKDOWNS = {
     "size": "longest side of the object",
     "support": "what it is on",
     "gap": "gap to the nearest neighbor",
+    "seen": "seen in all frames together",
 }
 _HEAD = """# Instances benchmark
 

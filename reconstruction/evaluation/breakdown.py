@@ -1,4 +1,4 @@
-"""Recall by what makes objects hard: their size, what they stand on, how near their neighbors are.
+"""Recall by what makes objects hard: size, what they stand on, how near neighbors are, how well the video shows them.
 
 Takes the records that `simrecon evaluate --json` keeps under `objects` (and under `stages.instances.boxes.objects`), of
 one capture or pooled over many.
@@ -15,6 +15,7 @@ from reconstruction.evaluation.object_facts import SUPPORTS
 
 SIZE_EDGES_CM = (5.0, 10.0, 20.0, 50.0)  # of the longest side; a bin holds its lower edge
 GAP_EDGES_CM = (2.0, 5.0, 10.0, 30.0)  # to the nearest neighbor
+SEEN_EDGES = (10_000.0, 30_000.0, 100_000.0)  # pixels in all frames together
 _Z_95 = 1.959963984540054  # two-sided 95 % of the normal distribution
 _ON = {"floor": "on the floor", "furniture": "on furniture", "thing": "on a thing", "wall": "on a wall"}
 
@@ -57,28 +58,31 @@ def wilson(found: int, count: int, z: float = _Z_95) -> tuple[float, float]:
 
 
 def breakdown(records: Sequence[dict[str, Any]]) -> dict[str, list[Bin]]:
-    """Return recall by "size", "support" and "gap"; bins without an object are left out, the last bin is "all".
+    """Return recall by "size", "support", "gap" and "seen"; empty bins are left out, the last bin is "all".
 
     Args:
-        records: of evaluated true objects, with `longest_side_cm`, `support`, `gap_cm`, `found_25` and `found_50`.
+        records: of evaluated true objects, with `longest_side_cm`, `support`, `gap_cm`, `visible_pixels`, `found_25`
+            and `found_50`.
     """
     sizes = [_bin_name(r["longest_side_cm"], SIZE_EDGES_CM) for r in records]
     gaps = [_bin_name(np.inf if r["gap_cm"] is None else r["gap_cm"], GAP_EDGES_CM) for r in records]
+    seen = [_bin_name(r["visible_pixels"], SEEN_EDGES, "pixels") for r in records]
     return {
         "size": _bins(records, sizes, bin_names(SIZE_EDGES_CM)),
         "support": _bins(records, [_ON[r["support"]] for r in records], [_ON[s] for s in SUPPORTS]),
         "gap": _bins(records, gaps, bin_names(GAP_EDGES_CM)),
+        "seen": _bins(records, seen, bin_names(SEEN_EDGES, "pixels")),
     }
 
 
-def bin_names(edges: Sequence[float]) -> list[str]:
-    """Name the bins between edges in centimetres: below the first, between two, from the last on."""
-    inner = [f"{low:g}–{high:g} cm" for low, high in pairwise(edges)]
-    return [f"< {edges[0]:g} cm", *inner, f"≥ {edges[-1]:g} cm"]
+def bin_names(edges: Sequence[float], unit: str = "cm") -> list[str]:
+    """Name the bins between edges: below the first, between two, from the last on."""
+    inner = [f"{low:,g}–{high:,g} {unit}" for low, high in pairwise(edges)]
+    return [f"< {edges[0]:,g} {unit}", *inner, f"≥ {edges[-1]:,g} {unit}"]
 
 
-def _bin_name(value: float, edges: Sequence[float]) -> str:
-    return bin_names(edges)[int(np.searchsorted(edges, value, side="right"))]
+def _bin_name(value: float, edges: Sequence[float], unit: str = "cm") -> str:
+    return bin_names(edges, unit)[int(np.searchsorted(edges, value, side="right"))]
 
 
 def _bins(records: Sequence[dict[str, Any]], names: Sequence[str], order: Iterable[str]) -> list[Bin]:

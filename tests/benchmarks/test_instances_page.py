@@ -76,7 +76,7 @@ def test_recall_and_precision_are_pooled_over_objects():
     assert (recall.found, recall.count, precision.found, precision.count) == (1, 3, 1, 5)
 
 
-def test_the_page_has_the_pool_the_captures_and_the_three_breakdowns():
+def test_the_page_has_the_pool_the_captures_and_the_four_breakdowns():
     page = render(RESULTS, [], None, CODE)
     # 2 of 3: Wilson's interval is [0.208, 0.939]; 2 of 5: [0.118, 0.769].
     (pool,) = rows(page, "rooms (2)")
@@ -85,7 +85,7 @@ def test_the_page_has_the_pool_the_captures_and_the_three_breakdowns():
     assert rows(page, "10–20 cm") == [["10–20 cm", "1", "0.00 [0.00, 0.79]", "0.00 [0.00, 0.79]"]]
     assert rows(page, "on furniture")[0][2:] == ["1.00 [0.21, 1.00]", "0.00 [0.00, 0.79]"]
     assert rows(page, "< 2 cm")[0][1] == "1"
-    assert [cells[1] for cells in rows(page, "all")] == ["3", "3", "3"]
+    assert [cells[1] for cells in rows(page, "all")] == ["3", "3", "3", "3"]
     assert "Whole scenes" not in page
 
 

@@ -140,12 +140,13 @@ def test_records_say_what_was_found_at_which_overlap(truth):
     assert figures["object_precision_50"] == pytest.approx(1 / 3)
 
 
-def record(side_cm, support, gap_cm, found_25=True, found_50=True):
+def record(side_cm, support, gap_cm, found_25=True, found_50=True, pixels=50_000):
     """Return what the breakdown reads of a record."""
     return {
         "longest_side_cm": side_cm,
         "support": support,
         "gap_cm": gap_cm,
+        "visible_pixels": pixels,
         "found_25": found_25,
         "found_50": found_50,
     }
@@ -153,12 +154,12 @@ def record(side_cm, support, gap_cm, found_25=True, found_50=True):
 
 def test_bins_hold_their_lower_edge_and_every_object_is_in_one():
     records = [
-        record(4.9, "thing", 0.0, False, False),
+        record(4.9, "thing", 0.0, False, False, 9_999),
         record(5.0, "thing", 1.99),
         record(9.99, "furniture", 2.0, True, False),
         record(10.0, "furniture", 7.0, False, False),
         record(50.0, "floor", None),
-        record(120.0, "wall", 10.0),
+        record(120.0, "wall", 10.0, pixels=100_000),
     ]
     tables = {
         name: {b.name: (b.recall_25.found, b.recall_50.found, b.recall_25.count) for b in bins}
@@ -184,6 +185,12 @@ def test_bins_hold_their_lower_edge_and_every_object_is_in_one():
         "5–10 cm": (0, 0, 1),
         "10–30 cm": (1, 1, 1),
         "≥ 30 cm": (1, 1, 1),
+        "all": (4, 3, 6),
+    }
+    assert tables["seen"] == {
+        "< 10,000 pixels": (0, 0, 1),
+        "30,000–100,000 pixels": (3, 2, 4),
+        "≥ 100,000 pixels": (1, 1, 1),
         "all": (4, 3, 6),
     }
     assert len(SIZE_EDGES_CM) == 4
