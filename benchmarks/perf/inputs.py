@@ -1,6 +1,7 @@
 """Fixed inputs of the kernels: small, analytic, the same on every machine."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -118,10 +119,14 @@ def room_registry(folder: Path) -> Path:
     """Write the hand-made room of the environment's tests into a registry; its id is `room`."""
     from registry import SceneRegistry
 
-    place = ROOT / "tests" / "simrecon_envs" / "conftest.py"
-    spec = importlib.util.spec_from_file_location("perf_room", place)
+    tests = ROOT / "tests"
+    spec = importlib.util.spec_from_file_location("perf_room", tests / "simrecon_envs" / "conftest.py")
     fixtures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(fixtures)
+    sys.path.insert(0, str(tests))  # what the tests share lies there
+    try:
+        spec.loader.exec_module(fixtures)
+    finally:
+        sys.path.remove(str(tests))
     writer = fixtures.BundleWriter(folder / "bundle")
     writer.folder.mkdir(parents=True)
     fixtures.add_room(writer)
