@@ -109,7 +109,14 @@ def test_a_command_that_takes_too_long_is_stopped_with_its_children(tmp_path):
     code = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import time; time.sleep(60)'])"
     before = set(psutil.Process().children(recursive=True))
     began = time.perf_counter()
-    exit_code, error = run_command([sys.executable, "-c", code], tmp_path, tmp_path / "log", timeout_s=1.0)
+    # As the command does: what a shell started in the background has Ctrl-C ignored, and so have its children.
+    before_it = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        exit_code, error = run_command(
+            [sys.executable, "-c", code], tmp_path, tmp_path / "log", timeout_s=1.0
+        )
+    finally:
+        signal.signal(signal.SIGINT, before_it or signal.SIG_DFL)
     assert exit_code == 124
     assert "--timeout-s" in error
     assert time.perf_counter() - began < 20
