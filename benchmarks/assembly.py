@@ -22,12 +22,12 @@ import numpy as np
 from benchmarks.assembly_page import write_assembly_page
 from benchmarks.assembly_rooms import room_task
 from benchmarks.captures import Capture, find_captures
+from benchmarks.command import guarded
 from benchmarks.instances import stage_run, work_of
 from benchmarks.machine import ROOT, describe_code, describe_machine
 from benchmarks.table import DEFAULT_OUT
 from reconstruction.assembly import AssemblyConfig, assemble
 from reconstruction.types import AssembledScene, AssetSet, SceneGraph
-from registry.errors import SimReconError
 from registry.geometry import transform_points
 from registry.report_card import failures
 
@@ -171,19 +171,19 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0, or the exit code of what is wrong."""
     arguments = build_parser().parse_args(argv)
+    return guarded("benchmarks.assembly", lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> int:
     out = arguments.out.resolve()
     folder = out / "assembly"
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        captures = find_captures(arguments.captures, arguments.only) if arguments.captures else []
-        if not arguments.page_only:
-            for capture in captures:
-                _keep(folder, measure_capture(capture, out, arguments.methods))
-            for seed in range(arguments.first_room, arguments.first_room + arguments.rooms):
-                _keep(folder, measure_room(seed, objects_of(seed), arguments.methods))
-    except SimReconError as error:
-        print(f"benchmarks.assembly: {error}", file=sys.stderr)
-        return error.exit_code
+    captures = find_captures(arguments.captures, arguments.only) if arguments.captures else []
+    if not arguments.page_only:
+        for capture in captures:
+            _keep(folder, measure_capture(capture, out, arguments.methods))
+        for seed in range(arguments.first_room, arguments.first_room + arguments.rooms):
+            _keep(folder, measure_room(seed, objects_of(seed), arguments.methods))
     kept = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
     write_assembly_page(kept, arguments.page)
     print(f"{arguments.page} is written", flush=True)

@@ -21,11 +21,12 @@ import numpy as np
 
 from benchmarks.avo_page import write_avo_page
 from benchmarks.captures import Capture, find_captures
+from benchmarks.command import guarded
 from benchmarks.instances import stage_run, work_of
 from benchmarks.machine import ROOT, describe_code, describe_machine
 from benchmarks.table import DEFAULT_OUT
 from benchmarks.variants import Variant, choose_variants
-from registry.errors import SimReconError, UsageError
+from registry.errors import UsageError
 
 DEFAULT_PAGE = ROOT / "docs" / "avo_benchmark.md"
 STRATEGY_ORDER = ("avo", "max-visibility", "canonical", "avo-no-depth")
@@ -209,20 +210,14 @@ def _row_picture(row: Sequence[Sequence[Any]]) -> np.ndarray:
     return np.concatenate(cells[:-1], axis=1)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.avo",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_object_arguments(parser: argparse.ArgumentParser, page: Path) -> None:
+    """Add what benchmarks of single objects in captures with truth are told."""
     parser.add_argument(
         "--captures", type=Path, nargs="+", required=True, metavar="DIR", help="with ground truth"
     )
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these captures")
-    parser.add_argument("--variant", default="oracle-instances", metavar="NAME", help="of benchmarks.run")
     parser.add_argument("--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="where results are kept")
-    parser.add_argument("--page", type=Path, default=DEFAULT_PAGE, metavar="FILE", help="the page to write")
+    parser.add_argument("--page", type=Path, default=page, metavar="FILE", help="the page to write")
     parser.add_argument(
         "--pictures", type=int, default=0, metavar="N",
         help="draw the N most hidden objects of each capture for the page: of generated rooms only",
@@ -232,32 +227,49 @@ def build_parser() -> argparse.ArgumentParser:
         help="only objects of which other things hide this share of the outline over the film",
     )  # fmt: skip
     parser.add_argument("--page-only", action="store_true", help="measure nothing")
+
+
+def captures_with_truth(arguments: argparse.Namespace) -> list[Capture]:
+    """Return the captures that the arguments name; UsageError where none has a truth."""
+    captures = [c for c in find_captures(arguments.captures, arguments.only) if c.truth == "scene"]
+    if not captures:
+        raise UsageError("--captures: none of them has a ground truth with scene.json")
+    return captures
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.avo",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_object_arguments(parser, DEFAULT_PAGE)
+    parser.add_argument("--variant", default="oracle-instances", metavar="NAME", help="of benchmarks.run")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0, or the exit code of what is wrong."""
     arguments = build_parser().parse_args(argv)
-    try:
-        captures = [c for c in find_captures(arguments.captures, arguments.only) if c.truth == "scene"]
-        if not captures:
-            raise UsageError("--captures: none of them has a ground truth with scene.json")
-        (variant,) = choose_variants([arguments.variant], [])
-        kept = []
-        for capture in captures:
-            path = arguments.out.resolve() / capture.name / "avo.json"
-            if not arguments.page_only:
-                measured = measure_capture(
-                    capture, variant, arguments.out.resolve(), arguments.pictures, arguments.least_hidden
-                )
-                save_pictures(measured.pop("pictures"), arguments.page, capture.name)
-                path.write_text(json.dumps(measured, indent=1) + "\n")
-            if path.is_file():
-                kept.append(json.loads(path.read_text()))
-        write_avo_page(kept, arguments.page)
-    except SimReconError as error:
-        print(f"benchmarks.avo: {error}", file=sys.stderr)
-        return error.exit_code
+    return guarded("benchmarks.avo", lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    captures = captures_with_truth(arguments)
+    (variant,) = choose_variants([arguments.variant], [])
+    kept = []
+    for capture in captures:
+        path = arguments.out.resolve() / capture.name / "avo.json"
+        if not arguments.page_only:
+            measured = measure_capture(
+                capture, variant, arguments.out.resolve(), arguments.pictures, arguments.least_hidden
+            )
+            save_pictures(measured.pop("pictures"), arguments.page, capture.name)
+            path.write_text(json.dumps(measured, indent=1) + "\n")
+        if path.is_file():
+            kept.append(json.loads(path.read_text()))
+    write_avo_page(kept, arguments.page)
     print(f"{arguments.page} is written", flush=True)
     return 0
 

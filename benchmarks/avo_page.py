@@ -34,17 +34,28 @@ def write_avo_page(kept: Sequence[dict[str, Any]], page: Path) -> None:
         if chosen and not (chosen is records and len(hidden) == len(records)):
             lines += ["", f"## {title} ({len(chosen)})", "", *_strategies(chosen), "", *_wins(chosen)]
     lines += ["", "## Gradient, places, time", "", *_facts(records, kept)]
-    pictures = [
-        one["capture"] for one in kept if (page.parent / "images" / f"avo_{one['capture']}.jpg").is_file()
-    ]
-    if pictures:
-        lines += [
-            "", "## Pictures", "",
-            "The most hidden objects of each room; from the left four views of `avo`, of `max-visibility` and of "
-            "`canonical`. Red: what is seen of the object.",
-        ]  # fmt: skip
-        for name in pictures:
-            lines += ["", f"![Views of things in {name}](images/avo_{name}.jpg)"]
+    words = (
+        "The most hidden objects of each room; from the left four views of `avo`, of `max-visibility` and of "
+        "`canonical`. Red: what is seen of the object."
+    )
+    lines += picture_lines(kept, page, "avo", "Views of things in", words)
+    write_lines(lines, page)
+
+
+def picture_lines(
+    kept: Sequence[dict[str, Any]], page: Path, prefix: str, title: str, words: str
+) -> list[str]:
+    """Return the section of the pictures `images/PREFIX_CAPTURE.jpg` that are there; nothing where there are none."""
+    folder = page.parent / "images"
+    drawn = [one["capture"] for one in kept if (folder / f"{prefix}_{one['capture']}.jpg").is_file()]
+    lines = ["", "## Pictures", "", words] if drawn else []
+    for name in drawn:
+        lines += ["", f"![{title} {name}](images/{prefix}_{name}.jpg)"]
+    return lines
+
+
+def write_lines(lines: Sequence[str], page: Path) -> None:
+    """Write a page, with the folders above it."""
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text("\n".join(lines) + "\n")
 

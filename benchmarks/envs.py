@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from benchmarks.command import guarded
 from benchmarks.machine import describe_machine, machine_line
 from registry import SceneRegistry
-from registry.errors import SimReconError
 
 _IMPORT = "import time, gymnasium; t, c = time.perf_counter(), time.process_time(); import simrecon_envs; " \
     "print(time.perf_counter() - t, time.process_time() - c)"  # fmt: skip
@@ -47,23 +47,23 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=2, help="how often each task is done")
     parser.add_argument("--json", type=Path, default=None, help="where to write the figures")
     arguments = parser.parse_args()
+    return guarded("benchmarks.envs", lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> int:
     import torch
 
     torch.set_num_threads(1)
     out = {"machine": describe_machine(), "robot": arguments.robot, "import_10000": import_time(10_000)}
     print(machine_line(out["machine"]))
     print(f"import with 10,000 scenes: {_both(out['import_10000'])}")
-    try:
-        for scene in arguments.scenes:
-            out[scene] = measure(scene, arguments.registry, arguments.robot, arguments.task)
-            print(f"{scene}: " + ", ".join(f"{key} {value}" for key, value in out[scene].items()))
-            if arguments.tasks:
-                out[scene]["tasks"] = tasks(scene, arguments.registry, arguments.robot, arguments.seeds)
-                done = sum(sum(runs) for runs in out[scene]["tasks"].values())
-                print(f"  scripts: {done} of {arguments.seeds * len(out[scene]['tasks'])} runs")
-    except SimReconError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    for scene in arguments.scenes:
+        out[scene] = measure(scene, arguments.registry, arguments.robot, arguments.task)
+        print(f"{scene}: " + ", ".join(f"{key} {value}" for key, value in out[scene].items()))
+        if arguments.tasks:
+            out[scene]["tasks"] = tasks(scene, arguments.registry, arguments.robot, arguments.seeds)
+            done = sum(sum(runs) for runs in out[scene]["tasks"].values())
+            print(f"  scripts: {done} of {arguments.seeds * len(out[scene]['tasks'])} runs")
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(out, indent=1))
     return 0

@@ -20,15 +20,22 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.avo import STRATEGY_ORDER, instance_of, spread
-from benchmarks.captures import Capture, find_captures
+from benchmarks.avo import (
+    STRATEGY_ORDER,
+    add_object_arguments,
+    captures_with_truth,
+    instance_of,
+    save_pictures,
+    spread,
+)
+from benchmarks.captures import Capture
+from benchmarks.command import guarded
 from benchmarks.generation_page import write_generation_page
 from benchmarks.instances import stage_run, work_of
 from benchmarks.machine import ROOT, describe_code, describe_machine
 from benchmarks.one_view import OneViewServer, Shown
-from benchmarks.table import DEFAULT_OUT
 from benchmarks.variants import choose_variants
-from registry.errors import SimReconError, UsageError
+from registry.errors import SimReconError
 
 DEFAULT_PAGE = ROOT / "docs" / "generation_benchmark.md"
 _HIDDEN_POSES, _PICTURE_PX, _POINTS, _BOUND_M = 20, 170, 30_000, 0.01
@@ -196,47 +203,29 @@ def build_parser() -> argparse.ArgumentParser:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "--captures", type=Path, nargs="+", required=True, metavar="DIR", help="with ground truth"
-    )
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these captures")
-    parser.add_argument("--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="where results are kept")
-    parser.add_argument("--page", type=Path, default=DEFAULT_PAGE, metavar="FILE", help="the page to write")
-    parser.add_argument(
-        "--pictures", type=int, default=0, metavar="N",
-        help="draw the N most hidden objects of each capture for the page: of generated rooms only",
-    )  # fmt: skip
-    parser.add_argument(
-        "--least-hidden", type=float, default=0.0, metavar="SHARE",
-        help="only objects of which other things hide this share of the outline over the film",
-    )  # fmt: skip
-    parser.add_argument("--page-only", action="store_true", help="measure nothing")
+    add_object_arguments(parser, DEFAULT_PAGE)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0, or the exit code of what is wrong."""
-    from benchmarks.avo import save_pictures
-
     arguments = build_parser().parse_args(argv)
-    try:
-        captures = [c for c in find_captures(arguments.captures, arguments.only) if c.truth == "scene"]
-        if not captures:
-            raise UsageError("--captures: none of them has a ground truth with scene.json")
-        out, kept = arguments.out.resolve(), []
-        for capture in captures:
-            path = out / capture.name / "generation.json"
-            if not arguments.page_only:
-                measured = measure_capture(capture, out, arguments.least_hidden, arguments.pictures)
-                drawn = [("", picture) for picture in measured.pop("pictures")]
-                save_pictures(drawn, arguments.page, f"generation_{capture.name}")
-                path.write_text(json.dumps(measured, indent=1) + "\n")
-            if path.is_file():
-                kept.append(json.loads(path.read_text()))
-        write_generation_page(kept, arguments.page)
-    except SimReconError as error:
-        print(f"benchmarks.generation: {error}", file=sys.stderr)
-        return error.exit_code
+    return guarded("benchmarks.generation", lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    captures = captures_with_truth(arguments)
+    out, kept = arguments.out.resolve(), []
+    for capture in captures:
+        path = out / capture.name / "generation.json"
+        if not arguments.page_only:
+            measured = measure_capture(capture, out, arguments.least_hidden, arguments.pictures)
+            drawn = [("", picture) for picture in measured.pop("pictures")]
+            save_pictures(drawn, arguments.page, f"generation_{capture.name}")
+            path.write_text(json.dumps(measured, indent=1) + "\n")
+        if path.is_file():
+            kept.append(json.loads(path.read_text()))
+    write_generation_page(kept, arguments.page)
     print(f"{arguments.page} is written", flush=True)
     return 0
 

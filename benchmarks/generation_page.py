@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.avo_page import picture_lines, write_lines
 from benchmarks.machine import machine_line
 from benchmarks.table import table_lines
 
@@ -39,18 +40,12 @@ def write_generation_page(kept: Sequence[dict[str, Any]], page: Path) -> None:
         "",
         f"Distances in centimeters, F at 1 cm. Measured on {'; '.join(machines)}; commits {commits}.",
     ]
-    folder = page.parent / "images"
-    drawn = [c for c in (one["capture"] for one in kept) if (folder / f"avo_generation_{c}.jpg").is_file()]
-    if drawn:
-        lines += [
-            "", "## Pictures", "",
-            "From the left: the truth, the embedded completion, then for `avo`, `max-visibility`, `canonical` and "
-            "`avo-no-depth` the picture that was sent and what was made of it, unchecked.",
-        ]  # fmt: skip
-        for name in drawn:
-            lines += ["", f"![Completed things in {name}](images/avo_generation_{name}.jpg)"]
-    page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text("\n".join(lines) + "\n")
+    words = (
+        "From the left: the truth, the embedded completion, then for `avo`, `max-visibility`, `canonical` and "
+        "`avo-no-depth` the picture that was sent and what was made of it, unchecked."
+    )
+    lines += picture_lines(kept, page, "avo_generation", "Completed things in", words)
+    write_lines(lines, page)
 
 
 def _table(records: Sequence[dict[str, Any]]) -> list[str]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.command import guarded
 from benchmarks.graph_page import GeometryResult, LyingResult, write_graph_page
 from benchmarks.lying import LyingRelations, TrueRelations
 from benchmarks.machine import ROOT
@@ -30,7 +31,7 @@ from reconstruction.synthetic.procedural import RoomSpec, plan_room, unpainted
 from reconstruction.synthetic.room import Room
 from reconstruction.synthetic.true_assets import true_assets, true_edges
 from reconstruction.types import AssetSet
-from registry.errors import SimReconError, UsageError
+from registry.errors import UsageError
 from registry.geometry import rigid
 
 DEFAULT_PAGE = ROOT / "docs" / "scene_graph_benchmark.md"
@@ -172,24 +173,24 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0, or the exit code of what is wrong."""
     arguments = build_parser().parse_args(argv)
-    try:
-        if min(arguments.rooms, arguments.lying_rooms, arguments.seeds) < 1:
-            raise UsageError("--rooms, --lying-rooms and --seeds must be at least 1")
-        specs = room_specs(arguments.rooms)
-        geometry = []
-        for by in DISTURBANCES:
-            geometry.append(measure_geometry(specs, by))
-            print(f"geometry, {by}: F1 {geometry[-1].f1:.3f}", *geometry[-1].errors, sep="\n  ", flush=True)
-        lies = []
-        chosen = room_specs(arguments.lying_rooms, first_seed=2000)
-        for wrong, missing in LIES:
-            lies += measure_lies(chosen, arguments.seeds, wrong, missing)
-            words = ", ".join(f"{r.merging} {np.mean(r.f1):.3f}" for r in lies[-3:])
-            print(f"{wrong:.0%} wrong, {missing:.0%} missing: {words}", flush=True)
-        write_graph_page(geometry, lies, arguments.lying_rooms, arguments.seeds, arguments.page)
-    except SimReconError as error:
-        print(f"benchmarks.graph: {error}", file=sys.stderr)
-        return error.exit_code
+    return guarded("benchmarks.graph", lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    if min(arguments.rooms, arguments.lying_rooms, arguments.seeds) < 1:
+        raise UsageError("--rooms, --lying-rooms and --seeds must be at least 1")
+    specs = room_specs(arguments.rooms)
+    geometry = []
+    for by in DISTURBANCES:
+        geometry.append(measure_geometry(specs, by))
+        print(f"geometry, {by}: F1 {geometry[-1].f1:.3f}", *geometry[-1].errors, sep="\n  ", flush=True)
+    lies = []
+    chosen = room_specs(arguments.lying_rooms, first_seed=2000)
+    for wrong, missing in LIES:
+        lies += measure_lies(chosen, arguments.seeds, wrong, missing)
+        words = ", ".join(f"{r.merging} {np.mean(r.f1):.3f}" for r in lies[-3:])
+        print(f"{wrong:.0%} wrong, {missing:.0%} missing: {words}", flush=True)
+    write_graph_page(geometry, lies, arguments.lying_rooms, arguments.seeds, arguments.page)
     print(f"{arguments.page} is written", flush=True)
     return 0
 
