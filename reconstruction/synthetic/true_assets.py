@@ -1,7 +1,11 @@
-"""A generated room as the assets of a perfect reconstruction: true meshes at true poses, no hints, no textures."""
+"""A generated room as the assets of a perfect reconstruction: true meshes and masses at true poses, collision parts
+of its own primitives, no hints, no textures.
+"""
 
 import numpy as np
 
+from reconstruction.assembly.base import convex_part
+from reconstruction.synthetic.checks import convex_pieces
 from reconstruction.synthetic.room import Entity, Room
 from reconstruction.types import (
     AssetProvenance,
@@ -16,7 +20,8 @@ from reconstruction.types import (
 from registry.geometry import invert_rigid, transform_points
 
 _TEXTURE = np.full((2, 2, 3), 180, np.uint8)
-_RANGES = PhysicalRanges((1.0, 1.0), (0.5, 0.5), (0.1, 0.1))
+_DENSITY_KG_M3, _FRICTION, _RESTITUTION = 600.0, 0.45, 0.1
+_MIN_MASS_KG = 5e-3
 
 
 def true_assets(room: Room) -> AssetSet:
@@ -43,21 +48,31 @@ def _mesh(entity: Entity, mesh_from_world: np.ndarray) -> TexturedMesh:
 
 
 def _object_asset(entity: Entity) -> ObjectAsset:
-    visual = _mesh(entity, invert_rigid(entity.world_from_object))
-    center = 0.5 * (visual.vertices.min(0) + visual.vertices.max(0)).astype(np.float64)
-    physics = PhysicalAttributes("unknown", 500.0, 1.0, center, 0.01 * np.eye(3), 0.5, 0.1, _RANGES)
+    object_from_world = invert_rigid(entity.world_from_object)
     return ObjectAsset(
         id=entity.id,
         label=entity.label,
         label_confidence=1.0,
         world_from_object=entity.world_from_object,
-        visual=visual,
-        collision=(),
-        physics=physics,
-        provenance=AssetProvenance("true", "none", "none", 1.0),
+        visual=_mesh(entity, object_from_world),
+        collision=tuple(convex_part(transform_points(object_from_world, p)) for p in convex_pieces(entity)),
+        physics=_physics(entity, object_from_world),
+        provenance=AssetProvenance("true", "none", "true", 1.0),
         views=np.zeros(0, np.int32),
         support_hint=0,
         attached_hint=False,
+    )
+
+
+def _physics(entity: Entity, object_from_world: np.ndarray) -> PhysicalAttributes:
+    mesh = entity.mesh()
+    mass = max(_DENSITY_KG_M3 * float(mesh.volume), _MIN_MASS_KG)
+    turn = object_from_world[:3, :3]
+    inertia = turn @ mesh.moment_inertia @ turn.T * (mass / float(mesh.volume))
+    center = transform_points(object_from_world, mesh.center_mass[None])[0]
+    ranges = PhysicalRanges((mass, mass), (_FRICTION, _FRICTION), (_RESTITUTION, _RESTITUTION))
+    return PhysicalAttributes(
+        "wood", _DENSITY_KG_M3, mass, center, 0.5 * (inertia + inertia.T), _FRICTION, _RESTITUTION, ranges
     )
 
 
