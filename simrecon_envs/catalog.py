@@ -80,27 +80,43 @@ def list_tasks(
 
     Args:
         scene: `scene0001` or `SimRecon/scene0001`.
-        robot: A robot of ManiSkill; what it can grip decides.
+        robot: A robot of ManiSkill; what it can grip and reach decides.
         kinds: Only these; all where None.
         hard: With the tasks that something speaks against (their `problems` say what).
         registry: The registry's folder; the default registry where left out.
 
     Raises:
         SceneNotFound: there is no such scene.
-        UsageError: there is no such kind.
+        UsageError: there is no such kind or robot.
+        EnvironmentMissing: the robot's files are not here.
     """
-    from simrecon_envs.tasks import KINDS, list_specs
-    from simrecon_envs.tasks.facts import SceneFacts
+    from simrecon_envs.robots import check_robot
+    from simrecon_envs.tasks import KINDS
+    from simrecon_envs.tasks.facts import scene_facts
 
     chosen = None if kinds is None else tuple([kinds] if isinstance(kinds, str) else kinds)
     wrong = [kind for kind in chosen or () if kind not in KINDS]
     if wrong:
         raise UsageError(f"list_tasks: {wrong[0]!r} is not a kind of task. Kinds: {', '.join(KINDS)}")
+    check_robot(robot)
     name = scene.removeprefix(NAMESPACE + "/")
-    bundle = SceneRegistry(None if registry is None else Path(registry)).load(name)
-    facts = SceneFacts(bundle, robot)
-    specs = list_specs(facts, kinds=chosen, hard=hard)
-    return [
-        TaskEntry(env_id(name, s.name), name, s.name, s.kind, KINDS[s.kind].words(facts, s), s.problems)
-        for s in specs
-    ]
+    facts = scene_facts(SceneRegistry(None if registry is None else Path(registry)).load(name), robot)
+    entries = [entry for kind in KINDS if chosen is None or kind in chosen for entry in _entries(facts, kind)]
+    return [entry for entry in entries if hard or not entry.problems]
+
+
+def _entries(facts: "SceneFacts", kind: str) -> list[TaskEntry]:  # noqa: F821
+    """Return every task of a kind with what speaks against it; kept with the facts."""
+    from simrecon_envs.planning import place_task, without_grip
+    from simrecon_envs.tasks import KINDS, list_specs
+
+    if kind not in facts.listed:
+        entries = []
+        for spec in list_specs(facts, kinds=(kind,), hard=True):
+            problems = spec.problems or without_grip(facts, kind)
+            if not problems and (note := place_task(facts, spec).note):
+                problems = (note,)
+            words, name = KINDS[kind].words(facts, spec), facts.scene_id
+            entries.append(TaskEntry(env_id(name, spec.name), name, spec.name, kind, words, problems))
+        facts.listed[kind] = entries
+    return facts.listed[kind]

@@ -3,6 +3,7 @@
 A task says in its `script` what the hand does, in the words of `Hand`; `Oracle` turns that into actions.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from registry import UsageError
 from simrecon_envs.arrays import numpy
+from simrecon_envs.grasps import Grasp
 
 CONTROL_MODE = "pd_ee_delta_pose"
 _HOVER_M = 0.09
@@ -19,9 +21,11 @@ _MAX_SHARE = 0.35  # of the largest step that the controller takes
 _POSITION_STEP_M, _ROTATION_STEP_RAD = 0.1, 0.1  # what an action of 1 means to pd_ee_delta_pose
 _CLOSE_STEPS, _OPEN_STEPS = 8, 6
 _PATIENCE_STEPS = 60
+_GRIPS = 3
 _LOWER_PATIENCE_STEPS = 35
 _TURN_RAD = 0.06
 _PUSH_SHARE = 0.12
+_LEVER = 1.4  # how high a thing may be pushed, to half its width
 _FINGER_M = 0.022  # half the thickness of closed fingers, along the push
 _TORSO, _FORWARD, _TURN = 9, 10, 11  # places in Fetch's action
 
@@ -70,7 +74,12 @@ class Hand:
         """Start with the hand open where it is."""
         self._env = env
         self._open = True
+        self._opening: float | None = (
+            None  # how far the fingers are apart when open; None for as far as they go
+        )
         self.phase = "start"
+        gripper = env.agent.controller.controllers.get("gripper")
+        self._travel_m = 0.04 if gripper is None else float(gripper.config.upper - gripper.config.lower)
         # Fetch: arm (6), gripper (1), head pan, head tilt, torso lift, then the base forward and turning.
         self._fetch = "torso_lift_joint" in getattr(env.agent, "body_joint_names", ())
 
@@ -86,33 +95,62 @@ class Hand:
 
     # ---- What it does.
 
-    def go(self, goal: Goal, *, within_m: float = 0.012, yaw: float | None = None, base: bool = True,
+    def go(self, goal: Goal, *, within_m: float = 0.012, yaw: Callable[[], float] | None = None, base: bool = True,
            patience: int = _PATIENCE_STEPS, share: float = _MAX_SHARE) -> Iterator[np.ndarray]:  # fmt: skip
-        """Move the fingertips to a point, turned to close along `yaw`; go on after `patience` steps anyway."""
+        """Move the fingertips to a point, turned to close along `yaw()`; go on after `patience` steps anyway."""
         for _ in range(patience):
-            turn = 0.0 if yaw is None else self._turn(yaw)
+            turn = 0.0 if yaw is None else self._turn(yaw())
             if np.linalg.norm(goal() - self.tip()) < within_m and abs(turn) < _TURN_RAD:
                 return
             yield self.step(goal(), turn, base=base, share=share)
 
     def grip(self, key: int) -> Iterator[np.ndarray]:
-        """Reach over a thing, go down around its narrow side and close the fingers."""
-        facts = self._env.facts
-        half = facts.height_m(key) / 2
-        yaw = facts.targets[key].grip_yaw_rad + float(self._env.measures.yaw(key)[0])
-        self._open, self.phase = True, "reach"
-        if self.tip()[2] < self.place(key)[2] + half + _HOVER_M - 0.02:
-            above = np.array([*self.tip()[:2], self.place(key)[2] + half + _HOVER_M])
+        """Reach over a thing, go down where it can be gripped and close the fingers; try another grasp if it slips."""
+        for grasp in (self._env.facts.targets[key].grasps or (self._across(key),))[:_GRIPS]:
+            yield from self._grip(key, grasp)
+            if bool(self._env.measures.held(key)[0]):
+                return
+        self._opening = None
+
+    def _grip(self, key: int, grasp: Grasp) -> Iterator[np.ndarray]:
+        facts, measures = self._env.facts, self._env.measures
+        top = facts.height_m(key) / 2 + _HOVER_M
+
+        def turned() -> float:
+            return float(measures.yaw(key)[0])
+
+        def there() -> np.ndarray:
+            c, s = math.cos(turned()), math.sin(turned())
+            x, y, z = grasp.offset
+            return self.place(key) + np.array([c * x - s * y, s * x + c * y, z])
+
+        def over() -> np.ndarray:
+            return np.array([*there()[:2], self.place(key)[2] + top])
+
+        self._open, self._opening, self.phase = True, grasp.opening_m, "reach"
+        if self.tip()[2] < self.place(key)[2] + top - 0.02:
+            above = np.array([*self.tip()[:2], self.place(key)[2] + top])
             yield from self.go(lambda: above, within_m=0.02, base=False, patience=25)
-        yield from self.go(lambda: self.place(key) + _up(half + _HOVER_M), yaw=yaw)
+        yield from self.go(over, yaw=lambda: grasp.yaw_rad + turned())
         self.phase = "lower"
-        depth = max(half - _GRIP_DEPTH_M, _TIP_CLEARANCE_M - half)
-        # A short gripper meets the target's top with its palm first: then that is deep enough.
-        yield from self.go(
-            lambda: self.place(key) + _up(depth), within_m=0.008, yaw=yaw, patience=_LOWER_PATIENCE_STEPS
-        )
+        # Its own fingers may move it: the way down is to where it was.
+        goal, yaw = there(), grasp.yaw_rad + turned()
+        yield from self.go(lambda: goal, within_m=0.005, yaw=lambda: yaw, patience=_LOWER_PATIENCE_STEPS)
         self.phase, self._open = "grip", False
         yield from self.wait(_CLOSE_STEPS + 1)
+
+    def _across(self, key: int) -> Grasp:
+        """Return the grasp across the whole of a thing that nothing is known of to grip."""
+        facts = self._env.facts
+        target, half = facts.targets[key], facts.height_m(key) / 2
+        depth = max(half - _GRIP_DEPTH_M, _TIP_CLEARANCE_M - half)
+        return Grasp(
+            np.array([0, 0, depth]),
+            target.grip_yaw_rad,
+            target.grip_width_m,
+            facts.traits.hand.opening_m,
+            1.0,
+        )
 
     def lift(self, height_m: float) -> Iterator[np.ndarray]:
         """Raise the hand straight up."""
@@ -137,7 +175,7 @@ class Hand:
 
     def let_go(self) -> Iterator[np.ndarray]:
         """Open the fingers and raise the hand."""
-        self._open, self.phase = True, "let go"
+        self._open, self._opening, self.phase = True, None, "let go"
         yield from self.wait(_OPEN_STEPS)
         yield from self.lift(0.13)
 
@@ -149,11 +187,13 @@ class Hand:
         way = goal() - self.place(key)
         along = np.array([*way[:2], 0.0]) / max(np.linalg.norm(way[:2]), 1e-6)
         low = min(-0.2 * half, half - 0.02) if half > 0.02 else 0.0
+        # Where friction at its foot cannot tip it over.
+        low = min(low, max(_LEVER * facts.targets[key].grip_width_m / 2, 0.03) - half)
         low = max(low, _TIP_CLEARANCE_M + 0.006 - half)
         yaw = float(np.arctan2(along[0], -along[1]))  # the fingers side by side, across the way
         behind = self.place(key) - along * (radius + _FINGER_M + 0.03)
-        yield from self.go(lambda: behind + _up(half + _HOVER_M), yaw=yaw)
-        yield from self.go(lambda: behind + _up(low), yaw=yaw, within_m=0.01, patience=40)
+        yield from self.go(lambda: behind + _up(half + _HOVER_M), yaw=lambda: yaw)
+        yield from self.go(lambda: behind + _up(low), yaw=lambda: yaw, within_m=0.01, patience=40)
         self.phase = "push"
         for _ in range(140):
             left = goal() - self.place(key)
@@ -212,8 +252,14 @@ class Hand:
             action[_TORSO] = np.clip((goal - tip)[2] / _POSITION_STEP_M, -share, share)
             if base:
                 action[_FORWARD] = np.clip(2.0 * self._to_root(goal - tip)[0], -0.15, 0.15)
-        action[6] = 1.0 if self._open else -1.0
+        action[6] = self._fingers()
         return action
+
+    def _fingers(self) -> float:
+        if not self._open or self._opening is None:
+            return 1.0 if self._open else -1.0
+        shut = (self._env.facts.traits.hand.opening_m - self._opening) / 2
+        return float(np.clip(1 - 2 * shut / self._travel_m, -1, 1))
 
     def _wheels(self, forward: float, turn: float) -> np.ndarray:
         action = np.zeros(self._env.single_action_space.shape, np.float32)

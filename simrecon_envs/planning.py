@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from registry import UsageError
-from simrecon_envs.placement import Placement, PlacementConfig, choose_targets, place_robot
-from simrecon_envs.robots import RobotShape
+from simrecon_envs.placement import Placement, choose_targets
+from simrecon_envs.robots import robot_shape
 from simrecon_envs.tasks import KINDS, kind_of, list_specs, parse_task, unknown_task
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -22,14 +22,13 @@ class Plan:
     note: str  # why the task is not what was asked for, or hard
 
 
-def plan_task(facts: SceneFacts, task: str, target: str | int, shape: RobotShape) -> Plan:
+def plan_task(facts: SceneFacts, task: str, target: str | int) -> Plan:
     """Choose the task and the robot's place.
 
     Args:
         facts: The scene, for the robot; its name is "none" where there is no robot.
         task: A kind (the easiest of it is taken), a task's name, or "none".
         target: "auto", or the id or label of what a kind shall be about.
-        shape: The robot's; without points where there is no robot.
 
     Raises:
         UsageError: there is no such task or target; lists what there is.
@@ -37,25 +36,31 @@ def plan_task(facts: SceneFacts, task: str, target: str | int, shape: RobotShape
     if facts.robot == "none":
         return Plan(None, None, "there is no robot" if task != "none" else "")
     if task == "none":
-        return Plan(None, _stand(facts, facts.ranked[:1], shape, []), "")
-    if task != "navigate" and not task.startswith("navigate_") and not shape.has_gripper:
+        return Plan(None, _stand(facts, facts.ranked[:1], []), "")
+    if missing := without_grip(facts, task.split("_")[0]):
         parse_task(facts, task) if task not in KINDS else None
-        note = f"robot {facts.robot!r} cannot tell whether it grasps something"
-        return Plan(None, _stand(facts, facts.ranked[:1], shape, []), note)
+        return Plan(None, _stand(facts, facts.ranked[:1], []), missing[0])
     if task not in KINDS:
-        return _place(facts, parse_task(facts, task), shape)
+        return place_task(facts, parse_task(facts, task))
     if task == "pick" and target == "auto" and not facts.ranked:
-        return Plan(None, _stand(facts, [], shape, []), "nothing in this scene can move")
+        return Plan(None, _stand(facts, [], []), "nothing in this scene can move")
     specs = _of_kind(facts, task, target)
     if not specs:
         raise UsageError(unknown_task(facts, task))
     plans = []
     feasible, hard = ([s for s in specs if s.feasible is wanted] for wanted in (True, False))
     for spec in feasible[:_TRIES] + hard[:_HARD_TRIES]:
-        plans.append(_place(facts, spec, shape))
+        plans.append(place_task(facts, spec))
         if not plans[-1].note:
             return plans[-1]
     return min(plans, key=lambda plan: len(plan.spec.problems) + bool(plan.placement.note))
+
+
+def without_grip(facts: SceneFacts, kind: str) -> tuple[str, ...]:
+    """Return why a robot cannot do a kind of task at all: it does not know what it holds."""
+    if kind == "navigate" or robot_shape(facts.robot).has_gripper:
+        return ()
+    return (f"robot {facts.robot!r} cannot tell whether it grasps something",)
 
 
 def _of_kind(facts: SceneFacts, kind: str, target: str | int) -> list[TaskSpec]:
@@ -72,7 +77,7 @@ def _of_kind(facts: SceneFacts, kind: str, target: str | int) -> list[TaskSpec]:
     return sorted((s for s in specs if s.subject in ids), key=lambda s: ids.index(s.subject))
 
 
-def _place(facts: SceneFacts, spec: TaskSpec, shape: RobotShape) -> Plan:
+def place_task(facts: SceneFacts, spec: TaskSpec) -> Plan:
     """Find where the robot stands for a task."""
     if any(stage.kind == "navigate" for stage in spec.stages):
         raise UsageError(f"task {spec.name!r}: navigate cannot be a stage; make an environment of it alone")
@@ -92,11 +97,10 @@ def _place(facts: SceneFacts, spec: TaskSpec, shape: RobotShape) -> Plan:
             targets = [facts.targets[subject]] if subject in facts.targets else []
         if not targets:
             raise UsageError(f"scene {facts.scene_id}: task {spec.name!r}: {'; '.join(spec.problems)}")
-        placement = _stand(facts, targets, shape, interests)
+        placement = _stand(facts, targets, interests)
     problems = list(dict.fromkeys([*spec.problems, *([placement.note] if placement.note else [])]))
     return Plan(spec, placement, "; ".join(problems))
 
 
-def _stand(facts: SceneFacts, targets: list, shape: RobotShape, interests: list) -> Placement:
-    arguments = (facts.floor_ids, facts.wall_ids, targets, shape, facts.traits, PlacementConfig())
-    return place_robot(facts.solids, *arguments, interests=[goals for goals in interests if len(goals)])
+def _stand(facts: SceneFacts, targets: list, interests: list) -> Placement:
+    return facts.places.find(targets, [goals for goals in interests if len(goals)])

@@ -14,6 +14,22 @@ _SAMPLE_SPACING_M = 0.02
 
 
 @dataclass(frozen=True)
+class HandShape:
+    """A gripper that points down, about the point between its fingers; lengths in metres."""
+
+    opening_m: float
+    """Between the fingers when they are open."""
+    finger_m: tuple[float, float]
+    """A finger's width across and thickness along the closing direction."""
+    tip_below_m: float
+    """How far the fingertips reach below the point between the fingers."""
+    palm_above_m: float
+    """Where the palm is, above that point."""
+    palm_half_m: tuple[float, float]
+    """Half the palm's size along and across the closing direction."""
+
+
+@dataclass(frozen=True)
 class RobotTraits:
     """What placement needs to know of a robot; lengths in metres."""
 
@@ -23,17 +39,20 @@ class RobotTraits:
     """Least, best and greatest horizontal distance from the root to something to grasp."""
     work_height_m: tuple[float, float]
     """Least and greatest height of something to grasp above the root."""
-    gripper_opening_m: float
+    hand: HandShape
     payload_kg: float
     footprint_radius_m: float
 
 
-_ARM = RobotTraits(False, (0.35, 0.50, 0.68), (-0.25, 0.60), 0.08, 3.0, 0.13)
-_SMALL_ARM = RobotTraits(False, (0.15, 0.22, 0.32), (-0.10, 0.20), 0.06, 0.3, 0.08)
+_PANDA_HAND = HandShape(0.08, (0.022, 0.016), 0.0095, 0.037, (0.104, 0.032))
+_FETCH_HAND = HandShape(0.10, (0.026, 0.015), 0.031, 0.032, (0.063, 0.040))
+_SMALL_HAND = HandShape(0.06, (0.020, 0.015), 0.010, 0.035, (0.040, 0.030))
+_ARM = RobotTraits(False, (0.35, 0.50, 0.68), (-0.25, 0.60), _PANDA_HAND, 3.0, 0.13)
+_SMALL_ARM = RobotTraits(False, (0.15, 0.22, 0.32), (-0.10, 0.20), _SMALL_HAND, 0.3, 0.08)
 TRAITS = {
     "panda": _ARM,
     "panda_wristcam": _ARM,
-    "fetch": RobotTraits(True, (0.50, 0.62, 0.85), (0.30, 1.20), 0.10, 3.0, 0.30),
+    "fetch": RobotTraits(True, (0.50, 0.62, 0.85), (0.30, 1.20), _FETCH_HAND, 3.0, 0.30),
     "so100": _SMALL_ARM,
     "koch-v1.1": _SMALL_ARM,
 }

@@ -24,14 +24,13 @@ from simrecon_envs.cameras import room_view
 from simrecon_envs.direct import DirectDrive
 from simrecon_envs.errors import SceneAssetsMissing
 from simrecon_envs.measures import Measures
-from simrecon_envs.occupancy import scene_solids
 from simrecon_envs.placement import Target
 from simrecon_envs.planning import Plan, plan_task
 from simrecon_envs.randomization import Randomization, Randomizer
 from simrecon_envs.robots import RobotShape, check_robot, rest_qpos, robot_shape, traits_of
 from simrecon_envs.scene_builder import SceneBuilder, scene_extent
 from simrecon_envs.tasks import PickTaskConfig, kind_of
-from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.facts import scene_facts
 from simrecon_envs.viewpoints import camera, observing_cameras, parse_cameras
 
 logger = logging.getLogger(__name__)
@@ -144,16 +143,16 @@ class SceneEnv(BaseEnv):
         self.task_config = PickTaskConfig(**task_config) if isinstance(task_config, dict) else task_config
         self.task_config = self.task_config or PickTaskConfig()
         self.pose_noise = (pose_noise, 0.0) if np.isscalar(pose_noise) else tuple(pose_noise)
-        self._solids = scene_solids(self.bundle)
+        self.facts = scene_facts(self.bundle, robot_uids)
+        self._solids = self.facts.solids
         self.builder = SceneBuilder(self.bundle, scene_extent(self._solids))
         self.movable_ids = tuple(body.root for body in self.builder.bodies if body.dynamic)
         self._shape = (
             robot_shape(robot_uids) if robot_uids != "none" else RobotShape(np.zeros((0, 3)), None, False)
         )
-        self.facts = SceneFacts(self.bundle, robot_uids, self._solids)
         self.observe_objects = observe_objects
         self.cameras = parse_cameras(cameras)
-        self._apply(plan_task(self.facts, task, target, self._shape))
+        self._apply(plan_task(self.facts, task, target))
         self.measures: Measures | None = None
         self._drive: DirectDrive | None = None
         self._info: dict[str, Array] = {}

@@ -38,7 +38,7 @@ class Carry(Task):
 
     @classmethod
     def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
-        return [cls._goals(facts, spec)]
+        return [facts.hand_over(spec.subject, cls._goals(facts, spec))]
 
     @classmethod
     def _goals(cls, facts: SceneFacts, spec: TaskSpec) -> np.ndarray:
@@ -48,7 +48,7 @@ class Carry(Task):
     def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
         super().__init__(env, spec, placement)
         goals = self._goals(self.facts, spec)
-        mask = placement.reaches(goals, self.facts.traits)
+        mask = placement.reaches(self.facts.hand_over(spec.subject, goals), self.facts.traits)
         self.goals = (goals[mask] if mask.any() else goals)[:_FREE_CHOICE]
         if not len(self.goals):
             self.goals = self.facts.targets[spec.subject].center[None] * [1, 1, 0]

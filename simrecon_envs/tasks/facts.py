@@ -1,7 +1,9 @@
 """What tasks need to know of a scene: names, sizes, who carries whom, where there is room. NumPy only."""
 
+import copy
 import functools
 import re
+from collections import OrderedDict
 
 import numpy as np
 
@@ -9,18 +11,19 @@ from registry import SceneBundle
 from registry.welding import moving_ids, welded_to
 from simrecon_envs.occupancy import ConvexSolid, scene_solids
 from simrecon_envs.placement import PlacementConfig, Target, candidate_targets
-from simrecon_envs.robots import RobotTraits, traits_of
+from simrecon_envs.robots import RobotTraits, robot_shape, traits_of
+from simrecon_envs.standing import Places
 from simrecon_envs.surfaces import Container, find_container, free_spots
 
 
 class SceneFacts:
     """A bundle as tasks see it, for one robot; what is expensive is measured when it is asked for."""
 
-    def __init__(self, bundle: SceneBundle, robot: str, solids: list[ConvexSolid] | None = None) -> None:
+    def __init__(self, bundle: SceneBundle, robot: str) -> None:
         """Read the graph and measure the things that can move."""
         self.bundle = bundle
         self.scene_id: str = bundle.scene["id"]
-        self.solids = scene_solids(bundle) if solids is None else solids
+        self.solids: list[ConvexSolid] = scene_solids(bundle)
         self.robot = robot
         self.traits: RobotTraits = traits_of(robot)
         self.movable = sorted(moving_ids(bundle) - welded_to(bundle).keys())
@@ -36,8 +39,15 @@ class SceneFacts:
         )
         self.targets = {target.id: target for target in self.ranked}
         self.names = _names(bundle)
+        self.listed: dict[str, list] = {}  # what `catalog` found, by kind
         self._containers: dict[int, Container | None] = {}
         self._spots: dict[tuple, np.ndarray] = {}
+
+    @functools.cached_property
+    def places(self) -> Places:
+        """Return where the robot may stand."""
+        shape = robot_shape(self.robot)
+        return Places(self.solids, self.floor_ids, self.wall_ids, shape, self.traits, PlacementConfig())
 
     @functools.cached_property
     def carriers(self) -> list[int]:
@@ -71,6 +81,12 @@ class SceneFacts:
         """Return how high a movable object is."""
         return self.targets[key].top_m - self.targets[key].bottom_m
 
+    def hand_over(self, key: int, bottoms: np.ndarray) -> np.ndarray:
+        """Return where the hand is (k, 3) that holds a thing whose box's bottom is at (k, 3)."""
+        target = self.targets[key]
+        lift = target.grasps[0].offset[2] if target.grasps else 0.0
+        return bottoms + np.array([0, 0, self.height_m(key) / 2 + lift])
+
     def spots(self, support: int, subject: int) -> np.ndarray:
         """Return where on a support the subject can stand (k, 3), the roomiest first."""
         key = (support, subject)
@@ -94,6 +110,22 @@ class SceneFacts:
         if label == "unknown":
             return f"object {key}"
         return label if len(same) == 1 or key in self.floor_ids else f"{label} {key}"
+
+
+_known: OrderedDict[tuple[str, str, str], SceneFacts] = OrderedDict()
+_KEPT = 8
+
+
+def scene_facts(bundle: SceneBundle, robot: str) -> SceneFacts:
+    """Return the facts of a scene for a robot; the last few are kept, since tasks and environments ask again."""
+    key = (str(bundle.root), bundle.revision, robot)
+    if key not in _known:
+        # A copy holds no lease on the folder: nothing is read from it later on.
+        _known[key] = SceneFacts(copy.copy(bundle), robot)
+    _known.move_to_end(key)
+    while len(_known) > _KEPT:
+        _known.popitem(last=False)
+    return _known[key]
 
 
 def _names(bundle: SceneBundle) -> dict[str, int]:

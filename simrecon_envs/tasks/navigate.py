@@ -1,5 +1,6 @@
 """Navigate: drive to an object and stand before it, facing it. For robots that drive."""
 
+import functools
 from collections import deque
 from collections.abc import Iterator
 
@@ -56,7 +57,7 @@ class Navigate(Task):
     @classmethod
     def plan(cls, facts: SceneFacts, spec: TaskSpec) -> Placement:
         """Return a place before the object that the robot can drive to; the note says where there is none."""
-        floor = FloorPlan(facts)
+        floor = floor_plan(facts)
         item = next(o for o in facts.bundle.objects if o.id == spec.subject)
         target = describe_target(facts.bundle, item, facts.solids)
         near = floor.near(outline(facts, spec.subject))
@@ -68,7 +69,7 @@ class Navigate(Task):
 
     def __init__(self, env: object, spec: TaskSpec, placement: Placement) -> None:
         super().__init__(env, spec, placement)
-        self.floor = FloorPlan(self.facts)
+        self.floor = floor_plan(self.facts)
         self._outline = outline(self.facts, spec.subject)
         self.near = self.floor.near(self._outline)
         self.starts = self.floor.starts(self.near)
@@ -137,6 +138,12 @@ class Navigate(Task):
         here = numpy(self._base()[0])[0]
         point = self._outline[np.argmin(np.linalg.norm(self._outline - here, axis=1))]
         return point if np.linalg.norm(point - here) > 0.3 else middle
+
+
+@functools.lru_cache(maxsize=4)
+def floor_plan(facts: SceneFacts) -> "FloorPlan":
+    """Return where a scene's robot can drive; the last few are kept."""
+    return FloorPlan(facts)
 
 
 class FloorPlan:

@@ -13,7 +13,8 @@ from simrecon_envs.tasks.spec import TaskSpec
 WITHIN_M = 0.035
 _DISTANCES_M = (0.10, 0.20)
 _UPRIGHT = 0.94
-_MAX_PUSHED_KG = 3.0
+_MAX_PUSHED_KG = 5.0
+_SLIM = 1.7  # times as high as wide
 
 
 class Push(Task):
@@ -32,7 +33,7 @@ class Push(Task):
             problems.append("something stands on it or hangs from it")
         if height < 0.03:
             problems.append(f"only {1000 * height:.0f} mm high")
-        if height > 2.2 * target.grip_width_m:
+        if height > _SLIM * target.grip_width_m:
             problems.append("so slim that it tips over")
         if facts.mass_kg[subject] > _MAX_PUSHED_KG:
             problems.append(f"weighs {facts.mass_kg[subject]:.1f} kg")

@@ -84,7 +84,11 @@ class Rearrange(Task):
 
     @classmethod
     def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
-        return [facts.targets[key].center[None] for key in chosen_things(facts)[:1]]
+        return [
+            goals
+            for key in chosen_things(facts)[:1]
+            for goals in (facts.targets[key].center[None], _moves(facts, key))
+        ]
 
     def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
         super().__init__(env, spec, placement)
@@ -159,9 +163,10 @@ def chosen_things(facts: SceneFacts) -> list[int]:
 
 
 def displaced(facts: SceneFacts, key: int, placement: object) -> np.ndarray:
-    """Return where a thing may be moved to on its support (k, 3), within the robot's reach."""
+    """Return where a thing may be moved to on its support (k, 3): within the robot's reach, if anything is."""
     moves = _moves(facts, key)
-    return moves[placement.reaches(moves, facts.traits)][:48]
+    within = placement.reaches(moves, facts.traits)
+    return (moves[within] if within.any() else moves)[:48]
 
 
 def _moves(facts: SceneFacts, key: int) -> np.ndarray:

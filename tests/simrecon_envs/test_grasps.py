@@ -1,0 +1,69 @@
+"""Where a gripper can take hold of a thing: across it, at its neck, by its wall, and not where there is no room."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from simrecon_envs.grasps import Grasp, find_grasps
+from simrecon_envs.occupancy import ConvexSolid, convex_solid
+from simrecon_envs.robots import TRAITS
+
+HAND = TRAITS["panda"].hand
+
+
+def _box(owner: int, size: tuple, at: tuple) -> ConvexSolid:
+    mesh = trimesh.creation.box(size).apply_translation([at[0], at[1], at[2] + size[2] / 2])
+    return convex_solid(owner, "made", np.asarray(mesh.vertices))
+
+
+def _cylinder(owner: int, radius: float, height: float, bottom: float) -> ConvexSolid:
+    mesh = trimesh.creation.cylinder(radius, height, sections=32)
+    return convex_solid(owner, "made", np.asarray(mesh.vertices) + [0, 0, bottom + height / 2])
+
+
+def _grasps(solids: list[ConvexSolid], mass_kg: float = 0.3) -> list[Grasp]:
+    cloud = np.concatenate([s.vertices for s in solids if s.owner == 1])
+    center = (cloud.min(axis=0) + cloud.max(axis=0)) / 2
+    return find_grasps([_box(0, (2, 2, 0.1), (0, 0, -0.1)), *solids], 1, center, mass_kg, center, HAND)
+
+
+def test_a_narrow_box_is_gripped_across_its_middle() -> None:
+    best = _grasps([_box(1, (0.16, 0.05, 0.10), (0.02, 0.01, 0))])[0]
+    assert best.yaw_rad == pytest.approx(np.pi / 2)
+    assert best.width_m == pytest.approx(0.05, abs=0.006)
+    np.testing.assert_allclose(best.offset[:2], 0, atol=0.008)
+    assert best.opening_m <= HAND.opening_m
+
+
+def test_a_vase_is_gripped_at_its_neck_and_a_plain_one_of_that_width_is_not() -> None:
+    body = _cylinder(1, 0.05, 0.12, 0)
+    best = _grasps([body, _cylinder(1, 0.02, 0.06, 0.12)])[0]
+    assert best.width_m == pytest.approx(0.04, abs=0.008)
+    assert best.offset[2] > 0.12 + 0.005 - 0.09  # above its body
+    assert _grasps([body]) == []
+
+
+def test_an_open_box_is_gripped_by_a_wall_with_a_finger_on_each_side() -> None:
+    wide, high, thick = 0.20, 0.08, 0.008
+    side = (wide - thick) / 2
+    parts = [_box(1, (wide, wide, thick), (0, 0, 0))]
+    parts += [_box(1, (thick, wide, high), (s * side, 0, 0)) for s in (-1, 1)]
+    parts += [_box(1, (wide, thick, high), (0, s * side, 0)) for s in (-1, 1)]
+    grasps = _grasps(parts)
+    assert {round(g.yaw_rad, 3) for g in grasps} >= {0.0, round(np.pi / 2, 3)}
+    for grasp in grasps:
+        assert np.abs(grasp.offset[:2]).max() == pytest.approx(side, abs=0.012)
+        assert grasp.width_m < 0.03
+    assert _grasps(parts, mass_kg=3.0) == []  # it would turn out of the hand
+    assert _grasps([_box(1, (wide, wide, high), (0, 0, 0))]) == []  # a solid one has no wall
+
+
+def test_fingers_and_palm_need_room() -> None:
+    box = _box(1, (0.05, 0.05, 0.05), (0, 0, 0))
+    assert _grasps([box])
+    close = [_box(2, (0.05, 0.05, 0.05), (x, y, 0)) for x, y in ((0.06, 0), (-0.06, 0), (0, 0.06), (0, -0.06))]
+    assert _grasps([box, *close]) == []
+    tall = _box(2, (0.05, 0.4, 0.30), (0.065, 0, 0))  # room for a finger, along y only; none for the palm across it
+    for grasp in _grasps([box, tall]):
+        assert abs(np.cos(grasp.yaw_rad)) < 0.5
+    assert _grasps([box, _box(2, (0.3, 0.3, 0.02), (0, 0, 0.10))]) == []  # under a shelf board
