@@ -18,7 +18,8 @@ def _box(owner: int, size: tuple, at: tuple) -> ConvexSolid:
 
 def _cylinder(owner: int, radius: float, height: float, bottom: float) -> ConvexSolid:
     mesh = trimesh.creation.cylinder(radius, height, sections=32)
-    return convex_solid(owner, "made", np.asarray(mesh.vertices) + [0, 0, bottom + height / 2])
+    mesh.apply_translation([0, 0, bottom + height / 2])
+    return convex_solid(owner, "made", np.asarray(mesh.vertices))
 
 
 def _grasps(solids: list[ConvexSolid], mass_kg: float = 0.3) -> list[Grasp]:
@@ -61,9 +62,13 @@ def test_an_open_box_is_gripped_by_a_wall_with_a_finger_on_each_side() -> None:
 def test_fingers_and_palm_need_room() -> None:
     box = _box(1, (0.05, 0.05, 0.05), (0, 0, 0))
     assert _grasps([box])
-    close = [_box(2, (0.05, 0.05, 0.05), (x, y, 0)) for x, y in ((0.06, 0), (-0.06, 0), (0, 0.06), (0, -0.06))]
+    close = [
+        _box(2, (0.05, 0.05, 0.05), (x, y, 0)) for x, y in ((0.06, 0), (-0.06, 0), (0, 0.06), (0, -0.06))
+    ]
     assert _grasps([box, *close]) == []
-    tall = _box(2, (0.05, 0.4, 0.30), (0.065, 0, 0))  # room for a finger, along y only; none for the palm across it
+    tall = _box(
+        2, (0.05, 0.4, 0.30), (0.065, 0, 0)
+    )  # room for a finger, along y only; none for the palm across it
     for grasp in _grasps([box, tall]):
         assert abs(np.cos(grasp.yaw_rad)) < 0.5
     assert _grasps([box, _box(2, (0.3, 0.3, 0.02), (0, 0, 0.10))]) == []  # under a shelf board
