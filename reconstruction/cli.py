@@ -25,7 +25,16 @@ a first run:
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the parser of all verbs."""
-    from reconstruction.commands import doctor, evaluate, export, marker, reconstruct, report, scenes
+    from reconstruction.commands import (
+        benchmark,
+        doctor,
+        evaluate,
+        export,
+        marker,
+        reconstruct,
+        report,
+        scenes,
+    )
 
     parser = argparse.ArgumentParser(
         prog="simrecon",
@@ -41,6 +50,7 @@ def build_parser() -> argparse.ArgumentParser:
     report.add_parser(verbs)
     export.add_parser(verbs)
     marker.add_parser(verbs)
+    benchmark.add_parser(verbs)
     doctor.add_parser(verbs)
     return parser
 

@@ -1,6 +1,8 @@
 """Pictures and videos of an environment: for the demo, the command line and people."""
 
+import contextlib
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +67,22 @@ def record_rollout(
         env.close()
 
 
-def _record(env: gym.Env, out_mp4: Path, steps: int, policy: str, seed: int) -> dict[str, Any]:
+@contextlib.contextmanager
+def open_video(out_mp4: Path, fps: int) -> Iterator[Callable[[np.ndarray], None]]:
+    """Yield what adds a picture (h, w, 3) uint8 to a video, which is written whole or not at all."""
     import imageio.v2 as imageio
 
+    out_mp4.parent.mkdir(parents=True, exist_ok=True)
+    partial = out_mp4.with_name(f".{out_mp4.stem}-{os.getpid()}.mp4")
+    try:
+        with imageio.get_writer(partial, fps=fps, codec="libx264", macro_block_size=2) as video:
+            yield video.append_data
+        os.replace(partial, out_mp4)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _record(env: gym.Env, out_mp4: Path, steps: int, policy: str, seed: int) -> dict[str, Any]:
     scene_env = env.unwrapped
     env.reset(seed=seed)
     env.action_space.seed(seed)
@@ -75,26 +90,18 @@ def _record(env: gym.Env, out_mp4: Path, steps: int, policy: str, seed: int) -> 
         policy = "random"
     script = Oracle(scene_env) if policy == "scripted" else None
     still = np.zeros(env.action_space.shape, np.float32)
-    out_mp4.parent.mkdir(parents=True, exist_ok=True)
-    partial = out_mp4.with_name(f".{out_mp4.stem}-{os.getpid()}.mp4")
     total, success = 0.0, False
-    try:
-        with imageio.get_writer(
-            partial, fps=scene_env.control_freq, codec="libx264", macro_block_size=2
-        ) as video:
-            video.append_data(_picture(env))
-            for _ in range(steps):
-                if script is not None:
-                    action = script.action()
-                else:
-                    action = env.action_space.sample() if policy == "random" else still
-                _, reward, _, _, info = env.step(action)
-                total += float(reward)
-                success = success or bool(info.get("success", False))
-                video.append_data(_picture(env))
-        os.replace(partial, out_mp4)
-    finally:
-        partial.unlink(missing_ok=True)
+    with open_video(out_mp4, scene_env.control_freq) as add:
+        add(_picture(env))
+        for _ in range(steps):
+            if script is not None:
+                action = script.action()
+            else:
+                action = env.action_space.sample() if policy == "random" else still
+            _, reward, _, _, info = env.step(action)
+            total += float(reward)
+            success = success or bool(info.get("success", False))
+            add(_picture(env))
     return {
         "steps": steps,
         "success": success,

@@ -1,0 +1,228 @@
+"""Scenes -> a suite of tasks that can be done and are not done by themselves."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from registry import SceneRegistry, UsageError
+from simrecon_envs.benchmark.candidates import SEQUENCE, Candidate, check_kinds, composites, scene_candidates
+from simrecon_envs.benchmark.files import Records, versions
+from simrecon_envs.benchmark.parallel import Workers
+from simrecon_envs.benchmark.proof import Proof, ProofSettings, prove, registry_text
+from simrecon_envs.benchmark.reporting import Reporter
+from simrecon_envs.benchmark.splits import side_of
+from simrecon_envs.benchmark.suite import LeftOut, OracleRun, Suite, SuiteTask
+from simrecon_envs.randomization import Randomization
+from simrecon_envs.robots import check_robot
+
+_COMPOSITE_SHARE = 5  # one task in so many may be a composite
+DEFAULT_RANDOMIZE = {"shift_m": 0.03, "turn_rad": 0.3}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerateConfig:
+    """What a suite is made of. The same values and scenes give the same suite, whatever `jobs` is."""
+
+    kinds: tuple[str, ...] = ()
+    """Kinds of tasks; all where empty."""
+    robots: tuple[str, ...] = ("panda", "fetch")
+    per_scene: int = 30
+    """Most tasks of a scene."""
+    seeds: int = 5
+    """Episodes of a task."""
+    seed: int = 0
+    """Of the episodes' seeds."""
+    test_share: float = 0.2
+    """Share of scenes and of objects on the side "test"."""
+    randomize: dict | str | None = None
+    """What differs from episode to episode; None: poses by up to 3 cm and 0.3 rad. "none": only goals and starts."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.per_scene < 1 or self.seeds < 1:
+            raise UsageError(f"--per-scene {self.per_scene}, --seeds {self.seeds}: expected at least 1")
+        if not 0 <= self.test_share <= 1:
+            raise UsageError(f"--test-share {self.test_share}: expected a number between 0 and 1")
+        for robot in self.robots:
+            check_robot(robot)
+
+    def randomization(self) -> dict[str, float]:
+        """Return what differs, without what does not."""
+        wanted = DEFAULT_RANDOMIZE if self.randomize is None else self.randomize
+        return {key: value for key, value in asdict(Randomization.parse(wanted)).items() if value}
+
+
+def generate_suite(
+    scenes: list[str],
+    config: GenerateConfig,
+    *,
+    registry: Path | None = None,
+    jobs: int = 1,
+    records: Records | None = None,
+    reporter: Reporter | None = None,
+) -> Suite:
+    """Prove tasks in scenes.
+
+    Args:
+        scenes: Ids of scenes; all of the registry where empty.
+        config: What is wanted.
+        registry: The registry's folder; the default registry where None.
+        jobs: How many processes.
+        records: Where proofs are kept and found; a run that was killed goes on with them.
+        reporter: Is told what happens.
+
+    Raises:
+        UsageError: scenes are missing (all that are), or nothing could be proven.
+    """
+    reporter = reporter or Reporter(quiet=True)
+    kinds = check_kinds(config.kinds)
+    names = check_scenes(scenes, registry)
+    settings = ProofSettings(seed=config.seed, seeds=config.seeds, randomize=config.randomization(),
+                             registry=registry_text(registry))  # fmt: skip
+    tasks: list[SuiteTask] = []
+    left_out: list[LeftOut] = []
+    with Workers(jobs) as workers:
+        prover = _Prover(workers, settings, records, reporter)
+        for scene in names:
+            reporter.start(0, f"scene {scene}")
+            proven = list(_of_scene(scene, kinds, config, registry, prover, left_out))
+            tasks += [_task(candidate, proof, config.test_share) for candidate, proof in proven]
+            counts = Counter(candidate.kind for candidate, _ in proven)
+            found = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+            reporter.note(f"scene {scene}: {len(proven)} tasks{': ' + found if found else ''}")
+    if not tasks:
+        reasons = "; ".join(f"{one.scene} {one.task} ({one.robot}): {one.reason}" for one in left_out[:5])
+        raise UsageError(
+            f"no task in {', '.join(names)} could be proven: {reasons or 'nothing in them can be done'}"
+        )
+    return Suite(
+        tasks=tuple(tasks),
+        left_out=tuple(left_out),
+        options=settings.options(),
+        settings={"kinds": list(kinds), "robots": list(config.robots), "per_scene": config.per_scene,
+                  "seeds": config.seeds, "seed": config.seed, "test_share": config.test_share},
+        made_with=versions(),
+    )  # fmt: skip
+
+
+def check_scenes(scenes: list[str], registry: Path | None) -> list[str]:
+    """Return the scenes without repetition, all of the registry where none is named.
+
+    Raises:
+        UsageError: lists what is missing, and what there is.
+    """
+    catalog = SceneRegistry(registry)
+    known = list(catalog.revisions())
+    wanted = list(dict.fromkeys(scene.removeprefix("SimRecon/") for scene in scenes)) or known
+    missing = [scene for scene in wanted if scene not in known]
+    if missing:
+        there = ", ".join(known[:10]) + (f" and {len(known) - 10} more" if len(known) > 10 else "")
+        raise UsageError(
+            f"{len(missing)} of {len(wanted)} scenes are not in the registry {catalog.root}: {', '.join(missing)}. "
+            f"There are: {there or 'none'}. Name another with --registry, or make one with `simrecon reconstruct VIDEO`"
+        )
+    if not wanted:
+        raise UsageError(
+            f"the registry {catalog.root} is empty; make a scene with `simrecon reconstruct VIDEO`"
+        )
+    return wanted
+
+
+class _Prover:
+    """Proves candidates, some at a time, and remembers."""
+
+    def __init__(
+        self, workers: Workers, settings: ProofSettings, records: Records | None, reporter: Reporter
+    ) -> None:
+        self._workers, self._settings, self._records, self._reporter = workers, settings, records, reporter
+        versions_ = versions()
+        self._frame = {"versions": versions_, "options": settings.options(), "seed": settings.seed,
+                       "seeds": settings.seeds}  # fmt: skip
+
+    def __call__(self, candidates: list[Candidate]) -> list[Proof]:
+        """Return the proofs, in the candidates' order."""
+        proofs: dict[int, Proof] = {}
+        for number, candidate in enumerate(candidates):
+            record = self._records.get(self._key(candidate)) if self._records else None
+            if record is not None:
+                proofs[number] = _proof(record)
+        open_ = [number for number in range(len(candidates)) if number not in proofs]
+        for place, proof in self._workers.map(prove, [candidates[n] for n in open_], self._settings):
+            candidate = candidates[open_[place]]
+            proofs[open_[place]] = proof
+            if self._records:
+                self._records.put(self._key(candidate), asdict(proof))
+            how = proof.reason or f"{len(proof.oracle)} episodes, {max(r.steps for r in proof.oracle)} steps"
+            if not candidate.problems:
+                self._reporter.done(f"{candidate.task} ({candidate.robot}): {how}")
+        return [proofs[number] for number in range(len(candidates))]
+
+    def _key(self, candidate: Candidate) -> dict:
+        return {**self._frame, **asdict(candidate)}
+
+
+def _of_scene(
+    scene: str,
+    kinds: tuple[str, ...],
+    config: GenerateConfig,
+    registry: Path | None,
+    prover: _Prover,
+    left_out: list[LeftOut],
+) -> Iterator[tuple[Candidate, Proof]]:
+    """Yield what is proven of a scene; the rest goes to `left_out`."""
+    reserve = config.per_scene // _COMPOSITE_SHARE if SEQUENCE in kinds else 0
+    singles = scene_candidates(scene, config.robots, kinds, registry)
+    found = list(_take(singles, config.per_scene - reserve, prover, left_out))
+    yield from found
+    if reserve:
+        pairs = list(composites([candidate for candidate, _ in found], most=reserve))
+        yield from _take(pairs, config.per_scene - len(found), prover, left_out)
+
+
+def _take(
+    candidates: list[Candidate], most: int, prover: _Prover, left_out: list[LeftOut]
+) -> Iterator[tuple[Candidate, Proof]]:
+    """Yield the first `most` that are proven. As many are tried at once as are wanting, so that jobs change nothing."""
+    taken, position = 0, 0
+    while position < len(candidates) and taken < most:
+        batch = candidates[position : position + most - taken]
+        position += len(batch)
+        for candidate, proof in zip(batch, prover(batch), strict=True):
+            if proof.reason:
+                left_out.append(_left(candidate, proof.reason))
+            else:
+                taken += 1
+                yield candidate, proof
+    for candidate in candidates[position:]:
+        reason = "; ".join(candidate.problems) or f"not tried: the scene has {most} such tasks without it"
+        left_out.append(_left(candidate, reason))
+
+
+def _left(candidate: Candidate, reason: str) -> LeftOut:
+    return LeftOut(scene=candidate.scene, robot=candidate.robot, task=candidate.task, kind=candidate.kind,
+                   reason=reason)  # fmt: skip
+
+
+def _task(candidate: Candidate, proof: Proof, test_share: float) -> SuiteTask:
+    objects = tuple(f"{candidate.scene}/{key}" for key in candidate.objects)
+    sides = {side_of(name, test_share) for name in objects}
+    return SuiteTask(
+        name=candidate.name,
+        env_id=candidate.env_id,
+        scene=candidate.scene,
+        revision=candidate.revision,
+        task=candidate.task,
+        kind=candidate.kind,
+        robot=candidate.robot,
+        instruction=proof.instruction,
+        max_steps=proof.max_steps,
+        objects=objects,
+        scene_side=side_of(candidate.scene, test_share),
+        object_side="test" if "test" in sides else "train",
+        oracle=proof.oracle,
+    )
+
+
+def _proof(record: dict) -> Proof:
+    return Proof(**{**record, "oracle": tuple(OracleRun(**run) for run in record["oracle"])})

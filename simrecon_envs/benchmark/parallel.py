@@ -1,0 +1,51 @@
+"""The same function on many things, in one process or in several; each has one thread."""
+
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any
+
+from registry import UsageError
+
+
+class Workers:
+    """Up to `jobs` processes that stay; one job runs here. Use as a context."""
+
+    def __init__(self, jobs: int) -> None:
+        if jobs < 1:
+            raise UsageError(f"--jobs {jobs}: expected at least 1")
+        self.jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> "Workers":
+        """Start; processes begin with the first work."""
+        one_thread()
+        if self.jobs > 1:
+            # A simulator must not be forked, so every process starts afresh.
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=one_thread)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """End the processes; what was not begun is dropped."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def map(
+        self, function: Callable[..., Any], items: Sequence[Any], *arguments: Any
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield (number, function(item, *arguments)) as they are done."""
+        if self._pool is None:
+            for number, item in enumerate(items):
+                yield number, function(item, *arguments)
+            return
+        futures = {self._pool.submit(function, item, *arguments): n for n, item in enumerate(items)}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+
+
+def one_thread() -> None:
+    """Keep torch to one thread: its arrays are small, and episodes must not differ with the machine."""
+    import torch
+
+    torch.set_num_threads(1)

@@ -1,0 +1,124 @@
+"""The proof that a task belongs into a suite: the oracle does it from every seed, and doing nothing does not."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from registry import SimReconError
+from simrecon_envs.benchmark.candidates import Candidate
+from simrecon_envs.benchmark.episodes import Episode, run_episode
+from simrecon_envs.benchmark.policies import CONTROL_MODE, OraclePolicy, StillPolicy
+from simrecon_envs.benchmark.splits import episode_seed
+from simrecon_envs.benchmark.suite import OracleRun
+from simrecon_envs.randomization import Randomization
+
+# Every episode builds the scene anew: PhysX remembers contacts, and a run must not depend on the runs before it.
+OPTIONS = {"reconfiguration_freq": 1}
+_ORACLE_HORIZON = 2.0  # times the usual steps: what the oracle gets
+_SLACK = 1.5  # times the oracle's longest run: what a policy gets at least
+_STEPS_UNIT = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProofSettings:
+    """How tasks are proven."""
+
+    seed: int = 0
+    seeds: int = 5
+    randomize: dict[str, float] = field(default_factory=dict)
+    registry: str | None = None
+
+    def options(self) -> dict[str, Any]:
+        """Return the suite's keyword arguments of `gym.make`."""
+        return {**OPTIONS, **({"randomize": self.randomize} if self.randomize else {})}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proof:
+    """What came of a candidate; `reason` is empty where it is proven."""
+
+    reason: str
+    instruction: str = ""
+    max_steps: int = 0
+    oracle: tuple[OracleRun, ...] = ()
+
+
+def prove(candidate: Candidate, settings: ProofSettings) -> Proof:
+    """Try a candidate. Every error of it is a reason to leave it out: one task must not end a long run."""
+    if candidate.problems:
+        return Proof(reason="; ".join(candidate.problems))
+    from simrecon_envs.registration import make_cpu
+
+    options = {**settings.options(), "robot_uids": candidate.robot, "control_mode": CONTROL_MODE}
+    try:
+        env = make_cpu(candidate.env_id, registry=settings.registry, **options)
+    except SimReconError as error:
+        return Proof(reason=str(error))
+    except Exception as error:
+        return Proof(reason=f"defect: making it failed with {type(error).__name__}: {error}")
+    try:
+        return _prove(env, candidate, settings)
+    finally:
+        env.close()
+
+
+def _prove(env: gym.Env, candidate: Candidate, settings: ProofSettings) -> Proof:
+    scene = env.unwrapped
+    if scene.task_note or scene.task_object is None:
+        return Proof(reason=scene.task_note or "there is no task")
+    usual = env.spec.max_episode_steps
+    _limit(env, int(_ORACLE_HORIZON * usual))
+    runs: list[Episode] = []
+    policy = OraclePolicy(env)
+    for seed in _seeds(candidate, settings):
+        run = run_episode(env, policy, seed)
+        if run.at_reset:
+            return Proof(reason=f"it is done at reset (seed {seed})")
+        if not run.success:
+            return Proof(
+                reason=f"the oracle failed from seed {seed}, after {len(runs)} of {settings.seeds} that it did"
+            )
+        runs.append(run)
+        if _same_start(runs, settings):
+            runs.pop()  # nothing differs from seed to seed: one episode says all
+            break
+    again = run_episode(env, policy, runs[0].seed)
+    if (again.steps, again.path_m) != (runs[0].steps, runs[0].path_m):
+        return Proof(reason=f"defect: seed {runs[0].seed} went another way when it was run again")
+    longest = max(run.steps for run in runs)
+    max_steps = max(usual, _STEPS_UNIT * math.ceil(_SLACK * longest / _STEPS_UNIT))
+    _limit(env, max_steps)
+    still = StillPolicy(env)
+    for run in runs:
+        if run_episode(env, still, run.seed).success:
+            return Proof(reason=f"doing nothing does it (seed {run.seed})")
+    oracle = tuple(OracleRun(seed=r.seed, steps=r.steps, path_m=round(r.path_m, 4)) for r in runs)
+    return Proof(reason="", instruction=scene.instruction, max_steps=max_steps, oracle=oracle)
+
+
+def _seeds(candidate: Candidate, settings: ProofSettings) -> list[int]:
+    return [episode_seed(settings.seed, candidate.name, number) for number in range(settings.seeds)]
+
+
+def _same_start(runs: list[Episode], settings: ProofSettings) -> bool:
+    """Tell whether the second episode began as the first; masses and frictions cannot be seen in a state."""
+    unseen = Randomization.parse(settings.randomize or None)
+    return len(runs) == 2 and runs[0].start == runs[1].start and not (unseen.mass or unseen.friction)
+
+
+def _limit(env: gym.Env, steps: int) -> None:
+    """Set after how many steps episodes end."""
+    from simrecon_envs.wrappers import BatchedTimeLimit
+
+    wrapper = env
+    while not isinstance(wrapper, BatchedTimeLimit):
+        wrapper = wrapper.env
+    wrapper._max_episode_steps = steps
+
+
+def registry_text(registry: Path | None) -> str | None:
+    """Return a registry's folder as other processes need it."""
+    return None if registry is None else str(Path(registry).expanduser().absolute())

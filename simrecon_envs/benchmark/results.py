@@ -1,0 +1,125 @@
+"""What a policy did in a suite: a file that says all that is needed to compare it with another one."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from registry import UsageError
+from simrecon_envs.benchmark.files import read_json, write_json
+from simrecon_envs.benchmark.statistics import bootstrap_mean, wilson
+
+SCHEMA = "simrecon.results/1"
+STEP_S = 0.05  # a control step
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeResult:
+    """One episode of one task."""
+
+    task: str  # the task's name in the suite
+    revision: str
+    kind: str
+    scene: str
+    robot: str
+    scene_side: str
+    object_side: str
+    seed: int
+    proven: bool  # a seed of the suite, which the oracle did; else a fresh one
+    success: bool
+    steps: int
+    path_m: float
+    oracle_path_m: float  # of the same seed; the median of the task's where the seed is fresh
+    oracle_steps: float
+    reward: float
+    act_ms: float  # wall time of the policy a step
+    video: str = ""  # the file's name
+
+    @property
+    def efficiency(self) -> float:
+        """Return success weighted by path length: the oracle's way over the longer of both, 0 without success."""
+        if not self.success:
+            return 0.0
+        return self.oracle_path_m / max(self.path_m, self.oracle_path_m, 1e-9)
+
+    @property
+    def pair(self) -> tuple:
+        """Return what the same episode of another policy has, too."""
+        return self.task, self.revision, self.seed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """Episodes in the order of the suite."""
+
+    suite: dict[str, Any]  # name, digest
+    policy: dict[str, Any]  # name, arguments, options
+    selection: dict[str, Any]
+    episodes: tuple[EpisodeResult, ...]
+    notes: tuple[str, ...] = ()
+    made_with: dict[str, str] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures of all episodes, and by kind, scene, robot and side."""
+        keys: dict[str, Callable[[EpisodeResult], str]] = {
+            "kind": lambda e: e.kind,
+            "scene": lambda e: e.scene,
+            "robot": lambda e: e.robot,
+            "object_side": lambda e: e.object_side,
+            "scene_side": lambda e: e.scene_side,
+        }
+        out: dict[str, Any] = {"all": figures(self.episodes)}
+        for name, key in keys.items():
+            values = sorted({key(e) for e in self.episodes})
+            out[name] = {v: figures([e for e in self.episodes if key(e) == v]) for v in values}
+        return out
+
+    def save(self, path: Path) -> None:
+        """Write the results, whole or not at all."""
+        body = asdict(self)
+        order = ("suite", "policy", "selection", "made_with", "notes")
+        head = {"schema": SCHEMA, **{key: body[key] for key in order}}
+        write_json(path, {**head, "summary": self.summary(), "episodes": body["episodes"]})
+
+
+def load_results(path: Path | str) -> Results:
+    """Read results.
+
+    Raises:
+        UsageError: the file is absent or no results of a version that is known here.
+    """
+    path = Path(path)
+    body = read_json(path, "results")
+    if not isinstance(body, dict) or body.get("schema") != SCHEMA:
+        found = body.get("schema") if isinstance(body, dict) else type(body).__name__
+        raise UsageError(f"results {path}: expected the schema {SCHEMA!r}, found {found!r}")
+    try:
+        episodes = tuple(EpisodeResult(**entry) for entry in body["episodes"])
+        return Results(suite=body["suite"], policy=body["policy"], selection=body["selection"], episodes=episodes,
+                       notes=tuple(body["notes"]), made_with=body["made_with"])  # fmt: skip
+    except (KeyError, TypeError) as error:
+        raise UsageError(
+            f"results {path}: a field is missing, unknown or of another type: {error}"
+        ) from error
+
+
+def figures(episodes: list[EpisodeResult] | tuple[EpisodeResult, ...]) -> dict[str, Any]:
+    """Return {figure: {value, interval, …}} of some episodes. Steps and times are of those that succeeded."""
+    done = [e for e in episodes if e.success]
+    rate = len(done) / len(episodes)
+    return {
+        "episodes": len(episodes),
+        "tasks": len({e.task for e in episodes}),
+        "success": {"value": rate, "interval": wilson(len(done), len(episodes)), "count": len(done)},
+        "path_efficiency": _mean([e.efficiency for e in episodes], [e.task for e in episodes]),
+        "steps": _mean([e.steps for e in done], [e.task for e in done]),
+        "seconds": _mean([e.steps * STEP_S for e in done], [e.task for e in done]),
+        "reward": _mean([e.reward for e in episodes], [e.task for e in episodes]),
+        "act_ms": _mean([e.act_ms for e in episodes], [e.task for e in episodes]),
+    }
+
+
+def _mean(values: list[float], tasks: list[str]) -> dict[str, Any]:
+    if not values:
+        return {"value": None, "interval": None}
+    return {"value": sum(values) / len(values), "interval": bootstrap_mean(values, tasks)}

@@ -1,0 +1,187 @@
+"""A suite and a policy -> results."""
+
+import statistics
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from registry import SceneRegistry, UsageError
+from simrecon_envs.benchmark.episodes import run_episode
+from simrecon_envs.benchmark.files import Records, versions
+from simrecon_envs.benchmark.parallel import Workers
+from simrecon_envs.benchmark.policies import PolicySpec
+from simrecon_envs.benchmark.reporting import Reporter
+from simrecon_envs.benchmark.results import EpisodeResult, Results
+from simrecon_envs.benchmark.splits import episode_seed
+from simrecon_envs.benchmark.suite import Suite, SuiteTask
+from simrecon_envs.rollout import open_video
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """How a suite is run."""
+
+    episodes: int | None = None
+    """Most episodes of a task; all of its seeds where None."""
+    fresh: int = 0
+    """Episodes from seeds that are not the suite's, in place of those."""
+    any_revision: bool = False
+    """Run scenes that have another revision than the suite's, and note it."""
+    videos: str | None = None
+    """Where a video of each task's first episode goes."""
+    video_size_px: int = 384
+    registry: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.fresh < 0 or (self.episodes is not None and self.episodes < 1):
+            raise UsageError(f"--episodes {self.episodes}, --fresh-seeds {self.fresh}: expected at least 1")
+
+
+def run_suite(
+    suite: Suite,
+    tasks: list[SuiteTask],
+    policy: PolicySpec,
+    settings: RunSettings,
+    *,
+    jobs: int = 1,
+    records: Records | None = None,
+    reporter: Reporter | None = None,
+    suite_name: str = "",
+    selection: dict[str, Any] | None = None,
+) -> Results:
+    """Run a policy.
+
+    Args:
+        suite: The suite.
+        tasks: Those of it that are run, as of `suite.select`.
+        policy: Which policy; every task gets a new one.
+        settings: How.
+        jobs: How many processes.
+        records: Where finished tasks are kept and found; a run that was killed goes on with them.
+        reporter: Is told what happens.
+        suite_name: For the results.
+        selection: For the results: how the tasks were chosen.
+
+    Raises:
+        UsageError: scenes are missing or of another revision (lists all), or there is no such policy.
+    """
+    reporter = reporter or Reporter(quiet=True)
+    notes = check_revisions(tasks, settings)
+    for note in notes:
+        reporter.note(f"note: {note}")
+    options = policy.options()
+    policy.load()  # a wrong name is said before anything is built
+    made_with = versions()
+    frame = {
+        "suite": suite.digest,
+        "policy": asdict(policy),
+        "settings": asdict(settings),
+        "versions": made_with,
+    }
+    found: dict[str, list[EpisodeResult]] = {}
+    for task in tasks:
+        record = records.get({**frame, "task": task.name}) if records else None
+        if record is not None:
+            found[task.name] = [EpisodeResult(**entry) for entry in record["episodes"]]
+    open_ = [task for task in tasks if task.name not in found]
+    reporter.start(len(open_), f"{policy.name}: {len(tasks)} tasks, {len(found)} of them done before")
+    with Workers(jobs) as workers:
+        for number, rows in workers.map(run_task, open_, suite.options, policy, settings, suite.settings):
+            task = open_[number]
+            found[task.name] = rows
+            if records:
+                records.put({**frame, "task": task.name}, {"episodes": [asdict(row) for row in rows]})
+            reporter.done(f"{task.name}: {sum(row.success for row in rows)} of {len(rows)}")
+    return Results(
+        suite={"name": suite_name, "digest": suite.digest},
+        policy={"name": policy.name, "arguments": policy.arguments, "options": options},
+        selection={**(selection or {}), "episodes": settings.episodes, "fresh_seeds": settings.fresh},
+        episodes=tuple(row for task in tasks for row in found[task.name]),
+        notes=tuple(notes),
+        made_with=made_with,
+    )
+
+
+def check_revisions(tasks: list[SuiteTask], settings: RunSettings) -> list[str]:
+    """Return notes about scenes that have another revision than the suite's.
+
+    Raises:
+        UsageError: scenes are missing, or have another revision and that was not allowed; lists all of them.
+    """
+    catalog = SceneRegistry(None if settings.registry is None else Path(settings.registry))
+    known = catalog.revisions()
+    wanted = {task.scene: task.revision for task in tasks}
+    missing = [scene for scene in wanted if scene not in known]
+    other = [scene for scene, revision in wanted.items() if known.get(scene, revision) != revision]
+    changed = [f"{scene} is {known[scene]}, the suite's is {wanted[scene]}" for scene in other]
+    if missing:
+        more = f"; and of another revision: {'; '.join(changed)}" if changed else ""
+        raise UsageError(
+            f"{len(missing)} of the suite's {len(wanted)} scenes are not in the registry {catalog.root}: "
+            f"{', '.join(f'{scene} (revision {wanted[scene]})' for scene in missing)}{more}. Name another registry "
+            "with --registry, or choose tasks of the scenes that are here with --tasks 'SCENE-*'"
+        )
+    if changed and not settings.any_revision:
+        raise UsageError(
+            f"the registry {catalog.root} has other revisions of scenes than the suite was proven in: "
+            f"{'; '.join(changed)}. Generate the suite again, or go on with --any-revision: results then say so"
+        )
+    return [f"scene {text}" for text in changed]
+
+
+def run_task(
+    task: SuiteTask, options: dict[str, Any], policy: PolicySpec, settings: RunSettings, made: dict[str, Any]
+) -> list[EpisodeResult]:
+    """Run a task's episodes one after the other, in an environment of its own."""
+    suite = Suite(tasks=(task,), options=options)
+    extra: dict[str, Any] = policy.options()
+    if settings.videos is not None:
+        size = settings.video_size_px
+        extra |= {"render_mode": "rgb_array", "human_render_camera_configs": {"width": size, "height": size}}
+    env = suite.make(task, registry=settings.registry, **extra)
+    try:
+        actor = policy.load()(env)
+        rows = []
+        for number, seed in enumerate(_seeds(task, settings, int(made.get("seed", 0)))):
+            video = f"{task.name}-{seed}.mp4" if settings.videos is not None and number == 0 else ""
+            if video:
+                with open_video(Path(settings.videos) / video, env.unwrapped.control_freq) as add:
+                    episode = run_episode(env, actor, seed, lambda *_: add(env.render()))
+            else:
+                episode = run_episode(env, actor, seed)
+            rows.append(_row(task, env.unwrapped.bundle.revision, episode, video))
+        return rows
+    finally:
+        env.close()
+
+
+def _seeds(task: SuiteTask, settings: RunSettings, suite_seed: int) -> list[int]:
+    if settings.fresh:
+        # The suite's come from numbers that start at 0.
+        return [episode_seed(suite_seed, f"{task.name}/fresh", number) for number in range(settings.fresh)]
+    return list(task.seeds[: settings.episodes])
+
+
+def _row(task: SuiteTask, revision: str, episode: Any, video: str) -> EpisodeResult:
+    known = {run.seed: run for run in task.oracle}
+    mine = [known[episode.seed]] if episode.seed in known else list(task.oracle)
+    return EpisodeResult(
+        task=task.name,
+        revision=revision,
+        kind=task.kind,
+        scene=task.scene,
+        robot=task.robot,
+        scene_side=task.scene_side,
+        object_side=task.object_side,
+        seed=episode.seed,
+        proven=episode.seed in known,
+        success=episode.success,
+        steps=episode.steps,
+        path_m=round(episode.path_m, 4),
+        oracle_path_m=statistics.median(run.path_m for run in mine),
+        oracle_steps=statistics.median(run.steps for run in mine),
+        reward=round(episode.reward, 4),
+        act_ms=round(1000 * episode.act_s / max(episode.steps, 1), 3),
+        video=video,
+    )

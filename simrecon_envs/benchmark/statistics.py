@@ -1,0 +1,51 @@
+"""Rates, means and their 95 % intervals. NumPy only, deterministic."""
+
+import math
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+
+Interval = tuple[float, float]
+_Z = 1.959964  # of the normal distribution, two-sided 95 %
+_DRAWS = 4000
+
+
+def wilson(successes: int, count: int) -> Interval:
+    """Return Wilson's 95 % interval of a rate: where the true rate of these tasks may lie, episodes drawn anew."""
+    if count < 1 or not 0 <= successes <= count:
+        raise ValueError(
+            f"expected 0 <= successes <= count and a count of at least 1, got {successes} of {count}"
+        )
+    rate, z2 = successes / count, _Z**2
+    middle = (rate + z2 / (2 * count)) / (1 + z2 / count)
+    half = _Z / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
+    low = 0.0 if successes == 0 else middle - half
+    high = 1.0 if successes == count else middle + half
+    return max(low, 0.0), min(high, 1.0)
+
+
+def bootstrap_mean(values: Sequence[float], groups: Sequence[Hashable]) -> Interval | None:
+    """Return the 95 % interval of a mean when whole groups (tasks) are drawn anew; None with fewer than two groups.
+
+    Episodes of one task are alike, so that drawing single episodes would make the interval too narrow.
+    """
+    names = list(dict.fromkeys(groups))
+    if len(names) < 2:
+        return None
+    place = {name: k for k, name in enumerate(names)}
+    index = np.array([place[group] for group in groups])
+    sums = np.bincount(index, weights=np.asarray(values, np.float64), minlength=len(names))
+    counts = np.bincount(index, minlength=len(names))
+    drawn = np.random.default_rng(0).integers(len(names), size=(_DRAWS, len(names)))
+    means = sums[drawn].sum(1) / counts[drawn].sum(1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def mcnemar(only_first: int, only_second: int) -> float:
+    """Return the exact two-sided p of McNemar's test, from the pairs in which only one of two succeeded."""
+    count = only_first + only_second
+    if count == 0:
+        return 1.0
+    tail = sum(math.comb(count, k) for k in range(min(only_first, only_second) + 1)) / 2**count
+    return min(1.0, 2 * tail)
