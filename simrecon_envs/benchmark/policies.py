@@ -144,7 +144,5 @@ def _find(name: str) -> Callable:
 
 def _checked(policy: Any, name: str) -> Policy:
     if not callable(getattr(policy, "act", None)):
-        raise UsageError(
-            f"policy {name}: it returned a {type(policy).__name__}, which has no act(observation)"
-        )
+        raise UsageError(f"policy {name}: what it returned ({type(policy).__name__}) has no act(observation)")
     return policy

@@ -1,4 +1,4 @@
-"""A small hand-made scene in a registry of its own, and whether this machine can render."""
+"""A small hand-made scene in a registry of its own, a suite of its tasks, and whether this machine can render."""
 
 import functools
 import subprocess
@@ -12,11 +12,15 @@ from masses import mass_entry
 
 from registry import SceneRegistry, seal_bundle
 from registry.geometry import GLTF_FROM_WORLD
+from simrecon_envs.benchmark.files import Records
+from simrecon_envs.benchmark.generate import GenerateConfig, generate_suite
+from simrecon_envs.benchmark.suite import Suite, load_suite
 
 ROOM_M = (4.0, 3.0, 2.4)
 TABLE_TOP_M = 0.60
 BOX, CYLINDER, PICTURE, TABLE, BOOK, KNOB = 10, 11, 12, 13, 14, 15
 CRATE, BLOCK, CUBE, SHELF = 20, 21, 22, 23
+SUITE_CONFIG = GenerateConfig(kinds=("reach", "pick"), robots=("panda",), per_scene=3, seeds=2)
 
 
 def _glb(mesh: trimesh.Trimesh, path: Path, color: tuple[int, int, int]) -> None:
@@ -265,6 +269,42 @@ def scenes_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writer.seal(scene_id)
         registry.publish(writer.folder, scene_id)
     return root
+
+
+class Killed(BaseException):
+    """What a kill is to a test."""
+
+
+class DyingRecords(Records):
+    """Keeps so many records, then the process "dies"."""
+
+    left = 2
+
+    def put(self, key: object, record: dict) -> None:
+        if not self.left:
+            raise Killed
+        self.left -= 1
+        super().put(key, record)
+
+
+@pytest.fixture(scope="session")
+def suite_file(scenes_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a suite of `things` that was generated in two runs, the first of which was killed."""
+    out = tmp_path_factory.mktemp("suite") / "suite.json"
+    with pytest.raises(Killed):
+        generate_suite(["things"], SUITE_CONFIG, registry=scenes_root, records=DyingRecords(out))
+    records = Records(out)
+    assert len(list(records.folder.iterdir())) == 2
+    generate_suite(["things"], SUITE_CONFIG, registry=scenes_root, records=records).save(out)
+    records.clear()
+    assert [file.name for file in out.parent.iterdir()] == ["suite.json"]
+    return out
+
+
+@pytest.fixture(scope="session")
+def suite(suite_file: Path) -> Suite:
+    """Return the suite as it is in the file."""
+    return load_suite(suite_file)
 
 
 @functools.lru_cache(maxsize=1)
