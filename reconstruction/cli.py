@@ -34,6 +34,7 @@ def build_parser() -> argparse.ArgumentParser:
         reconstruct,
         report,
         scenes,
+        train,
     )
 
     parser = argparse.ArgumentParser(
@@ -51,6 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_parser(verbs)
     marker.add_parser(verbs)
     benchmark.add_parser(verbs)
+    train.add_parser(verbs)
     doctor.add_parser(verbs)
     return parser
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from registry import UsageError
+from simrecon_envs.robots import traits_of
 from simrecon_envs.surfaces import CELL_M, height_map
 from simrecon_envs.tasks.facts import SceneFacts
 
@@ -24,12 +25,14 @@ _LEVEL_M = 0.006
 
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
-    """How much differs. 0 is nothing; `all` is `Randomization.everything()`."""
+    """How much differs. 0 is nothing; `all` is `Randomization.everything()`, `start` is `Randomization.start()`."""
 
     shift_m: float = 0.0
     """Greatest horizontal shift of a thing along x and y."""
     turn_rad: float = 0.0
     """Greatest turn about the vertical."""
+    joints_rad: float = 0.0
+    """Greatest change of each of the robot's joints, fingers and driving base left out."""
     mass: float = 0.0
     """Which share of the bundle's range of masses is drawn from, on a logarithmic scale."""
     friction: float = 0.0
@@ -58,12 +61,17 @@ class Randomization:
     @classmethod
     def everything(cls) -> "Randomization":
         """Return a moderate amount of all."""
-        return cls(shift_m=0.05, turn_rad=0.5, mass=1.0, friction=1.0, lights=0.4, textures=0.3, camera_m=0.02,
-                   camera_rad=0.03, image_noise=4.0, depth_noise=0.003)  # fmt: skip
+        return cls(shift_m=0.05, turn_rad=0.5, joints_rad=0.05, mass=1.0, friction=1.0, lights=0.4, textures=0.3,
+                   camera_m=0.02, camera_rad=0.03, image_noise=4.0, depth_noise=0.003)  # fmt: skip
+
+    @classmethod
+    def start(cls) -> "Randomization":
+        """Return a moderate amount of what an episode begins with: poses of the things and of the robot."""
+        return cls(shift_m=0.05, turn_rad=0.5, joints_rad=0.05)
 
     @classmethod
     def parse(cls, value: "str | dict | Randomization | None") -> "Randomization":
-        """Return what an option means: None or "none", "all", or a dict of the fields.
+        """Return what an option means: None or "none", "start", "all", or a dict of the fields.
 
         Raises:
             UsageError: lists the fields.
@@ -74,10 +82,12 @@ class Randomization:
             return cls()
         if value == "all":
             return cls.everything()
+        if value == "start":
+            return cls.start()
         names = [field.name for field in fields(cls)]
         if not isinstance(value, dict) or set(value) - set(names):
             raise UsageError(
-                f'randomize: expected "none", "all" or a dict of {", ".join(names)}, got {value!r}'
+                f'randomize: expected "none", "start", "all" or a dict of {", ".join(names)}, got {value!r}'
             )
         return cls(**value)
 
@@ -127,6 +137,19 @@ class Randomizer:
                     hulls[number], moves[number] = hull, move
                     break
         return moves
+
+    # ---- The robot.
+
+    def joints(self, env_idx: torch.Tensor, rng: Any, qpos: np.ndarray) -> np.ndarray:
+        """Return where the joints are (b, d) (rad, m) in the environments `env_idx`, from those at rest (d,)."""
+        out = np.repeat(qpos[None], len(env_idx), axis=0)
+        if not self.config.joints_rad:
+            return out
+        base = 3 if traits_of(self._env.robot_uids).mobile else 0  # x, y and heading of whoever drives
+        arm = slice(base, max(len(qpos) - 2, base))  # the last two are the fingers
+        draws = np.asarray(rng[env_idx.cpu().numpy()].uniform(-1, 1, size=len(qpos)), np.float64)
+        out[:, arm] += self.config.joints_rad * draws.reshape(out.shape)[:, arm]
+        return out
 
     # ---- Mass and friction.
 

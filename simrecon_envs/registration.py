@@ -126,7 +126,7 @@ def find_spec(name: str) -> EnvSpec | None:
             raise EnvNotFound(f"{name} does not exist: the version of tasks is {TASK_VERSION}, as in {there}")
         kwargs = {**row.kwargs, "task": match["task"]}
         return EnvSpec(
-            id=name, entry_point=_ENTRY_POINT, max_episode_steps=_steps_of(match["task"]), disable_env_checker=True,
+            id=name, entry_point=_ENTRY_POINT, max_episode_steps=episode_steps(match["task"]), disable_env_checker=True,
             kwargs=kwargs, additional_wrappers=_WRAPPERS,
         )  # fmt: skip
     ids = [known for known, spec in gym.registry.items() if _registry_of(spec) is not None]
@@ -178,7 +178,7 @@ def _spec(name: str, scene: str, revision: str, folder: str) -> EnvSpec:
     return spec
 
 
-def _steps_of(task: str) -> int:
+def episode_steps(task: str) -> int:
     """Return how long an episode of a task is; composites have the steps of all stages."""
     return sum(_KIND_STEPS.get(stage.split("_")[0], MAX_EPISODE_STEPS) for stage in task.split("-then-"))
 

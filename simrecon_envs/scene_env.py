@@ -113,7 +113,8 @@ class SceneEnv(BaseEnv):
             target: What a kind of task is about: "auto" (the easiest), an object's id, or a label.
             pose_noise: Standard deviation of a random shift of each movable object at reset (m), or of shift
                 and turn (m, rad). A little noise can make objects overlap where they stand close together.
-            randomize: What differs from reset to reset: None, "all", or a dict of `Randomization`'s fields.
+            randomize: What differs from reset to reset: None, "start" (poses of things and robot), "all", or a dict
+                of `Randomization`'s fields.
             robot_uids: A robot of ManiSkill, or "none".
             cameras: Which cameras observe, by name or names with commas: "workspace" (`base_camera`), "overview",
                 "wrist", "capture:N" (N frames of the video). What the robot carries observes anyway.
@@ -307,8 +308,8 @@ class SceneEnv(BaseEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
         if self.agent is not None:
-            qpos = torch.as_tensor(rest_qpos(self.agent), dtype=torch.float32, device=self.device)
-            self.agent.reset(qpos.repeat(len(env_idx), 1))
+            qpos = self._randomizer.joints(env_idx, self._batched_episode_rng, rest_qpos(self.agent))
+            self.agent.reset(torch.as_tensor(qpos, dtype=torch.float32, device=self.device))
             self.agent.robot.set_pose(Pose.create(self._root_pose(), device=self.device))
         self._randomizer.poses(env_idx, self._batched_episode_rng)
         if not self.gpu_sim_enabled:  # on the GPU they are fixed once the simulation runs

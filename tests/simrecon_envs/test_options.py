@@ -207,3 +207,34 @@ def test_splits_keep_their_side() -> None:
     test = [name for name in names if split_of(name) == "test"]
     assert 0.17 < len(test) / len(names) < 0.23
     assert split_of("scene0001") == split_of("scene0001")
+
+
+def test_the_robot_begins_elsewhere_and_its_fingers_do_not(scenes_root: Path) -> None:
+    env = _make(scenes_root, randomize={"joints_rad": 0.05})
+    rest = _make(scenes_root).unwrapped
+    rest.reset(seed=0)
+    home = rest.agent.robot.get_qpos().numpy()[0]
+    starts = []
+    for seed in (1, 2, 1):
+        env.reset(seed=seed)
+        starts.append(env.unwrapped.agent.robot.get_qpos().numpy()[0])
+        assert 0.01 < np.abs(starts[-1] - home)[:7].max() <= 0.05 + 1e-6
+        np.testing.assert_array_equal(starts[-1][7:], home[7:])
+    np.testing.assert_array_equal(starts[0], starts[2])
+    assert np.abs(starts[0] - starts[1]).max() > 0.01
+    np.testing.assert_array_equal(env.unwrapped.movable_ids, rest.movable_ids)
+    rest.close()
+    env.close()
+    assert Randomization.parse("start").joints_rad > 0
+
+
+def test_a_base_that_drives_begins_where_it_was_placed(scenes_root: Path) -> None:
+    env = _make(scenes_root, robot_uids="fetch", task="navigate", randomize="start")
+    rest = _make(scenes_root, robot_uids="fetch", task="navigate").unwrapped
+    rest.reset(seed=0)
+    env.reset(seed=0)
+    moved = (env.unwrapped.agent.robot.get_qpos() - rest.agent.robot.get_qpos()).numpy()[0]
+    np.testing.assert_array_equal(moved[[0, 1, 2, -2, -1]], 0)
+    assert np.abs(moved).max() > 0.01
+    rest.close()
+    env.close()

@@ -1,0 +1,41 @@
+"""Train policies in reconstructed scenes with stable-baselines3, and use what was trained.
+
+`simrecon train SCENE --task reach` is `train(TrainConfig(...))`. A finished run is a folder; `load_policy(folder)`
+returns its policy, a function of observations. Policies for `simrecon benchmark run --policy module:callable` are
+made by a function of the environment: `simrecon_envs.training:trained` is one.
+
+Nothing heavy is imported before a policy is trained or loaded.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from simrecon_envs.training.config import ALGORITHMS, PpoSettings, SacSettings, TrainConfig
+from simrecon_envs.training.folder import RunFolder, runs_root
+
+if TYPE_CHECKING:
+    from simrecon_envs.training.policy import TrainedPolicy, load_policy, trained
+    from simrecon_envs.training.run import train
+
+__all__ = [
+    "ALGORITHMS",
+    "PpoSettings",
+    "RunFolder",
+    "SacSettings",
+    "TrainConfig",
+    "TrainedPolicy",
+    "load_policy",
+    "runs_root",
+    "train",
+    "trained",
+]
+
+_LAZY = {"TrainedPolicy": "policy", "load_policy": "policy", "trained": "policy", "train": "run"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs torch on first use."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(f"simrecon_envs.training.{_LAZY[name]}"), name)

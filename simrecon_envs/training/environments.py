@@ -1,0 +1,190 @@
+"""The environments that a run trains and is evaluated in: one process each, plain NumPy, what a learner needs."""
+
+import functools
+import multiprocessing
+import signal
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from registry import UsageError
+from simrecon_envs.registration import episode_steps, make_cpu
+from simrecon_envs.training.config import TrainConfig
+
+_ONE_TARGET = ("reach", "navigate")  # all that matters is in the observation without the other things' poses
+_PREFERRED = ("pd_ee_delta_pos", "pd_joint_delta_pos")  # to control by, the first that a robot has
+
+
+def env_kwargs(config: TrainConfig) -> dict[str, Any]:
+    """Return how an environment is made (`simrecon_envs.make`), but for scene and registry."""
+    kwargs: dict[str, Any] = {
+        "task": config.task,
+        "robot_uids": config.robot,
+        "obs_mode": config.obs_mode,
+        "control_mode": config.control_mode,
+        "reward_mode": "normalized_dense",
+        "randomize": config.randomize,
+        "observe_objects": config.task.split("_")[0] not in _ONE_TARGET,
+        "max_episode_steps": config.settings.horizon or episode_steps(config.task),
+    }
+    if config.obs_mode == "rgb":
+        kwargs["sensor_configs"] = {"width": config.settings.image_px, "height": config.settings.image_px}
+    return kwargs
+
+
+def make_one(config: TrainConfig, *, bonus: bool = True, **more: Any) -> gym.Env:
+    """Make one environment.
+
+    Args:
+        config: Of the run, with a control mode that the robot has.
+        bonus: Pay at success what staying there would; not where rewards are measured.
+        **more: As for `simrecon_envs.make`.
+    """
+    env: gym.Env = make_cpu(config.scene, registry=config.registry, **(env_kwargs(config) | more))
+    if config.obs_mode != "state":
+        env = FlatPictures(env)
+    gamma = config.settings.gamma if bonus and config.settings.success_bonus else 0.0
+    return EpisodeInfo(env, bonus=gamma / (1 - gamma))
+
+
+def make_several(config: TrainConfig) -> Any:
+    """Make the vector environment of a run, without normalization; one process each where there are several."""
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+    makers = [functools.partial(_in_worker, config)] * config.envs
+    if config.envs == 1:
+        return DummyVecEnv(makers)
+    # Ctrl-C reaches every process of a terminal: workers, which inherit this, leave it to the one that trains.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _is_main_thread() else None
+    try:
+        return SubprocVecEnv(makers, start_method="spawn")
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+
+
+def resolve(config: TrainConfig) -> tuple[TrainConfig, dict[str, Any]]:
+    """Make the environment once, to say before anything is trained what is wrong.
+
+    Returns:
+        The configuration with the control mode and the task's name that hold, and what is known of the scene:
+        {"revision", "target_id", "instruction", "task_note"}.
+
+    Raises:
+        SceneNotFound, EnvNotFound, UsageError: the scene, task, robot or control mode do not exist.
+        EnvironmentMissing: pictures are to be observed, and nothing can render here.
+    """
+    import dataclasses
+
+    env = make_cpu(config.scene, registry=config.registry, **env_kwargs(config) | {"control_mode": None})
+    try:
+        scene = env.unwrapped
+        if scene.task_object is None:
+            raise UsageError(f"scene {scene.scene_id}: no task to train: {scene.task_note or config.task}")
+        modes = list(scene.agent.supported_control_modes)
+        mode = config.control_mode
+        if mode == "auto":
+            wanted = _PREFERRED[1:] if scene.task_kind == "navigate" else _PREFERRED
+            mode = next((known for known in wanted if known in modes), modes[0])
+        if mode not in modes:
+            raise UsageError(f"--control-mode {mode}: {config.robot} has {', '.join(modes)}")
+        known = {
+            "scene_id": scene.scene_id,
+            "revision": scene.bundle.revision,
+            "target_id": scene.target_id,
+            "instruction": scene.instruction,
+            "task_note": scene.task_note,
+        }
+        registry = str(config.registry) if config.registry is not None else None
+        return dataclasses.replace(
+            config, scene=scene.scene_id, task=scene.task, control_mode=mode, registry=registry
+        ), known
+    finally:
+        env.close()
+
+
+class EpisodeInfo(gym.Wrapper):
+    """Says at an episode's end how it went, in stable-baselines3's words, and nothing in between.
+
+    A dense reward pays for being near at every step, and an episode ends with success: a policy that hovers short
+    of it would earn more. `bonus` is what staying there would be worth, so that success is never a loss.
+    """
+
+    def __init__(self, env: gym.Env, bonus: float = 0.0) -> None:
+        """Wrap one environment; `bonus` is added to the reward (not to what is told) at success."""
+        super().__init__(env)
+        self._bonus = bonus
+        self._return, self._length, self._began = 0.0, 0, time.time()
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict]:
+        """Begin an episode."""
+        self._return, self._length, self._began = 0.0, 0, time.time()
+        obs, info = self.env.reset(**kwargs)
+        return obs, {"instruction": info.get("instruction", "")}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
+        """Step; `info` is empty but for the last step: {"episode": {"r", "l", "t"}, "is_success"}."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self._return += reward
+        self._length += 1
+        success = bool(info.get("success", False))
+        told: dict[str, Any] = {}
+        if terminated or truncated:
+            seconds = round(time.time() - self._began, 6)
+            told = {"episode": {"r": self._return, "l": self._length, "t": seconds}, "is_success": success}
+        return obs, reward + (self._bonus if success and terminated else 0.0), terminated, truncated, told
+
+
+class FlatPictures(gym.ObservationWrapper):
+    """Nested observations with pictures -> {"state": (k,) float32, "CAMERA_rgb": (h, w, 3) uint8 ...}."""
+
+    def __init__(self, env: gym.Env) -> None:
+        """Wrap one environment whose observations are a dict."""
+        super().__init__(env)
+        spaces: dict[str, gym.Space] = {}
+        sensors = env.observation_space["sensor_data"]
+        for name in sensors:
+            spaces[f"{name}_rgb"] = gym.spaces.Box(0, 255, sensors[name]["rgb"].shape, np.uint8)
+        parts = [
+            env.observation_space[key] for key in ("agent", "extra") if key in env.observation_space.spaces
+        ]
+        size = sum(gym.spaces.flatdim(part) for part in parts)
+        spaces["state"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.observation_space = gym.spaces.Dict(spaces)
+
+    def observation(self, observation: dict) -> dict[str, np.ndarray]:
+        """Flatten one observation."""
+        return flat_pictures(observation)
+
+
+def flat_pictures(observation: dict) -> dict[str, np.ndarray]:
+    """Return an observation with pictures as `FlatPictures` has it; joints and touch in the order they come."""
+    flat = {f"{name}_rgb": np.asarray(of["rgb"]) for name, of in observation["sensor_data"].items()}
+    leaves = [np.ravel(leaf) for key in ("agent", "extra") for leaf in _leaves(observation.get(key, {}))]
+    flat["state"] = np.concatenate(leaves, dtype=np.float32, casting="unsafe")
+    return flat
+
+
+def _leaves(entry: Any) -> Any:
+    if isinstance(entry, dict):
+        for value in entry.values():
+            yield from _leaves(value)
+    else:
+        yield entry
+
+
+def _in_worker(config: TrainConfig) -> gym.Env:
+    import torch
+
+    torch.set_num_threads(1)
+    if multiprocessing.parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return make_one(config)
+
+
+def _is_main_thread() -> bool:
+    import threading
+
+    return threading.current_thread() is threading.main_thread()

@@ -1,0 +1,101 @@
+"""How well a policy does: the same seeds for every run, none of which was trained on; and a video of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+import numpy as np
+
+from registry import EnvironmentMissing
+from simrecon_envs.benchmark.statistics import wilson
+from simrecon_envs.rollout import open_video
+from simrecon_envs.training.config import LARGEST_SEED, TrainConfig
+from simrecon_envs.training.environments import make_one
+
+FIRST_SEED = LARGEST_SEED + 1
+VIDEO_EPISODES = 4
+_VIDEO_PX = 384
+_LAST_FRAMES = 8  # of an episode's last picture
+
+Policy = Callable[[Any], np.ndarray]
+
+
+def evaluate(
+    config: TrainConfig,
+    policy: Policy,
+    episodes: int,
+    on_episode: Callable[[int, int], None] = lambda done, successes: None,
+) -> dict[str, Any]:
+    """Let a policy act in one environment for episodes with the seeds FIRST_SEED, FIRST_SEED + 1 …
+
+    Args:
+        config: Of the run.
+        policy: Observation -> action.
+        episodes: How many, at least one.
+        on_episode: Called after every episode with how many are done and how many succeeded.
+
+    Returns:
+        {"episodes", "successes", "success_rate", "wilson_95": [low, high], "return_mean", "steps_mean",
+        "steps_to_success_median" (None without success), "seeds": [first, last], "per_episode": [{"seed",
+        "success", "return", "steps"}]}; steps are 1/20 s, returns are the environment's own.
+    """
+    env = make_one(config, bonus=False)
+    rows: list[dict[str, Any]] = []
+    try:
+        for seed in range(FIRST_SEED, FIRST_SEED + episodes):
+            rows.append({"seed": seed, **_episode(env, policy, seed)})
+            on_episode(len(rows), sum(row["success"] for row in rows))
+    finally:
+        env.close()
+    successes = sum(row["success"] for row in rows)
+    fast = [row["steps"] for row in rows if row["success"]]
+    return {
+        "episodes": episodes,
+        "successes": successes,
+        "success_rate": successes / episodes,
+        "wilson_95": list(wilson(successes, episodes)),
+        "return_mean": mean(row["return"] for row in rows),
+        "steps_mean": mean(row["steps"] for row in rows),
+        "steps_to_success_median": median(fast) if fast else None,
+        "seeds": [rows[0]["seed"], rows[-1]["seed"]],
+        "per_episode": rows,
+    }
+
+
+def record(config: TrainConfig, policy: Policy, path: Path, episodes: int = VIDEO_EPISODES) -> str:
+    """Film the first episodes of the evaluation.
+
+    Returns:
+        "" or why there is no video: nothing can render here.
+    """
+    size = {"width": _VIDEO_PX, "height": _VIDEO_PX}
+    try:
+        env = make_one(config, bonus=False, render_mode="rgb_array", human_render_camera_configs=size)
+    except EnvironmentMissing as error:
+        return str(error)
+    try:
+        with open_video(path, env.unwrapped.control_freq) as add:
+            for seed in range(FIRST_SEED, FIRST_SEED + episodes):
+                _episode(env, policy, seed, lambda: add(_picture(env)))
+                for _ in range(_LAST_FRAMES):
+                    add(_picture(env))
+    finally:
+        env.close()
+    return ""
+
+
+def _episode(env: Any, policy: Policy, seed: int, look: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    obs, _ = env.reset(seed=seed)
+    done = False
+    while not done:
+        look()
+        obs, _, terminated, truncated, info = env.step(policy(obs))
+        done = terminated or truncated
+    return {"success": info["is_success"], "return": info["episode"]["r"], "steps": info["episode"]["l"]}
+
+
+def _picture(env: Any) -> np.ndarray:
+    picture = env.render()
+    picture = picture.cpu().numpy() if hasattr(picture, "cpu") else np.asarray(picture)
+    return picture.reshape(picture.shape[-3:]).astype(np.uint8)
