@@ -14,6 +14,10 @@ from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
 from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController, PDEEPoseController
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosMimicController
+from mani_skill.agents.robots import Fetch, Panda
+
+_MARGIN_M = 0.02  # more than PhysX keeps between bodies in contact
+_GRASP_N, _GRASP_DEG = 0.5, 85  # as in `is_grasping`
 
 
 class DirectReads:
@@ -33,6 +37,11 @@ class DirectReads:
         self._centers = [sapien.Pose(center) for center in centers]
         self._links = set() if env.agent is None else {id(link._objs[0]) for link in env.agent.robot.links}
         self._touching: dict[int, list] = {}
+        self._fingers, self._opening = None, ()
+        for known, opening in ((Panda, (1, -1)), (Fetch, (-1, 1))):
+            if env.agent is not None and type(env.agent).is_grasping is known.is_grasping:
+                self._fingers = [env.agent.finger1_link._objs[0], env.agent.finger2_link._objs[0]]
+                self._opening = opening
 
     def refresh(self) -> None:
         """Forget the contacts: the simulator has moved on."""
@@ -65,17 +74,49 @@ class DirectReads:
         """Return the speeds (1, d) of the robot's joints (rad/s, m/s)."""
         return self._env.agent.robot._objs[0].qvel[None]
 
-    def between_links(self, row: int) -> bool:
-        """Return whether at least two links of the robot touch a thing: less cannot hold it."""
-        return len({id(other) for _, other, _ in self._contacts(row)} & self._links) > 1
+    def held(self, row: int, actor: Any) -> bool:
+        """Return whether the robot says that it grasps a thing, without asking it where that cannot be."""
+        if self._fingers is not None and not self._may_touch(row):
+            return False
+        touching = {id(other) for _, other, _ in self._contacts(row)}
+        if self._fingers is None:
+            # Less than two links cannot hold it.
+            return len(touching & self._links) > 1 and bool(self._env.agent.is_grasping(actor))
+        return all(id(finger) in touching for finger in self._fingers) and self._pressed(row)
+
+    def _may_touch(self, row: int) -> bool:
+        """Return whether the box around the thing meets those around both fingers: asking for contacts is slow."""
+        low, high = self._bodies[row].get_global_aabb_fast().tolist()
+        for finger in self._fingers:
+            least, most = finger.get_global_aabb_fast().tolist()
+            if any(least[k] > high[k] + _MARGIN_M or most[k] < low[k] - _MARGIN_M for k in (0, 1, 2)):
+                return False
+        return True
+
+    def _pressed(self, row: int) -> bool:
+        """Return what `is_grasping` of the Panda and Fetch does: both fingers press on it, from where they close."""
+        for finger, sign in zip(self._fingers, self._opening, strict=True):
+            force = -self._force(row, {id(finger)})
+            size = float(np.linalg.norm(force))
+            if size < _GRASP_N:
+                return False
+            opening = sign * finger.entity_pose.to_transformation_matrix()[:3, 1]
+            cosine = float(np.clip(opening @ force / (size * np.linalg.norm(opening)), -1, 1))
+            if math.degrees(math.acos(cosine)) > _GRASP_DEG:
+                return False
+        return True
 
     def force(self, row: int, others: list) -> np.ndarray:
         """Return the force (1, 3) (N) of other actors on a thing."""
-        wanted, total = {id(other._bodies[0]) for other in others}, np.zeros(3)
+        return self._force(row, {id(other._bodies[0]) for other in others})[None]
+
+    def _force(self, row: int, wanted: set[int]) -> np.ndarray:
+        """Return the force (3,) (N) on a thing of the bodies with these ids."""
+        total = np.zeros(3)
         for contact, other, sign in self._contacts(row):
             if id(other) in wanted:
                 total += sign * np.sum([point.impulse for point in contact.points], axis=0)
-        return (total / self._env.scene.px.timestep).astype(np.float32)[None]
+        return (total / self._env.scene.px.timestep).astype(np.float32)
 
     def _contacts(self, row: int) -> list[tuple[Any, Any, int]]:
         """Return a thing's contacts, what it touches there, and 1 where the impulse acts on it, else -1.
@@ -141,7 +182,7 @@ class _Joints:
     def __init__(self, controller: PDJointPosController) -> None:
         self._controller = controller
         self._robot = controller.articulation._objs[0]
-        self._joints = [joint._objs[0] for joint in controller.joints]
+        self._targets = _Targets(controller)
         self._indices = controller.active_joint_indices.numpy()
         self._delta = controller.config.use_delta
         self._scale = None
@@ -166,7 +207,7 @@ class _Joints:
             target = np.empty_like(start)
             target[control] = start[control] + action if self._delta else action
             target[mimic] = target[source] * multiplier + offset
-        _drive(self._controller, self._joints, start, target)
+        self._targets.set(start, target)
 
 
 class _Tip:
@@ -187,7 +228,7 @@ class _Tip:
     def __init__(self, controller: PDEEPosController) -> None:
         self._controller = controller
         self._robot = controller.articulation._objs[0]
-        self._joints = [joint._objs[0] for joint in controller.joints]
+        self._targets = _Targets(controller)
         self._indices = controller.active_joint_indices.numpy()
         self._root, self._tip = controller.root_link._objs[0], controller.ee_link._objs[0]
         low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
@@ -216,16 +257,28 @@ class _Tip:
         )
         start = qpos[self._indices]
         target = solution[self._solved].astype(np.float32) if found else start
-        _drive(self._controller, self._joints, start, target)
+        self._targets.set(start, target)
 
 
-def _drive(controller: PDJointPosController, joints: list, start: np.ndarray, target: np.ndarray) -> None:
-    """Set joints' targets, and what `get_state` and whoever converts trajectories reads of the controller."""
-    controller._step = 0
-    controller._start_qpos = torch.from_numpy(start[None])
-    controller._target_qpos = torch.from_numpy(target[None].copy())
-    for joint, value in zip(joints, target.tolist(), strict=True):
-        joint.set_drive_target(value)
+class _Targets:
+    """Joints' targets, and what `get_state` and whoever converts trajectories reads of the controller."""
+
+    def __init__(self, controller: PDJointPosController) -> None:
+        self._controller = controller
+        self._joints = [joint._objs[0] for joint in controller.joints]
+        # One tensor each for all steps: to make them anew costs more than to set the joints.
+        self._start, self._target = (torch.zeros((1, len(self._joints))) for _ in range(2))
+        self._views = self._start.numpy()[0], self._target.numpy()[0]
+
+    def set(self, start: np.ndarray, target: np.ndarray) -> None:
+        """Set the targets (k,) of joints that are at `start` (k,)."""
+        controller = self._controller
+        controller._step = 0
+        controller._start_qpos, controller._target_qpos = self._start, self._target
+        self._views[0][:] = start
+        self._views[1][:] = target
+        for joint, value in zip(self._joints, target.tolist(), strict=True):
+            joint.set_drive_target(value)
 
 
 def _about(turn: np.ndarray, axis: int) -> sapien.Pose:

@@ -172,10 +172,8 @@ class Measures:
             row = self._row[key]
             if self._direct is None:
                 self._cache[name] = self._env.agent.is_grasping(self._actors[row]) & near
-            elif near[0] and self._direct.between_links(row):
-                self._cache[name] = self._env.agent.is_grasping(self._actors[row]).numpy()
             else:
-                self._cache[name] = np.zeros(1, bool)
+                self._cache[name] = near & self._direct.held(row, self._actors[row]) if near[0] else near
         return self._cache[name]
 
     # ---- Contacts.

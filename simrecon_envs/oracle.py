@@ -21,6 +21,7 @@ _MAX_SHARE = 0.35  # of the largest step that the controller takes
 _POSITION_STEP_M, _ROTATION_STEP_RAD = 0.1, 0.1  # what an action of 1 means to pd_ee_delta_pose
 _CLOSE_STEPS, _OPEN_STEPS = 8, 6
 _PATIENCE_STEPS = 60
+_SWING_RAD = 0.35
 _GRIPS = 3
 _LOWER_PATIENCE_STEPS = 35
 _TURN_RAD = 0.06
@@ -102,7 +103,9 @@ class Hand:
             turn = 0.0 if yaw is None else self._turn(yaw())
             if np.linalg.norm(goal() - self.tip()) < within_m and abs(turn) < _TURN_RAD:
                 return
-            yield self.step(goal(), turn, base=base, share=share)
+            towards, swing = self._around(goal())
+            # What is carried may turn with the arm, or the wrist comes to its end.
+            yield self.step(towards, swing * share if yaw is None else turn, base=base, share=share)
 
     def grip(self, key: int) -> Iterator[np.ndarray]:
         """Reach over a thing, go down where it can be gripped and close the fingers; try another grasp if it slips."""
@@ -168,8 +171,14 @@ class Hand:
         up = max(goal()[2] + over_m - self.place(key)[2], 0.0)
         if up > 0.02:
             yield from self.lift(up)
-        yield from self.go(tip_for(over_m), within_m=0.015, base=True, share=0.25)
+        # At the height that it has now: on a slanting way down it would meet what stands in between.
+        high = max(float(self.place(key)[2]), float(goal()[2]) + over_m)
+        yield from self.go(
+            lambda: tip_for(high - float(goal()[2]))(), within_m=0.02, base=True, share=0.25, patience=90
+        )
         self.phase = "lower"
+        if high > goal()[2] + over_m + 0.03:
+            yield from self.go(tip_for(over_m), within_m=0.015, base=True, share=0.25)
         yield from self.go(tip_for(above_m / 2), within_m=0.008, base=False, share=0.12, patience=50)
         yield from self.wait(4)
 
@@ -247,6 +256,7 @@ class Hand:
         action[:3] = self._to_root(move)
         # ManiSkill scales rotations by its `rot_lower`, which is negative: +1 means -0.1 rad.
         action[5] = -np.clip(turn / _ROTATION_STEP_RAD, -1, 1)
+        action[3:5] = -np.clip(0.5 * self._lean()[:2] / _ROTATION_STEP_RAD, -0.5, 0.5)
         if self._fetch:
             # The arm alone does not get far up or down, nor forward with the hand turned down.
             action[_TORSO] = np.clip((goal - tip)[2] / _POSITION_STEP_M, -share, share)
@@ -254,6 +264,27 @@ class Hand:
                 action[_FORWARD] = np.clip(2.0 * self._to_root(goal - tip)[0], -0.15, 0.15)
         action[6] = self._fingers()
         return action
+
+    def _around(self, goal: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return where to move next (3,) on the way to a goal, and how far the way turns about a mounted arm's foot.
+
+        The straight way to a place far aside would lead over the robot's own foot.
+        """
+        if self._fetch:
+            return goal, 0.0
+        here, there = (self._env.placement.to_root(point)[:2] for point in (self.tip(), goal))
+        first, last = (float(np.arctan2(p[1], p[0])) for p in (here, there))
+        angle = last - first  # never behind the robot, where the first joint ends
+        if abs(angle) < _SWING_RAD:
+            return goal, 0.0
+        share = _SWING_RAD / abs(angle)
+        radius = (1 - share) * float(np.linalg.norm(here)) + share * float(np.linalg.norm(there))
+        turn = first + math.copysign(_SWING_RAD, angle)
+        local = np.array([radius * math.cos(turn), radius * math.sin(turn), 0.0])
+        out = self._env.placement.to_world(local)
+        out[2] = goal[2]
+        step = _POSITION_STEP_M / max(radius, 0.2)  # by which the arm turns with a whole step
+        return out, math.copysign(step, angle)
 
     def _fingers(self) -> float:
         if not self._open or self._opening is None:
@@ -276,6 +307,11 @@ class Hand:
         error = yaw - np.arctan2(closing[1], closing[0])
         # A gripper that is turned by half a turn closes the same way.
         return float((error + np.pi / 2) % np.pi - np.pi / 2)
+
+    def _lean(self) -> np.ndarray:
+        """Return by which turn (3,) about the root's axes the gripper comes to point down again."""
+        pose = self._env.agent.tcp.pose.to_transformation_matrix()[0, :3, :3].cpu().numpy()
+        return self._to_root(np.cross(pose[:, 0 if self._fetch else 2], [0.0, 0.0, -1.0]))
 
     def _to_root(self, vector: np.ndarray) -> np.ndarray:
         yaw = self._env.placement.yaw_rad

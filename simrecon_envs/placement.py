@@ -63,6 +63,11 @@ class Placement:
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + self.position
 
+    def to_root(self, points: np.ndarray) -> np.ndarray:
+        """Take points (..., 3) from world to root space."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return (points - self.position) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
     def reaches(self, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
         """Return which world points (n, 3) are within the hand's reach (n,)."""
         return within_reach(self.position, points, traits)

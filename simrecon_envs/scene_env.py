@@ -4,7 +4,6 @@
 
 import logging
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from registry import BundleError, SceneBundle, SceneNotFound, SceneRegistry, Usa
 from simrecon_envs.arrays import Array, tensor
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
-from simrecon_envs.direct import DirectDrive
 from simrecon_envs.errors import SceneAssetsMissing
 from simrecon_envs.measures import Measures
 from simrecon_envs.placement import Target
@@ -29,6 +27,7 @@ from simrecon_envs.planning import Plan, plan_task
 from simrecon_envs.randomization import Randomization, Randomizer
 from simrecon_envs.robots import RobotShape, check_robot, rest_qpos, robot_shape, traits_of
 from simrecon_envs.scene_builder import SceneBuilder, scene_extent
+from simrecon_envs.stepping import DirectStep, check_action, flatten
 from simrecon_envs.tasks import PickTaskConfig, kind_of
 from simrecon_envs.tasks.facts import scene_facts
 from simrecon_envs.viewpoints import camera, observing_cameras, parse_cameras
@@ -155,7 +154,7 @@ class SceneEnv(BaseEnv):
         self.cameras = parse_cameras(cameras)
         self._apply(plan_task(self.facts, task, target))
         self.measures: Measures | None = None
-        self._drive: DirectDrive | None = None
+        self._stepper: DirectStep | None = None
         self._info: dict[str, Array] = {}
         self.randomization = Randomization.parse(randomize)
         self._randomizer = Randomizer(self, self.randomization)
@@ -256,54 +255,15 @@ class SceneEnv(BaseEnv):
         Raises:
             UsageError: the action has another shape than the action space, or is not finite.
         """
-        if isinstance(action, np.ndarray | torch.Tensor):
-            self._check_action(action)
+        numbers = isinstance(action, np.ndarray | torch.Tensor)
+        if numbers:
+            check_action(self, action)
         if self.gpu_sim_enabled:
             return super().step(action)
-        # The same in NumPy: right after the physics, each of many operations of torch takes tens of microseconds.
-        action = self._step_action(action)
-        self._elapsed_steps.numpy()[:] += 1
-        info = self.get_info()
-        obs = self.get_obs(info, unflattened=True)
-        reward = self.get_reward(obs=obs, action=action, info=info)
-        self._last_obs = obs = self._flatten_raw_obs(obs)
-        ended = np.zeros(1, bool)
-        for reason in {"success", "fail"} & info.keys():
-            ended |= info[reason].numpy()
-        return obs, reward, torch.from_numpy(ended), torch.from_numpy(np.zeros(1, bool)), info
-
-    def _step_action(self, action: np.ndarray | torch.Tensor | dict | None) -> torch.Tensor | None:
-        """Simulate one control step: as ManiSkill does, with less work between the tensors and SAPIEN on the CPU."""
-        if self.gpu_sim_enabled or not isinstance(action, np.ndarray | torch.Tensor):
-            return super()._step_action(action)
-        if self._drive is None or self._drive.controller is not self.agent.controller:
-            self._drive = DirectDrive(self.agent)
-        action = action if isinstance(action, np.ndarray) else action.numpy(force=True)
-        batched = torch.from_numpy(action.astype(np.float32).reshape(1, -1))
-        self._drive.set_action(batched)
-        self._before_control_step()
-        for _ in range(self._sim_steps_per_control):
-            if not self._drive.idle:
-                self.agent.before_simulation_step()
-            self._before_simulation_step()
-            self.scene.step()
-            self._after_simulation_step()
-        self._after_control_step()
-        return batched
-
-    def _check_action(self, action: np.ndarray | torch.Tensor) -> None:
-        if self.agent is None:
-            raise UsageError("this environment has no robot: step(None)")
-        single, shape = self._orig_single_action_space.shape, tuple(action.shape)
-        if shape != (self.num_envs, *single) and not (self.num_envs == 1 and shape == single):
-            raise UsageError(f"action: expected the shape {(self.num_envs, *single)} or, of one environment, "
-                             f"{single}; got {shape}")  # fmt: skip
-        if isinstance(action, np.ndarray):
-            finite = np.isfinite(action).all()
-        else:
-            finite = self.gpu_sim_enabled or torch.isfinite(action).all()
-        if not finite:
-            raise UsageError("action: expected finite numbers, got NaN or infinity")
+        if self._stepper is None or not self._stepper.current:
+            self._stepper = DirectStep(self)
+        action = self._stepper.simulate(action) if numbers else super()._step_action(action)
+        return self._stepper.outcome(action)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
@@ -338,17 +298,19 @@ class SceneEnv(BaseEnv):
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (num_envs,) between 0 and the task's `max_reward`; 0 without a task."""
-        if self.task_object is None:
-            return torch.zeros(self.num_envs, device=self.device)
-        return tensor(self.task_object.reward(self._info))
+        return self._reward(1.0)
 
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (num_envs,) in [0, 1]."""
-        reward = self.compute_dense_reward(obs, action, info)
+        return self._reward(1.0 if self.task_object is None else self.task_object.max_reward)
+
+    def _reward(self, most: float) -> torch.Tensor:
         if self.task_object is None:
-            return reward
-        most = self.task_object.max_reward
-        return reward / most if self.gpu_sim_enabled else torch.from_numpy(reward.numpy() / np.float32(most))
+            return torch.zeros(self.num_envs, device=self.device)
+        reward = self.task_object.reward(self._info)
+        if isinstance(reward, torch.Tensor):
+            return reward / most
+        return torch.from_numpy(reward.astype(np.float32) / np.float32(most))
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return 1 where the task is done, else 0 (num_envs,)."""
@@ -375,35 +337,28 @@ class SceneEnv(BaseEnv):
         return self._randomizer.pictures(data, self._batched_episode_rng)
 
     def _flatten_raw_obs(self, obs: Any) -> Any:
-        leaves = list(_leaves(obs)) if self._obs_mode == "state" and not self.gpu_sim_enabled else []
-        if not leaves or any(leaf.ndim != 2 for leaf in leaves):
-            return super()._flatten_raw_obs(obs)
-        return torch.from_numpy(np.concatenate([leaf.numpy() for leaf in leaves], axis=1, dtype=np.float32))
+        flat = flatten(obs) if self._obs_mode == "state" and not self.gpu_sim_enabled else None
+        return super()._flatten_raw_obs(obs) if flat is None else flat
 
     def _get_obs_agent(self) -> dict:
         return super()._get_obs_agent() if self.agent is not None else {}
 
-    def _get_obs_extra(self, info: dict) -> dict:
-        obs = {}
+    def known(self) -> dict[str, Array]:
+        """Return what an agent is told besides its own joints, as of the last `evaluate`."""
+        out = {}
         if hasattr(self.agent, "tcp"):
-            obs["tcp_pose"] = tensor(self.measures.tcp)
-        known = self.task_object.observe(self._info) if self.task_object is not None else {}
-        known = {key: tensor(value) for key, value in known.items()}
+            out["tcp_pose"] = self.measures.tcp
+        told = self.task_object.observe(self._info) if self.task_object is not None else {}
         if not self.obs_mode_struct.use_state:
             # What a robot knows without being told where things are: its own touch, and the goal it was given.
-            return obs | {key: value for key, value in known.items() if key.endswith(PUBLIC)}
-        obs |= known
+            return out | {key: value for key, value in told.items() if key.endswith(PUBLIC)}
+        out |= told
         if self.movable_ids and self.observe_objects:
-            obs["object_poses"] = tensor(self.measures.poses.reshape(self.num_envs, -1))
-        return obs
+            out["object_poses"] = self.measures.poses.reshape(self.num_envs, -1)
+        return out
 
-
-def _leaves(obs: dict) -> Iterator[torch.Tensor]:
-    for value in obs.values():
-        if isinstance(value, dict):
-            yield from _leaves(value)
-        else:
-            yield value
+    def _get_obs_extra(self, info: dict) -> dict:
+        return {key: tensor(value) for key, value in self.known().items()}
 
 
 def _load(scene_id: str, revision: str | None, registry: str | None, strict: bool) -> tuple[SceneBundle, str]:

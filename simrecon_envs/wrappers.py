@@ -43,7 +43,8 @@ class BatchedTimeLimit(gym.Wrapper, RecordConstructorArgs):
         if self._max_episode_steps is not None:
             steps = self.unwrapped.elapsed_steps
             if steps.device.type == "cpu":  # in NumPy, which is several times as fast with one number
-                truncated = torch.from_numpy(truncated.numpy() | (steps.numpy() >= self._max_episode_steps))
+                over = steps.numpy() >= self._max_episode_steps
+                truncated = torch.from_numpy(truncated.numpy() | over) if over.any() else truncated
             else:
                 truncated = truncated | (steps >= self._max_episode_steps)
         return obs, reward, terminated, truncated, info

@@ -14,7 +14,7 @@ WITHIN_M = 0.035
 _DISTANCES_M = (0.10, 0.20)
 _UPRIGHT = 0.94
 _MAX_PUSHED_KG = 5.0
-_SLIM = 1.7  # times as high as wide
+_SLIM = 2.6  # times as high as wide
 
 
 class Push(Task):

@@ -1,0 +1,120 @@
+"""A control step of one environment on the CPU: action -> physics -> observation, reward, info.
+
+What ManiSkill's own step does, computed in NumPy and made tensors once, at the end: right after the physics, when the
+caches are cold, each operation of torch takes tens of microseconds.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.envs.sapien_env import BaseEnv
+
+from registry import UsageError
+from simrecon_envs.direct import DirectDrive
+
+_HOOKS = ("_before_control_step", "_after_control_step", "_before_simulation_step", "_after_simulation_step")
+
+
+class DirectStep:
+    """Steps of a `SceneEnv` that is built, until its controller or its simulation is another one."""
+
+    def __init__(self, env: Any) -> None:
+        """Look at what the environment has now."""
+        self._env = env
+        self._scene, agent = env.scene, env.agent
+        self._controller = None if agent is None else agent.controller
+        self._drive = None if agent is None else DirectDrive(agent)
+        self._hooked = any(getattr(type(env), name) is not getattr(BaseEnv, name) for name in _HOOKS)
+        # Numbers of the observation that need no dict of tensors on the way.
+        plain = agent is not None and type(agent).get_proprioception is BaseAgent.get_proprioception
+        self._flat = env.obs_mode == "state" and plain and not agent.controller.get_state()
+        self._robot = None if agent is None else agent.robot._objs[0]
+
+    @property
+    def current(self) -> bool:
+        """Return whether it was made for what the environment has now."""
+        env = self._env
+        agent = env.agent
+        return self._scene is env.scene and self._controller is (None if agent is None else agent.controller)
+
+    def simulate(self, action: np.ndarray | torch.Tensor) -> torch.Tensor:
+        """Simulate one control step with an action (k,) or (1, k); return it as (1, k)."""
+        env, drive = self._env, self._drive
+        numbers = action if isinstance(action, np.ndarray) else action.numpy(force=True)
+        batched = torch.from_numpy(numbers.astype(np.float32).reshape(1, -1))
+        drive.set_action(batched)
+        if drive.idle and not self._hooked:
+            step = env.scene.px.step
+            for _ in range(env._sim_steps_per_control):
+                step()
+            return batched
+        env._before_control_step()
+        for _ in range(env._sim_steps_per_control):
+            if not drive.idle:
+                env.agent.before_simulation_step()
+            env._before_simulation_step()
+            env.scene.step()
+            env._after_simulation_step()
+        env._after_control_step()
+        return batched
+
+    def outcome(self, action: torch.Tensor | None) -> tuple:
+        """Return observation, reward, terminated, truncated and info after the simulation."""
+        env = self._env
+        env._elapsed_steps.numpy()[:] += 1
+        info = env.get_info()
+        flat = self._observe() if self._flat else None
+        obs = env.get_obs(info, unflattened=True) if flat is None else flat
+        reward = env.get_reward(obs=obs, action=action, info=info)
+        env._last_obs = obs = env._flatten_raw_obs(obs) if flat is None else flat
+        ended = np.zeros(1, bool)
+        for reason in ("success", "fail"):
+            if reason in info:
+                ended |= info[reason].numpy()
+        return obs, reward, torch.from_numpy(ended), torch.from_numpy(np.zeros(1, bool)), info
+
+    def _observe(self) -> torch.Tensor | None:
+        """Return the observation "state" (1, n); None where a task observes something else than rows of numbers."""
+        parts = [self._robot.qpos[None], self._robot.qvel[None], *self._env.known().values()]
+        if any(part.ndim != 2 for part in parts):
+            return None
+        return torch.from_numpy(np.concatenate(parts, axis=1, dtype=np.float32))
+
+
+def check_action(env: Any, action: np.ndarray | torch.Tensor) -> None:
+    """Make sure that an action can be given to an environment's robot.
+
+    Raises:
+        UsageError: there is no robot, or the action has another shape than the action space, or is not finite.
+    """
+    if env.agent is None:
+        raise UsageError("this environment has no robot: step(None)")
+    single, shape = env._orig_single_action_space.shape, tuple(action.shape)
+    if shape != (env.num_envs, *single) and not (env.num_envs == 1 and shape == single):
+        raise UsageError(f"action: expected the shape {(env.num_envs, *single)} or, of one environment, "
+                         f"{single}; got {shape}")  # fmt: skip
+    if isinstance(action, np.ndarray):
+        finite = np.isfinite(action).all()
+    else:
+        finite = env.gpu_sim_enabled or torch.isfinite(action).all()
+    if not finite:
+        raise UsageError("action: expected finite numbers, got NaN or infinity")
+
+
+def flatten(obs: dict) -> torch.Tensor | None:
+    """Return an observation of rows (1, k) on the CPU as one row (1, n); None where it has something else."""
+    leaves = list(_leaves(obs))
+    if not leaves or any(leaf.ndim != 2 for leaf in leaves):
+        return None
+    return torch.from_numpy(np.concatenate([leaf.numpy() for leaf in leaves], axis=1, dtype=np.float32))
+
+
+def _leaves(obs: dict) -> Iterator[torch.Tensor]:
+    for value in obs.values():
+        if isinstance(value, dict):
+            yield from _leaves(value)
+        else:
+            yield value
