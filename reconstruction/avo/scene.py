@@ -9,7 +9,7 @@ import numpy as np
 from reconstruction.avo.clearance import Clearance, measure_clearance
 from reconstruction.avo.config import AvoConfig
 from reconstruction.gaussians.model import Gaussians
-from reconstruction.types import Camera, InstanceSet, Surface
+from reconstruction.types import Camera, InstanceSet, SpaceGrid, Surface
 from registry.errors import UsageError
 
 _INPUTS = 40  # input cameras that are looked at, evenly spread over the film
@@ -25,6 +25,7 @@ class ViewScene:
     instance: np.ndarray  # int32 (g,) id of the thing that each Gaussian belongs to; 0 = none
     base: tuple[int, ...]  # ids of floor, walls and ceiling
     clearance: Clearance
+    space: SpaceGrid  # what is known of space, where things are closed
     camera: Camera  # of the input frames
     inputs: np.ndarray  # float64 (n, 4, 4) world_from_camera of input frames, evenly spread
     frames: np.ndarray  # int (n,) their rows among the keyframes
@@ -69,6 +70,7 @@ def prepare_scene(
         instance=gaussian_instances(gaussians.means, surface.vertices, instances.vertex_instance),
         base=tuple(b.id for b in instances.base),
         clearance=measure_clearance(surface.space, poses[:, :3, 3]),
+        space=surface.space,
         camera=camera,
         inputs=poses[rows],
         frames=rows,

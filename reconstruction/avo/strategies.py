@@ -1,14 +1,15 @@
 """How viewpoints are chosen: the strategies that the paper compares, behind one interface."""
 
 import math
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from reconstruction.avo.cameras import look_at, square_camera
+from reconstruction.avo.closure import close_shape
 from reconstruction.avo.config import AvoConfig
+from reconstruction.avo.coverage import LEAST_PX, Coverage, Unseen
 from reconstruction.avo.scene import Target, ViewScene, reach_of
 from reconstruction.avo.search import Search
 from reconstruction.avo.starts import input_starts, starts_around
@@ -22,11 +23,10 @@ if TYPE_CHECKING:
 _APART_DEG = 25.0  # starts that are optimized look from directions at least this far apart
 _CANONICAL_PITCH_DEG = 25.0
 _BY_PIXELS = 0.15  # of the ranking of starts; the rest is by what is seen anew
-_SEEN_AT, _CLEAR_SHARE = 0.1, 0.2
 _FRONTS_FROM = 2  # every second input camera tells fronts from backs
 _BETTER = 1.03  # by this factor a start must show more than what the search made of it, to stay
+_CLOSED_AT_LAST = 0.3  # of that comparison is the closed shape's: it knows nothing of undersides
 _LARGE_STEPS = 2 / 3  # of the steps are taken for large targets
-_LEAST_PX = 0.05  # of a Gaussian; less is never a good view of it
 
 
 @dataclass(frozen=True)
@@ -49,57 +49,6 @@ class Strategy(Protocol):
 
     def choose(self, scene: ViewScene, target: Target, config: AvoConfig) -> list[Viewpoint]:
         """Return at most `config.views` viewpoints, the most informative first; none where nothing can be seen."""
-
-
-class Coverage:
-    """What is left of the target's effective opacities: alpha_i decays by what each view shows of it.
-
-    A Gaussian has a front, which frames saw, and a back, which shows through sides that no frame saw: it stands for
-    what is there, with less weight. What a view shows of a side is its rendered contribution beside the most that any
-    start shows of it. A tenth of that counts as seen; a fifth of the weight waits for a view as good as the best.
-    """
-
-    def __init__(self, opacities: np.ndarray, most: np.ndarray, back_weight: float) -> None:
-        """Start with nothing seen.
-
-        Args:
-            opacities: (m,) of the target's Gaussians.
-            most: (2, m) the largest contributions of their fronts and backs, sums over pixels of alpha T; what cannot
-                be seen does not count.
-            back_weight: of backs beside fronts.
-        """
-        sides = np.where(most > _LEAST_PX, np.array([[1.0], [back_weight]]), 0.0)
-        self._opacities = np.asarray(opacities, np.float64) * sides
-        self._total = max(float(self._opacities.sum()), 1e-12)
-        self._sides, self._most = sides, np.maximum(most, _LEAST_PX)
-        self._unseen, self._unclear = np.ones(most.shape), np.ones(most.shape)
-
-    @property
-    def left(self) -> np.ndarray:
-        """What is left of each side (2, m), as a share of its own."""
-        return (1.0 - _CLEAR_SHARE) * self._unseen + _CLEAR_SHARE * self._unclear
-
-    @property
-    def worth(self) -> np.ndarray:
-        """What is left of the effective opacity of each side (2, m), as a share of a front's."""
-        return self._sides * self.left
-
-    @property
-    def remaining(self) -> float:
-        """Share of the opacity that is left."""
-        return float((self._opacities * self.left).sum()) / self._total
-
-    def gain(self, contributions: np.ndarray) -> float:
-        """Return the share of the opacity that a view with these contributions (2, m) shows anew."""
-        return self.remaining - self.after(contributions).remaining
-
-    def after(self, contributions: np.ndarray) -> "Coverage":
-        """Return what is left after a view with these contributions (2, m)."""
-        out = copy(self)
-        share = contributions / self._most
-        out._unseen = self._unseen * (1.0 - np.clip(share / _SEEN_AT, 0.0, 1.0))
-        out._unclear = self._unclear * (1.0 - np.clip(share, 0.0, 1.0))
-        return out
 
 
 def _coverage(scene: ViewScene, target: Target, most: np.ndarray, config: AvoConfig) -> Coverage:
@@ -128,36 +77,43 @@ class ActiveViews:
         fine = _objective(scene, target, square_camera(config.side_px, config.fov_deg), config)
         search = Search(fine, scene.clearance, target.distance_m, weight, config)
         starts = input_starts(scene, target, config)
-        seen = [coarse.scan(start)[0][0] for start in starts[::_FRONTS_FROM]]
-        fine.fronts = coarse.fronts = _fronts(scene, target, np.array(seen))
+        filmed = [coarse.scan(start)[0][0] for start in starts[::_FRONTS_FROM]]
+        fine.fronts = coarse.fronts = _fronts(scene, target, np.array(filmed))
         if config.starts == "around":
             starts = np.concatenate([starts, starts_around(scene, target, config)])
         scanned = [_scan(coarse, start, target, fine.camera) for start in starts]
         shown = np.array([contributions for contributions, _ in scanned])
         if self._with_depth:
             starts = _at_target_distance(starts, np.array([z for _, z in scanned]), scene, target, config)
+        closed = close_shape(scene, target)
+        sights = closed.seen(starts, fine.camera)
         fixed = np.array([search.loss_of_place(start[:3, 3])[0] for start in starts])
-        coverage, out = _coverage(scene, target, shown.max(axis=0), config), []
+        unseen = Unseen.of(_coverage(scene, target, shown.max(axis=0), config), closed.areas, sights)
+        out: list[Viewpoint] = []
         while len(out) < config.views:
+            coverage = unseen.coverage
             information = np.einsum("ksm,sm->k", shown, coverage.worth)
-            fine.reference_px = max(float(information.max()), _LEAST_PX)
-            gains = np.array([coverage.gain(contributions) for contributions in shown])
-            scores = gains / max(gains.max(), 1e-9) + _BY_PIXELS * information / fine.reference_px - fixed
+            fine.reference_px = max(float(information.max()), LEAST_PX)
+            scores = unseen.worth_of(shown, sights) + _BY_PIXELS * information / fine.reference_px - fixed
             rows = _apart(starts, -scores, config.restarts)
             found = search.best_of(starts[rows], coverage.worth)
             if found is None:
                 break
-            pose, contributions = found.pose, _scan(fine, found.pose, target, fine.camera)[0]
-            for row in rows:  # what counts is what is seen anew: more pixels of less are no progress
-                if fixed[row] == 0.0 and coverage.gain(shown[row]) > _BETTER * coverage.gain(contributions):
-                    pose, contributions = starts[row], _scan(fine, starts[row], target, fine.camera)[0]
-            gain, coverage = coverage.gain(contributions), coverage.after(contributions)
+            # What counts is what is seen anew: more pixels of less are no progress.
+            poses = np.array([found.pose, *(starts[row] for row in rows if fixed[row] == 0.0)])
+            drawn = np.array([_scan(fine, pose, target, fine.camera)[0] for pose in poses])
+            seen = closed.seen(poses, fine.camera)
+            worth = unseen.worth_of(drawn, seen, _CLOSED_AT_LAST)
+            worth[0] *= _BETTER
+            best = int(np.argmax(worth))
+            gain = unseen.gain(drawn[best], seen[best])
             if gain < config.min_gain:
                 break
-            origin = "optimized" if pose is found.pose else "start"
-            fronts = float(contributions[0].sum() / max(contributions.sum(), 1e-9))
-            out.append(Viewpoint(pose, fine.camera, origin, gain, fronts))
-            if coverage.remaining < config.remaining_share:
+            fronts = float(drawn[best, 0].sum() / max(drawn[best].sum(), 1e-9))
+            origin, anew = "start" if best else "optimized", coverage.gain(drawn[best])
+            out.append(Viewpoint(poses[best], fine.camera, origin, anew, fronts))
+            unseen = unseen.after(drawn[best], seen[best])
+            if unseen.remaining < config.remaining_share:
                 break
         return out
 

@@ -13,10 +13,11 @@ import avo_room as room
 from reconstruction.avo import AvoConfig, find_views, load_inpainter, load_strategy, make_target
 from reconstruction.avo.cameras import look_at, moved, square_camera, step_gradient, upright
 from reconstruction.avo.clearance import measure_clearance
+from reconstruction.avo.coverage import Coverage
 from reconstruction.avo.objective import Objective
 from reconstruction.avo.scene import reach_of
 from reconstruction.avo.search import Search
-from reconstruction.avo.strategies import STRATEGIES, Coverage
+from reconstruction.avo.strategies import STRATEGIES
 from reconstruction.gaussians.fit import exponential
 from reconstruction.gaussians.model import SH_C0
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize

@@ -1,0 +1,158 @@
+"""The closed shape that a target probably has, and which of its surface a camera sees.
+
+Gaussians exist where frames saw surface. Of a half hidden thing the best views are those of the other half, of which
+there are none. So each thing is closed as cautiously as can be: the convex hull of what was seen and of its shadow on
+what it stands on, less what rays passed through. The hull of a bowl loses its hollow that way, that of a table
+the space between its legs.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reconstruction.avo.scene import Target, ViewScene
+from reconstruction.gaussians.threads import run_over
+from reconstruction.types import Camera
+
+_FREE, _SURFACE = 1, 2
+_CELLS, _LEAST_CELL_M = 28, 0.006  # along the longest side
+_OPAQUE = 0.3
+_STRAYS = (0.5, 99.5)  # percentiles
+_SMOOTH = 1.2  # cells
+_OWN_CELLS = 2  # cells of the surface so near to the target's are its own, where nothing else has Gaussians
+_STANDS_M = 0.01  # what lies lower than this above the bottom carries the target: no camera is below it
+
+
+@dataclass(frozen=True)
+class ClosedShape:
+    """Cells that the target probably fills, and points on their border."""
+
+    solid: np.ndarray  # bool (nx, ny, nz)
+    origin: np.ndarray  # float64 (3,) corner of cell (0, 0, 0)
+    cell_m: float
+    occupied: np.ndarray  # bool, cells of the scene's grid in which anything else is
+    space_origin: np.ndarray  # float64 (3,)
+    space_cell_m: float
+    points: np.ndarray  # float64 (n, 3), one on every free side of a cell
+    sides: np.ndarray  # float64 (n, 3) to where the cell ends
+    normals: np.ndarray  # float64 (n, 3) of the shape
+    areas: np.ndarray  # float64 (n,) shares of the surface
+
+    def seen(self, poses: np.ndarray, camera: Camera) -> np.ndarray:
+        """Tell which points cameras at these poses (k, 4, 4) see: bool (k, n)."""
+        out = np.zeros((len(poses), len(self.points)), bool)
+        run_over(
+            len(poses), _kernel(), np.ascontiguousarray(poses[:, :3, 3]), self.points, self.sides, self.normals,
+            self.solid, self.origin, self.cell_m, self.occupied, self.space_origin, self.space_cell_m, out,
+        )  # fmt: skip
+        for row, pose in zip(out, poses):
+            x, y, z = ((self.points - pose[:3, 3]) @ pose[:3, :3]).T
+            z = np.maximum(z, 1e-6)
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            row &= (z > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        return out
+
+
+def close_shape(scene: ViewScene, target: Target) -> ClosedShape:
+    """Return the closed shape of a target; each thing of a region is closed for itself."""
+    clouds = [cloud for number in target.ids if len(cloud := _cloud(scene, target, number))]
+    every = np.concatenate(clouds)
+    low, high = every.min(axis=0), every.max(axis=0)
+    cell = max(float((high - low).max()) / _CELLS, _LEAST_CELL_M)
+    origin = low - 1.5 * cell
+    shape = np.ceil((high - origin) / cell).astype(int) + 2
+    centers = origin + (np.stack(np.indices(shape), axis=-1).reshape(-1, 3) + 0.5) * cell
+    inside = np.zeros(len(centers), bool)
+    for cloud in clouds:
+        inside |= _in_hull(cloud, centers, 0.25 * cell)
+    inside[inside] = scene.space.lookup(centers[inside]) != _FREE
+    solid = inside.reshape(shape)
+    solid[tuple(np.floor((every - origin) / cell).astype(int).T)] = True
+    points, sides, normals, areas = _border(solid, origin, cell)
+    space = scene.space
+    return ClosedShape(
+        solid, origin, cell, _occupied(scene, target, every), np.asarray(space.origin, np.float64),
+        float(space.voxel_size_m), points, sides, normals, areas,
+    )  # fmt: skip
+
+
+def _kernel():
+    from reconstruction.avo.sight import see_points
+
+    return see_points
+
+
+def _cloud(scene: ViewScene, target: Target, number: int) -> np.ndarray:
+    """Return the centers (n, 3) of one thing's Gaussians that can be seen, without strays."""
+    rows = target.rows[scene.instance[target.rows] == number]
+    packed = scene.packed[rows].astype(np.float64)
+    opaque = 1.0 / (1.0 + np.exp(-packed[:, 9])) > _OPAQUE
+    means = packed[opaque if opaque.sum() > 3 else slice(None), :3]
+    if not len(means):
+        return means
+    low, high = np.percentile(means, _STRAYS, axis=0)
+    near = ((means >= low - 0.01) & (means <= high + 0.01)).all(axis=1)
+    return means[near] if near.any() else means
+
+
+def _in_hull(cloud: np.ndarray, centers: np.ndarray, slack: float) -> np.ndarray:
+    """Tell which centers (k, 3) lie in the hull of a cloud and of its shadow on its lowest height."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    shadow = np.column_stack([cloud[:, :2], np.full(len(cloud), cloud[:, 2].min())])
+    try:
+        hull = ConvexHull(np.concatenate([cloud, shadow]))
+    except (QhullError, ValueError):
+        return np.zeros(len(centers), bool)  # flat or a few points: nothing to fill
+    inside = np.ones(len(centers), bool)
+    for plane in np.unique(np.round(hull.equations, 6), axis=0):
+        inside &= centers @ plane[:3] + plane[3] < slack
+    return inside
+
+
+def _border(
+    solid: np.ndarray, origin: np.ndarray, cell: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the middle of every free side of a solid cell, its direction, the shape's normal there, and its share."""
+    from scipy import ndimage
+
+    slope = np.stack(np.gradient(ndimage.gaussian_filter(solid.astype(np.float32), _SMOOTH)), axis=-1)
+    points, sides, normals = [], [], []
+    for axis in range(3):
+        for way in (1, -1):
+            cells = np.argwhere(solid & ~np.roll(solid, -way, axis=axis))
+            side = np.zeros(3)
+            side[axis] = way
+            points.append(origin + (cells + 0.5 + 0.5 * side) * cell)
+            sides.append(np.tile(side, (len(cells), 1)))
+            normals.append(-slope[tuple(cells.T)])
+    side, normal = np.concatenate(sides), np.concatenate(normals).astype(np.float64)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    # A slope is made of steps, whose sides together are larger than it is.
+    area = np.maximum((side * normal).sum(axis=1), 0.05)
+    return np.concatenate(points), side, normal, area / area.sum()
+
+
+def _occupied(scene: ViewScene, target: Target, cloud: np.ndarray) -> np.ndarray:
+    """Return the cells of the scene's grid with surface of anything but the target and what carries it."""
+    space = scene.space
+    out = space.state == _SURFACE
+    shape = np.array(out.shape)
+
+    def cells_of(points: np.ndarray) -> np.ndarray:
+        cells = np.floor((points - space.origin) / space.voxel_size_m).astype(np.int64)
+        return cells[((cells >= 0) & (cells < shape)).all(axis=1)]
+
+    opaque = 1.0 / (1.0 + np.exp(-scene.packed[:, 9])) > _OPAQUE
+    opaque[target.rows] = False
+    others = np.zeros(out.shape, bool)
+    others[tuple(cells_of(scene.packed[opaque, :3].astype(np.float64)).T)] = True
+    span = np.arange(-_OWN_CELLS, _OWN_CELLS + 1)
+    around = np.stack(np.meshgrid(span, span, span, indexing="ij"), axis=-1).reshape(-1, 3)
+    own = np.unique(cells_of(cloud), axis=0)[:, None] + around[None]
+    own = np.clip(own.reshape(-1, 3), 0, shape - 1)
+    own = own[~others[tuple(own.T)]]
+    out[tuple(own.T)] = False
+    carrying = int(np.floor((cloud[:, 2].min() + _STANDS_M - space.origin[2]) / space.voxel_size_m)) + 1
+    out[:, :, : max(carrying, 0)] = False
+    return out
