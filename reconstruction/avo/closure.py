@@ -19,6 +19,7 @@ _CELLS, _LEAST_CELL_M = 28, 0.006  # along the longest side
 _OPAQUE = 0.3
 _STRAYS = (0.5, 99.5)  # percentiles
 _SMOOTH = 1.2  # cells
+_LEAST_SIDE = 0.05  # of a cell's side, however steep to the shape it is
 _OWN_CELLS = 2  # cells of the surface so near to the target's are its own, where nothing else has Gaussians
 _STANDS_M = 0.01  # what lies lower than this above the bottom carries the target: no camera is below it
 
@@ -128,8 +129,10 @@ def _border(
             normals.append(-slope[tuple(cells.T)])
     side, normal = np.concatenate(sides), np.concatenate(normals).astype(np.float64)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    # A slope is made of steps, whose sides together are larger than it is.
-    area = np.maximum((side * normal).sum(axis=1), 0.05)
+    # A slope is made of steps, whose sides together are larger than it is. A sheet of one cell has no slope.
+    along = (side * normal).sum(axis=1)
+    normal = np.where((along > _LEAST_SIDE)[:, None], normal, side)
+    area = np.maximum(along, _LEAST_SIDE)
     return np.concatenate(points), side, normal, area / area.sum()
 
 
