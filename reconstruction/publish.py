@@ -27,6 +27,7 @@ from reconstruction.scene_graph.publishing import graph_of_bundle
 from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
 from registry import SceneRecord, SceneRegistry, seal_bundle
 from registry.errors import EnvironmentMissing, SimReconError
+from registry.primitives import primitive_of
 from registry.report_card import failures
 
 if TYPE_CHECKING:
@@ -187,10 +188,12 @@ def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Pat
     home = Path("objects") / f"{item.id:03d}"
     (folder / home).mkdir(parents=True)
     write_glb(item.visual, folder / home / "visual.glb")
-    collision = []
+    collision, primitives = [], []
     for number, part in enumerate(placed.collision or item.collision):
         collision.append(str(home / f"collision_{number:03d}.obj"))
         write_obj(part, folder / collision[-1])
+        primitive = primitive_of(part.vertices)
+        primitives.append(None if primitive is None else primitive.as_json())
     extents = item.visual.vertices.max(axis=0) - item.visual.vertices.min(axis=0)
     physics = item.physics
     return {
@@ -201,6 +204,7 @@ def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Pat
         "scale": [float(x) for x in extents],
         "visual": str(home / "visual.glb"),
         "collision": collision,
+        "collision_primitives": primitives,
         "material": physics.material,
         "density_kg_m3": float(physics.density_kg_m3),
         "mass_kg": float(physics.mass_kg),

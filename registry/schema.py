@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from registry.errors import BundleError, UsageError
+from registry.primitives import SIZES
 
 SCHEMA = "simrecon.scene/1"
 _SCHEMA_PATTERN = re.compile(r"simrecon\.scene/(\d+)(\.\d+)?")
@@ -186,6 +187,8 @@ def _objects(items: list, base_ids: set[int]) -> set[int]:
         dynamic = _boolean(item, "dynamic", where)
         if not _paths(item, "collision", where, ".obj") and dynamic:
             _fail(f"{where}.collision", "at least one convex part, because the object is dynamic", [])
+        if "collision_primitives" in item:  # bundles of before had none
+            _primitives(item, where)
         _physics(item, where)
         provenance = _mapping(_get(item, "provenance", where), f"{where}.provenance")
         for key in ("geometry", "appearance", "physics"):
@@ -195,6 +198,23 @@ def _objects(items: list, base_ids: set[int]) -> set[int]:
         if "anchor" in item:
             _anchor(_mapping(item["anchor"], f"{where}.anchor"), f"{where}.anchor")
     return seen - base_ids
+
+
+def _primitives(item: dict, where: str) -> None:
+    where = f"{where}.collision_primitives"
+    entries = _sequence(item["collision_primitives"], where)
+    if len(entries) != len(item["collision"]):
+        _fail(where, f"{len(item['collision'])} entries, one for each collision part", len(entries))
+    for k, entry in enumerate(entries):
+        if entry is None:
+            continue
+        place = f"{where}[{k}]"
+        shape = _mapping(entry, place).get("shape")
+        if shape not in SIZES:
+            _fail(f"{place}.shape", " or ".join(f'"{x}"' for x in SIZES), shape)
+        if min(_vector(entry, "size", place, (SIZES[shape],), high=_MAX_METRES)) <= 0:
+            _fail(f"{place}.size", "lengths above 0 in metres", entry["size"])
+        _transform(entry, "object_from_primitive", place)
 
 
 def _physics(item: dict, where: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from registry.errors import BundleError, EnvironmentMissing, SimReconError
 from registry.geometry import matrix_from_quat, quat_from_matrix, rigid
+from registry.primitives import Primitive, primitive_of
 
 TIMESTEP_S = 1 / 240
 BASE_FRICTION, BASE_RESTITUTION = 0.5, 0.0  # of floors and walls; PhysX averages them with the object's own
@@ -315,7 +316,13 @@ def _pose(sapien: Any, world_from_object: np.ndarray) -> Any:
 
 
 def convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) -> Any:
-    """Cook one convex piece; pieces that are flat get a minimal thickness first."""
+    """Return the shape of one convex piece: the primitive that it is exactly, if it is one that stands; else its hull.
+
+    Pieces that are flat get a minimal thickness first. Floor and walls stay hulls.
+    """
+    primitive = None if spec.base else standing_primitive(part)
+    if primitive is not None:
+        return _primitive_shape(physx, primitive, material)
     points = cookable_points(part)
     try:
         return physx.PhysxCollisionShapeConvexMesh(
@@ -326,6 +333,25 @@ def convex_shape(physx: Any, part: np.ndarray, material: Any, spec: BodySpec) ->
             f"physics: PhysX cannot use a convex piece of '{spec.name}' (id {spec.id}, {len(points)} points, "
             f"extents {np.round(np.ptp(points, axis=0), 4).tolist()} m): {error}"
         ) from error
+
+
+def standing_primitive(part: np.ndarray) -> Primitive | None:
+    """Return the primitive that stands for a convex piece (v, 3) in physics and in exports; None: its hull does."""
+    primitive = primitive_of(part)
+    thick = primitive is not None and 2 * min(primitive.size) >= _MIN_PART_THICKNESS_M
+    return primitive if thick and primitive.stands else None
+
+
+def _primitive_shape(physx: Any, primitive: Primitive, material: Any) -> Any:
+    sapien, _ = _sapien()
+    pose = np.array(primitive.pose)
+    if primitive.shape == "box":
+        shape = physx.PhysxCollisionShapeBox(np.asarray(primitive.size, np.float32), material)
+    else:
+        shape = physx.PhysxCollisionShapeCylinder(*primitive.size, material)
+        pose[:3, :3] = np.stack([pose[:3, 2], pose[:3, 1], -pose[:3, 0]], axis=1)  # its axis is x there
+    shape.set_local_pose(_pose(sapien, pose))
+    return shape
 
 
 def cookable_points(part: np.ndarray) -> np.ndarray:

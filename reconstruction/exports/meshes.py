@@ -32,6 +32,11 @@ def collision_obj(body: ExportBody, number: int) -> str:
     return f"{stem(body)}_collision_{number:03d}.obj"
 
 
+def hulls_of(body: ExportBody) -> list[tuple[int, ConvexPart]]:
+    """Return the parts that no primitive stands for, with their numbers."""
+    return [(k, part) for k, part in enumerate(body.parts) if body.primitives[k] is None]
+
+
 def write_meshes(bodies: tuple[ExportBody, ...], folder: Path) -> None:
     """Write all meshes and textures below a folder."""
     (folder / FOLDER).mkdir(exist_ok=True)
@@ -39,7 +44,7 @@ def write_meshes(bodies: tuple[ExportBody, ...], folder: Path) -> None:
         mesh = read_glb(body.visual)
         write_texture(mesh, folder / texture_png(body))
         _write_textured_obj(mesh, folder / visual_obj(body), Path(texture_png(body)).name)
-        for number, part in enumerate(body.parts):
+        for number, part in hulls_of(body):
             _write_hull(part, folder / collision_obj(body, number))
 
 

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.exports.meshes import FOLDER, collision_obj, texture_png, visual_obj
+from reconstruction.exports.meshes import FOLDER, collision_obj, hulls_of, texture_png, visual_obj
 from reconstruction.exports.numbers import text_of
 from reconstruction.exports.scene import ExportBody, ExportScene
 from registry.geometry import invert_rigid, quat_from_matrix
+from registry.primitives import Primitive
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 # An elliptic cone and a high ratio of frictional to normal impedance keep things from creeping; noslip stops the rest.
@@ -75,7 +76,7 @@ def _add_assets(assets: ET.Element, body: ExportBody) -> None:
     ET.SubElement(assets, "mesh", name=f"{body.name}_visual", file=file, inertia="shell")
     ET.SubElement(assets, "texture", name=body.name, type="2d", file=Path(texture_png(body)).name)
     ET.SubElement(assets, "material", name=body.name, texture=body.name, specular="0", shininess="0")
-    for number in range(len(body.parts)):
+    for number, _ in hulls_of(body):
         file = Path(collision_obj(body, number)).name
         ET.SubElement(assets, "mesh", name=f"{body.name}_{number:03d}", file=file, inertia="convex")
 
@@ -102,10 +103,19 @@ def _add_body(parent: ET.Element, body: ExportBody, parent_from_body: np.ndarray
         )
     mesh = {"class": "visual", "name": f"{body.name}_visual", "mesh": f"{body.name}_visual"}
     ET.SubElement(element, "geom", mesh | {"material": body.name})
-    for number in range(len(body.parts)):
+    for number, primitive in enumerate(body.primitives):
         name = f"{body.name}_{number:03d}"
         friction = text_of([body.friction, _TORSION_M, _ROLLING_M])
-        ET.SubElement(
-            element, "geom", {"class": "collision", "name": name, "mesh": name, "friction": friction}
-        )
+        shape = {"mesh": name} if primitive is None else _primitive(primitive)
+        ET.SubElement(element, "geom", {"class": "collision", "name": name, "friction": friction} | shape)
     return element
+
+
+def _primitive(primitive: Primitive) -> dict[str, str]:
+    pose = primitive.pose
+    return {
+        "type": primitive.shape,
+        "size": text_of(primitive.size),
+        "pos": text_of(pose[:3, 3]),
+        "quat": text_of(quat_from_matrix(pose[:3, :3])),
+    }

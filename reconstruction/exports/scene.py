@@ -9,7 +9,8 @@ import numpy as np
 from reconstruction.types import ConvexPart
 from registry import SceneBundle
 from registry.errors import BundleError
-from registry.simulation import cookable_points, specs_from_bundle
+from registry.primitives import Primitive
+from registry.simulation import cookable_points, specs_from_bundle, standing_primitive
 from registry.welding import moving_ids, welded_to
 
 # The shares of the largest moment below which PhysX is not given the smaller ones (registry/simulation.py).
@@ -30,6 +31,7 @@ class ExportBody:
     world_from_object: np.ndarray  # float64 (4, 4) rigid
     visual: Path  # textured .glb
     parts: tuple[ConvexPart, ...]  # closed, faces outward
+    primitives: tuple[Primitive | None, ...]  # what each part is exactly, if it is a primitive that stands
     mass_kg: float  # 0 for base surfaces
     center_of_mass: np.ndarray  # float64 (3,)
     inertia: np.ndarray  # float64 (3, 3) about the centre of mass, object axes
@@ -84,6 +86,7 @@ def read_scene(bundle: SceneBundle) -> ExportScene:
                 world_from_object=np.asarray(spec.world_from_object, np.float64),
                 visual=bundle.resolve(entry["mesh" if spec.base else "visual"]),
                 parts=parts,
+                primitives=tuple(None if spec.base else standing_primitive(points) for points in spec.parts),
                 mass_kg=spec.mass_kg,
                 center_of_mass=spec.center_of_mass,
                 inertia=inertia,

@@ -9,6 +9,7 @@ from reconstruction.exports.meshes import collision_obj, visual_obj
 from reconstruction.exports.numbers import roll_pitch_yaw, text_of
 from reconstruction.exports.scene import ExportBody, ExportScene
 from registry.geometry import invert_rigid
+from registry.primitives import Primitive
 
 WORLD_LINK = "world"
 
@@ -63,8 +64,11 @@ def _link(body: ExportBody) -> ET.Element:
     ET.SubElement(contact, "lateral_friction", value=text_of([body.friction]))
     ET.SubElement(contact, "restitution", value=text_of([body.restitution]))
     _mesh(link, "visual", visual_obj(body))
-    for number in range(len(body.parts)):
-        _mesh(link, "collision", collision_obj(body, number))
+    for number, primitive in enumerate(body.primitives):
+        if primitive is None:
+            _mesh(link, "collision", collision_obj(body, number))
+        else:
+            _primitive(link, primitive)
     return link
 
 
@@ -72,6 +76,17 @@ def _mesh(link: ET.Element, kind: str, file: str) -> None:
     element = ET.SubElement(link, kind)
     ET.SubElement(element, "origin", xyz="0 0 0", rpy="0 0 0")
     ET.SubElement(ET.SubElement(element, "geometry"), "mesh", filename=file)
+
+
+def _primitive(link: ET.Element, primitive: Primitive) -> None:
+    element = ET.SubElement(link, "collision")
+    _origin(element, primitive.pose)
+    geometry = ET.SubElement(element, "geometry")
+    if primitive.shape == "box":
+        ET.SubElement(geometry, "box", size=text_of([2 * half for half in primitive.size]))
+    else:
+        radius, half = primitive.size
+        ET.SubElement(geometry, "cylinder", radius=text_of([radius]), length=text_of([2 * half]))
 
 
 def _origin(parent: ET.Element, pose: np.ndarray) -> None:

@@ -14,6 +14,7 @@ from reconstruction.exports.scene import ExportBody, ExportScene
 from reconstruction.types import ConvexPart, TexturedMesh
 from registry.errors import EnvironmentMissing
 from registry.geometry import invert_rigid, quat_from_matrix
+from registry.primitives import Primitive
 
 _ROOT = "/World"
 _ROUGHNESS = 0.85
@@ -90,7 +91,12 @@ def _add_body(pxr: Any, stage: Any, body: ExportBody, folder: Path) -> str:
     _dress(pxr, stage, looks, mesh, f"{path}/Looks/surface", texture_png(body))
     material = _physics_material(pxr, stage, f"{path}/Looks/contact", body)
     for number, part in enumerate(body.parts):
-        _add_piece(pxr, stage, f"{path}/collision_{number:03d}", part, material)
+        place, primitive = f"{path}/collision_{number:03d}", body.primitives[number]
+        if primitive is None:
+            piece = _add_hull(pxr, stage, place, part)
+        else:
+            piece = _add_primitive(pxr, stage, place, primitive)
+        _make_collider(pxr, piece, material)
     return texture_png(body)
 
 
@@ -160,14 +166,41 @@ def _physics_material(pxr: Any, stage: Any, path: str, body: ExportBody) -> Any:
     return material
 
 
-def _add_piece(pxr: Any, stage: Any, path: str, part: ConvexPart, material: Any) -> None:
-    """Add a convex piece: a collider that is not drawn."""
+def _add_hull(pxr: Any, stage: Any, path: str, part: ConvexPart) -> Any:
     piece = _add_mesh(pxr, stage, path, part.vertices, part.faces)
+    shape = pxr.UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim())
+    shape.CreateApproximationAttr(pxr.UsdPhysics.Tokens.convexHull)
+    return piece
+
+
+def _add_primitive(pxr: Any, stage: Any, path: str, primitive: Primitive) -> Any:
+    """Add a box, as a cube that is stretched, or a cylinder along its z axis."""
+    pose = primitive.pose
+    if primitive.shape == "box":
+        piece = pxr.UsdGeom.Cube.Define(stage, path)
+        piece.CreateSizeAttr(2.0)
+        extent = np.ones(3)
+    else:
+        piece = pxr.UsdGeom.Cylinder.Define(stage, path)
+        radius, half = primitive.size
+        piece.CreateRadiusAttr(radius)
+        piece.CreateHeightAttr(2 * half)
+        piece.CreateAxisAttr(pxr.UsdGeom.Tokens.z)
+        extent = np.array([radius, radius, half])
+    piece.CreateExtentAttr(pxr.Vt.Vec3fArray.FromNumpy(np.array([-extent, extent], np.float32)))
+    w, x, y, z = quat_from_matrix(pose[:3, :3]).tolist()
+    piece.AddTranslateOp().Set(pxr.Gf.Vec3d(*pose[:3, 3].tolist()))
+    piece.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(w, x, y, z))
+    if primitive.shape == "box":
+        piece.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*primitive.size))
+    return piece
+
+
+def _make_collider(pxr: Any, piece: Any, material: Any) -> None:
+    """Make a piece a collider that is not drawn."""
     piece.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
     prim = piece.GetPrim()
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
-    shape = pxr.UsdPhysics.MeshCollisionAPI.Apply(prim)
-    shape.CreateApproximationAttr(pxr.UsdPhysics.Tokens.convexHull)
     pxr.UsdShade.MaterialBindingAPI.Apply(prim).Bind(
         material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics"
     )

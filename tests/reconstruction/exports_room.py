@@ -156,6 +156,12 @@ def solid_box(bundle: SceneBundle, item: object, space: str = "world") -> np.nda
     return _bounds(transform_points(_pose(item), points) if space == "world" else points)
 
 
+def are_boxes(bundle: SceneBundle, item: object) -> list[bool]:
+    """Tell which collision pieces of an object are boxes; all of this room with eight corners that are not flat."""
+    points = [read_obj_points(bundle.resolve(path)) for path in item.collision]
+    return [len(corners) == 8 and np.ptp(corners, axis=0).min() > 0 for corners in points]
+
+
 def _pose(item: object) -> np.ndarray:
     return getattr(item, "world_from_object", np.eye(4))
 

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from notes import Notes
+from scipy.spatial import cKDTree
 
 from reconstruction.assets.collision import build, collision_parts, kept, kept_parts
 from reconstruction.assets.collision.decomposition import Decomposer
+from reconstruction.assets.collision.primitives import BOUND_M, fitted_primitive
 from reconstruction.assets.collision.rings import find_hole
 from reconstruction.assets.collision.slicing import own_levels
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
@@ -19,6 +21,7 @@ from reconstruction.synthetic import containers, furnishing
 from reconstruction.synthetic.furniture import Workshop
 from reconstruction.synthetic.things import Place, Thing
 from registry.errors import EnvironmentMissing
+from registry.primitives import primitive_of
 from registry.simulation import BodySpec, Physics
 
 manifold3d = pytest.importorskip("manifold3d")
@@ -227,3 +230,69 @@ def test_a_full_scene_leaves_an_object_fewer_parts_but_some():
     assert config.with_hulls(-3).hulls_small == LEAST_HULLS
     _, bowl = made("bowl", 0)
     assert len(collision_parts(bowl, config.with_hulls(10))) < len(collision_parts(bowl, config))
+
+
+def _turned(mesh, noise_m=0.0, lying=False):
+    """Return a solid of a mesh, at a heading, standing at z = 0, with noise on its vertices."""
+    trimesh = pytest.importorskip("trimesh")
+    mesh = mesh.copy()
+    if lying:
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0, 0, 1]))
+    noise = np.random.default_rng(5).uniform(-noise_m, noise_m, mesh.vertices.shape)
+    vertices = np.asarray(mesh.vertices) + noise + [0.03, -0.02, 0.0]
+    vertices[:, 2] -= vertices[:, 2].min()
+    return Solid(vertices, np.asarray(mesh.faces, np.int32))
+
+
+def _fine_box(size):
+    trimesh = pytest.importorskip("trimesh")
+    return trimesh.creation.box(size).subdivide().subdivide().subdivide()
+
+
+def _primitive_meshes():
+    creation = pytest.importorskip("trimesh").creation
+    can = creation.cylinder(0.035, 0.11, sections=48)
+    return {
+        "box": (_fine_box((0.2, 0.12, 0.07)), False, "box", (0.1, 0.06, 0.035)),
+        "can": (can, False, "cylinder", (0.035, 0.055)),
+        "lying can": (can, True, "cylinder", (0.035, 0.055)),
+        "ball": (creation.icosphere(3, 0.04), False, "sphere", (0.04,)),
+        "sausage": (creation.capsule(0.1, 0.03, [24, 24]), True, "capsule", (0.03, 0.05)),
+    }
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0008])
+@pytest.mark.parametrize("name", ["box", "can", "lying can", "ball", "sausage"])
+def test_what_fits_a_primitive_collides_as_it(name, noise_m):
+    trimesh = pytest.importorskip("trimesh")
+    mesh, lying, shape, size = _primitive_meshes()[name]
+    solid = _turned(mesh, noise_m, lying)
+    (part,) = collision_parts(solid, AssetsConfig())
+    primitive = primitive_of(part.vertices)
+    assert primitive.shape == shape
+    np.testing.assert_allclose(sorted(primitive.size), sorted(size), atol=1e-3)
+    assert part.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-3)
+    # Both ways, by another road: dense points of either surface beside the other one.
+    own = trimesh.Trimesh(part.vertices, part.faces)
+    seen = trimesh.Trimesh(solid.vertices, solid.faces)
+    one, other = (trimesh.sample.sample_surface(m, 60_000, seed=1)[0] for m in (own, seen))
+    gaps = [cKDTree(a).query(b)[0].max() for a, b in ((one, other), (other, one))]
+    assert max(gaps) < BOUND_M + 0.0015  # the points lie up to that far apart
+
+
+def test_what_fits_no_primitive_is_none():
+    trimesh = pytest.importorskip("trimesh")
+    egg = trimesh.creation.icosphere(3, 0.04).apply_scale((1.0, 1.0, 1.3))
+    others = [egg, trimesh.creation.cone(0.05, 0.1), trimesh.creation.cylinder(0.05, 0.1, sections=6)]
+    rough = (_fine_box((0.2, 0.12, 0.07)), 0.004)
+    for mesh, noise_m in (*((mesh, 0.0) for mesh in others), rough):
+        assert fitted_primitive(_turned(mesh, noise_m)) is None
+    for name in ("mug", "open_box", "tray"):
+        assert fitted_primitive(made(name, 0)[1]) is None
+
+
+def test_a_primitive_ends_where_things_stand_on_it():
+    solid = _turned(_fine_box((0.2, 0.12, 0.07)))
+    assert fitted_primitive(solid, (0.069,)) is not None
+    assert fitted_primitive(solid, (0.06,)) is None

@@ -71,6 +71,7 @@ def test_the_scene_is_whole_and_verified(undisturbed):
     for item in scene["objects"]:
         assert item["mass_kg"] > 0
         assert item["collision"]
+        assert len(item["collision_primitives"]) == len(item["collision"])
 
 
 def test_killed_in_every_stage_and_resumed_gives_the_same_bundle(video, undisturbed, tmp_path):

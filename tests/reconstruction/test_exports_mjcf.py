@@ -1,5 +1,7 @@
 """The MJCF export in MuJoCo itself: what is there, where, how heavy, and that it rests."""
 
+import itertools
+
 import numpy as np
 import pytest
 from exports_room import (
@@ -9,6 +11,7 @@ from exports_room import (
     LEAF,
     MOVING,
     MUG,
+    are_boxes,
     generated_room,
     names,
     solid_box,
@@ -42,9 +45,12 @@ def _pose(data, number):
 
 
 def _geom_points(model, data, geom):
-    mesh = model.geom_dataid[geom]
-    start = model.mesh_vertadr[mesh]
-    points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        points = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * model.geom_size[geom]
+    else:
+        mesh = model.geom_dataid[geom]
+        start = model.mesh_vertadr[mesh]
+        points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
     return points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
 
 
@@ -89,6 +95,8 @@ def test_mass_inertia_and_friction_are_those_of_the_bundle(bundle, model):
             g for g in range(model.ngeom) if model.geom_bodyid[g] == body.id and model.geom_group[g] == 3
         ]
         assert len(geoms) == len(item.collision)
+        boxes = [model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX for g in geoms]
+        assert boxes == are_boxes(bundle, item)
         np.testing.assert_allclose(model.geom_friction[geoms, 0], item.friction)
 
 

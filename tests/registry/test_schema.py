@@ -20,6 +20,7 @@ SCALED = np.diag([1.1, 1.1, 1.1, 1.0]).tolist()
 MIRRORED = np.diag([-1.0, 1, 1, 1]).tolist()
 BAD_ROW = [*np.eye(4).tolist()[:3], [0, 0, 0.1, 1]]
 FAR = (np.eye(4) + np.array([[0, 0, 0, 1e6]] + [[0] * 4] * 3)).tolist()
+BALL = {"shape": "sphere", "size": [0.1], "object_from_primitive": np.eye(4).tolist()}
 MISTAKES = [
     ("schema", "simrecon.scene/2", "upgrade"),
     ("schema", "other", "expected"),
@@ -49,6 +50,11 @@ MISTAKES = [
     ("objects[1].id", 1, "used twice"),
     ("objects[1].id", "2", "whole number"),
     ("objects[1].id", True, "whole number"),
+    ("objects[1].collision_primitives", [], "one for each collision part"),
+    ("objects[1].collision_primitives", [{**BALL, "shape": "cone"}], '"sphere"'),
+    ("objects[1].collision_primitives", [{**BALL, "size": [0.1, 0.1]}], "1 finite numbers"),
+    ("objects[1].collision_primitives", [{**BALL, "size": [0.0]}], "above 0"),
+    ("objects[1].collision_primitives", [{**BALL, "object_from_primitive": SCALED}], "rigid"),
     ("objects[1].mass_kg", -1, "expected a positive number of at most 1e+07, got -1"),
     ("objects[1].mass_kg", 0, "positive"),
     ("objects[1].mass_kg", "3", "positive"),

@@ -1,9 +1,12 @@
-"""Convex collision parts: layers between level faces, hulls of what is nearly convex, cut rings, else CoACD."""
+"""Convex collision parts: a primitive that fits; else layers between level faces, hulls of what is nearly convex, cut
+rings, CoACD.
+"""
 
 import numpy as np
 
 from reconstruction.assets.collision.convexity import nearly_convex, waste
 from reconstruction.assets.collision.decomposition import decompose
+from reconstruction.assets.collision.primitives import fitted_primitive, primitive_part
 from reconstruction.assets.collision.rings import find_hole, ring_pieces
 from reconstruction.assets.collision.slicing import sliced
 from reconstruction.assets.config import AssetsConfig
@@ -35,6 +38,9 @@ def collision_parts(
         progress: told of parts that could not be decomposed and collide as their hulls.
         name: of the object, for that.
     """
+    primitive = fitted_primitive(solid, levels)
+    if primitive is not None:
+        return (primitive_part(primitive),)
     low, high = _bounds(solid)
     whole = hull_solid(solid.vertices)
     pieces, crumbs = sliced(solid, levels)
