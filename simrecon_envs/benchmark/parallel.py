@@ -1,5 +1,6 @@
 """The same function on many things, in one process or in several; each has one thread."""
 
+import gc
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -19,17 +20,18 @@ class Workers:
 
     def __enter__(self) -> "Workers":
         """Start; processes begin with the first work."""
-        one_thread()
+        prepare_process()
         if self.jobs > 1:
             # A simulator must not be forked, so every process starts afresh.
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=one_thread)
+            self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=prepare_process)
         return self
 
     def __exit__(self, *exc: object) -> None:
         """End the processes; what was not begun is dropped."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
+        gc.unfreeze()  # of whoever called, once more its own affair
 
     def map(
         self, function: Callable[..., Any], items: Sequence[Any], *arguments: Any
@@ -44,8 +46,16 @@ class Workers:
             yield futures[future], future.result()
 
 
-def one_thread() -> None:
-    """Keep torch to one thread: its arrays are small, and episodes must not differ with the machine."""
+def prepare_process() -> None:
+    """Load the simulator, one thread: its arrays are small, and episodes must not differ with the machine.
+
+    What is loaded is taken out of the garbage collection, which ManiSkill runs whenever a scene is built anew, that is
+    before every episode, and which took a third of all time.
+    """
     import torch
 
+    import simrecon_envs.scene_env  # noqa: F401 - all that is heavy
+
     torch.set_num_threads(1)
+    gc.collect()
+    gc.freeze()
