@@ -1,7 +1,6 @@
 """Scenes -> a suite of tasks that can be done and are not done by themselves."""
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -86,7 +85,7 @@ def generate_suite(
         prover = _Prover(workers, settings, records, reporter)
         for scene in names:
             reporter.start(0, f"scene {scene}")
-            proven = list(_of_scene(scene, kinds, config, registry, prover, left_out))
+            proven = _of_scene(scene, kinds, config, registry, prover, left_out)
             tasks += [_task(candidate, proof, config.test_share) for candidate, proof in proven]
             counts = Counter(candidate.kind for candidate, _ in proven)
             found = ", ".join(f"{count} {kind}" for kind, count in counts.items())
@@ -169,34 +168,36 @@ def _of_scene(
     registry: Path | None,
     prover: _Prover,
     left_out: list[LeftOut],
-) -> Iterator[tuple[Candidate, Proof]]:
-    """Yield what is proven of a scene; the rest goes to `left_out`."""
+) -> list[tuple[Candidate, Proof]]:
+    """Return what is proven of a scene; the rest goes to `left_out`."""
     reserve = config.per_scene // _COMPOSITE_SHARE if SEQUENCE in kinds else 0
     singles = scene_candidates(scene, config.robots, kinds, registry)
-    found = list(_take(singles, config.per_scene - reserve, prover, left_out))
-    yield from found
-    if reserve:
-        pairs = list(composites([candidate for candidate, _ in found], most=reserve))
-        yield from _take(pairs, config.per_scene - len(found), prover, left_out)
+    found = _take(singles, config.per_scene - reserve, prover, left_out)
+    pairs = list(composites([candidate for candidate, _ in found], most=reserve)) if reserve else []
+    found += _take(pairs, config.per_scene - len(found), prover, left_out)
+    found += _take(singles, config.per_scene - len(found), prover, left_out)  # where composites are wanting
+    for candidate in singles + pairs:
+        reason = "; ".join(candidate.problems) or f"not tried: the scene has {len(found)} tasks without it"
+        left_out.append(_left(candidate, reason))
+    return found
 
 
 def _take(
     candidates: list[Candidate], most: int, prover: _Prover, left_out: list[LeftOut]
-) -> Iterator[tuple[Candidate, Proof]]:
-    """Yield the first `most` that are proven. As many are tried at once as are wanting, so that jobs change nothing."""
-    taken, position = 0, 0
-    while position < len(candidates) and taken < most:
-        batch = candidates[position : position + most - taken]
-        position += len(batch)
+) -> list[tuple[Candidate, Proof]]:
+    """Take the first `most` that are proven out of a list, and what was tried. As many are tried at once as are wanting,
+    so that jobs change nothing.
+    """
+    taken: list[tuple[Candidate, Proof]] = []
+    while candidates and len(taken) < most:
+        batch = candidates[: most - len(taken)]
+        del candidates[: len(batch)]
         for candidate, proof in zip(batch, prover(batch), strict=True):
             if proof.reason:
                 left_out.append(_left(candidate, proof.reason))
             else:
-                taken += 1
-                yield candidate, proof
-    for candidate in candidates[position:]:
-        reason = "; ".join(candidate.problems) or f"not tried: the scene has {most} such tasks without it"
-        left_out.append(_left(candidate, reason))
+                taken.append((candidate, proof))
+    return taken
 
 
 def _left(candidate: Candidate, reason: str) -> LeftOut:

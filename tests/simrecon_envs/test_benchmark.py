@@ -74,7 +74,7 @@ def test_a_suite_says_what_is_to_be_done_and_holds_no_place_of_this_machine(
     assert "/root" not in text
     reasons = {one.task: one.reason for one in suite.left_out}
     assert "cm wide" in reasons["pick_block"]
-    assert any("not tried: the scene has 3 such tasks" in reason for reason in reasons.values())
+    assert any("not tried: the scene has 3 tasks without it" in reason for reason in reasons.values())
 
 
 def test_the_oracle_does_all_of_it_again_and_doing_nothing_does_none(results: dict[str, Results]) -> None:
