@@ -185,8 +185,9 @@ def _of_scene(
 def _take(
     candidates: list[Candidate], most: int, prover: _Prover, left_out: list[LeftOut]
 ) -> list[tuple[Candidate, Proof]]:
-    """Take the first `most` that are proven out of a list, and what was tried. As many are tried at once as are wanting,
-    so that jobs change nothing.
+    """Take the first `most` that are proven out of a list, and what was tried.
+
+    As many are tried at once as are wanting, so that jobs change nothing.
     """
     taken: list[tuple[Candidate, Proof]] = []
     while candidates and len(taken) < most:

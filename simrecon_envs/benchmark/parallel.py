@@ -4,9 +4,10 @@ import gc
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
-from registry import UsageError
+from registry import EnvironmentMissing, UsageError
 
 
 class Workers:
@@ -43,7 +44,13 @@ class Workers:
             return
         futures = {self._pool.submit(function, item, *arguments): n for n, item in enumerate(items)}
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            try:
+                yield futures[future], future.result()
+            except BrokenProcessPool as error:
+                raise EnvironmentMissing(
+                    f"one of {self.jobs} processes was ended from outside, most likely as memory ran out; run the same "
+                    "command again with fewer --jobs: what was finished is kept"
+                ) from error
 
 
 def prepare_process() -> None:

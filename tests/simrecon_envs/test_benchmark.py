@@ -1,6 +1,7 @@
 """Suites: what is proven, that it is so in another run, what is left out, files, errors, comparisons."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import pytest
 from conftest import CUBE, SUITE_CONFIG
 
 from reconstruction.cli import main
-from registry import SceneRegistry, UsageError
+from registry import EnvironmentMissing, SceneRegistry, UsageError
 from simrecon_envs.benchmark.candidates import Candidate, composites, scene_candidates
 from simrecon_envs.benchmark.compare import compare_results
 from simrecon_envs.benchmark.files import Records
 from simrecon_envs.benchmark.generate import generate_suite
+from simrecon_envs.benchmark.parallel import Workers
 from simrecon_envs.benchmark.policies import PolicySpec
 from simrecon_envs.benchmark.proof import ProofSettings, prove
 from simrecon_envs.benchmark.results import Results, load_results
@@ -266,6 +268,12 @@ def test_the_command_line_runs_compares_and_explains(
     }.items():
         assert main(["benchmark", *wrong, "--registry", str(scenes_root)]) == 2
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_one_clear_error() -> None:
+    with Workers(2) as workers, pytest.raises(EnvironmentMissing, match="fewer --jobs"):
+        list(workers.map(os._exit, [3, 3]))
 
 
 @pytest.mark.slow
