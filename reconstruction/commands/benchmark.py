@@ -1,6 +1,7 @@
 """`simrecon benchmark`: a suite of tasks from scenes, policies in it, and what differs between them."""
 
 import argparse
+import textwrap
 from pathlib import Path
 
 from reconstruction.commands.environments import run_by_name
@@ -97,7 +98,7 @@ def _add_run(parts: argparse._SubParsersAction) -> None:
         "run",
         "run a policy in a suite",
         "Run a policy in a suite: success rate, path efficiency (success times the oracle's way over the longer of "
-        "both), steps and seconds, with 95 %% intervals, by kind, scene, robot and split. A run with --out that was "
+        "both), steps and seconds, with 95 % intervals, by kind, scene, robot and split. A run with --out that was "
         "killed goes on where it was.",
         _POLICY,
     )
@@ -173,7 +174,7 @@ def _part(
     return parts.add_parser(
         name,
         help=summary,
-        description=description,
+        description=textwrap.fill(description, 100),
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter if epilog else argparse.HelpFormatter,
     )
