@@ -107,6 +107,12 @@ class Hand:
             # What is carried may turn with the arm, or the wrist comes to its end.
             yield self.step(towards, swing * share if yaw is None else turn, base=base, share=share)
 
+    def rise(self, height_m: float) -> Iterator[np.ndarray]:
+        """Raise the hand straight up to a height in the world, if it is lower: what stands about is in no way then."""
+        if self.tip()[2] < height_m - 0.02:
+            above = np.array([*self.tip()[:2], height_m])
+            yield from self.go(lambda: above, within_m=0.02, base=False, patience=25)
+
     def grip(self, key: int) -> Iterator[np.ndarray]:
         """Reach over a thing, go down where it can be gripped and close the fingers; try another grasp if it slips."""
         for grasp in (self._env.facts.targets[key].grasps or (self._across(key),))[:_GRIPS]:
@@ -131,9 +137,7 @@ class Hand:
             return np.array([*there()[:2], self.place(key)[2] + top])
 
         self._open, self._opening, self.phase = True, grasp.opening_m, "reach"
-        if self.tip()[2] < self.place(key)[2] + top - 0.02:
-            above = np.array([*self.tip()[:2], self.place(key)[2] + top])
-            yield from self.go(lambda: above, within_m=0.02, base=False, patience=25)
+        yield from self.rise(float(over()[2]))
         yield from self.go(over, yaw=lambda: grasp.yaw_rad + turned())
         self.phase = "lower"
         # Its own fingers may move it: the way down is to where it was.
@@ -201,6 +205,7 @@ class Hand:
         low = max(low, _TIP_CLEARANCE_M + 0.006 - half)
         yaw = float(np.arctan2(along[0], -along[1]))  # the fingers side by side, across the way
         behind = self.place(key) - along * (radius + _FINGER_M + 0.03)
+        yield from self.rise(float(behind[2]) + half + _HOVER_M)
         yield from self.go(lambda: behind + _up(half + _HOVER_M), yaw=lambda: yaw)
         yield from self.go(lambda: behind + _up(low), yaw=lambda: yaw, within_m=0.01, patience=40)
         self.phase = "push"

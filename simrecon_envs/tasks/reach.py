@@ -12,6 +12,7 @@ from simrecon_envs.tasks.spec import TaskSpec
 
 ABOVE_M = 0.05  # over the object's top
 WITHIN_M = 0.025
+_OVER_M = 0.04  # from where a script comes down
 STILL_RAD_S = 0.3
 TOUCHED_M = 0.03  # an object that was moved by more was knocked over, not reached
 
@@ -64,5 +65,8 @@ class Reach(Task):
         }
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
+        yield from hand.rise(float(numpy(self._goal())[0, 2]) + _OVER_M)
+        over = numpy(self._goal())[0] + [0, 0, _OVER_M]
+        yield from hand.go(lambda: over, within_m=0.02, patience=40)
         yield from hand.go(lambda: numpy(self._goal())[0], within_m=0.008)
         yield from hand.wait(20)
