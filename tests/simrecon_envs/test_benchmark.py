@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CUBE, SUITE_CONFIG
+from made_scenes import CUBE
+from made_suites import SUITE_CONFIG
 
 from reconstruction.cli import main
 from registry import EnvironmentMissing, SceneRegistry, UsageError

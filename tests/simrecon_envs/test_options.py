@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import BLOCK, BOX, CRATE, CUBE, CYLINDER
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from made_scenes import BLOCK, BOX, CRATE, CUBE, CYLINDER
 
 import simrecon_envs
 from registry import SceneNotFound, UsageError

@@ -7,7 +7,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from conftest import BOX, PICTURE
+from made_scenes import BOX, PICTURE
 
 import simrecon_envs
 from simrecon_envs.rollout import record_rollout, render_scene_picture

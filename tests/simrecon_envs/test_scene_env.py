@@ -11,9 +11,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import BOOK, BOX, CYLINDER, KNOB, PICTURE, TABLE, TABLE_TOP_M
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from made_scenes import BOOK, BOX, CYLINDER, KNOB, PICTURE, TABLE, TABLE_TOP_M
 
 import simrecon_envs
 from registry import EnvironmentMissing, SceneNotFound, SceneRegistry, UsageError

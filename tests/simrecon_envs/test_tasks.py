@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import BLOCK, CRATE, CUBE, CYLINDER, TABLE
+from made_scenes import BLOCK, CRATE, CUBE, CYLINDER, TABLE
 
 import simrecon_envs
 from registry import SceneRegistry, UsageError
