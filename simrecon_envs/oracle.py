@@ -26,7 +26,7 @@ _GRIPS = 3
 _LOWER_PATIENCE_STEPS = 35
 _TURN_RAD = 0.06
 _PUSH_SHARE = 0.12
-_LEVER = 0.8  # how high a thing may be pushed, to half its width
+_LEVER = 1.4  # how high a thing may be pushed, to half its width
 _FINGER_M = 0.022  # half the thickness of closed fingers, along the push
 _TORSO, _FORWARD, _TURN = 9, 10, 11  # places in Fetch's action
 
