@@ -23,7 +23,7 @@ from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
-from reconstruction.assets.volume import ObjectFrame, ObjectVolume, frame_object, fuse_volume
+from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, frame_object, fuse_volume
 from reconstruction.avo import SceneViews
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import (
@@ -247,6 +247,8 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     frame = with_copies(frame, sides)
     volume = fuse_volume(item.id, frame, noise, scene.posed, scene.depth, scene.pixels, config)
     furniture = float(np.ptp(frame.points, axis=0).max()) > config.furniture_m
+    if not sides:
+        frame = confirmed(frame, volume)
     # A container's rim may be close to what it holds; a table has none.
     grow = max(2.0 * volume.noise_m, volume.voxel_m, 0.012 if furniture else 0.004)
     volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from reconstruction.assets import symmetry
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.tails import without_whiskers
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 
 _HIDDEN_M = 0.02  # of a foot
@@ -43,7 +44,10 @@ def complete(
         solid |= _contact(volume, hull, frame, solid, furniture=furniture)
     field = np.where(volume.known, volume.distance, np.where(solid, -volume.trunc_m, volume.trunc_m))
     field = _keep_shells(field.astype(np.float32), volume, config)
-    return CompletedField(volume.origin, volume.voxel_m, _blend(field, volume, frame), tuple(names))
+    field = _blend(field, volume, frame)
+    if frame.wall_y is None:
+        field = without_whiskers(field, volume.voxel_m, top=furniture)
+    return CompletedField(volume.origin, volume.voxel_m, field, tuple(names))
 
 
 def _settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume:

@@ -89,6 +89,7 @@ def fuse_object(
     confidence,
     ids,
     cosine,
+    inner,
     frames,
     camera_from_grid,
     fx,
@@ -102,13 +103,15 @@ def fuse_object(
     trunc,
     tau,
     shell,
+    shade,
 ):  # pragma: no cover - compiled
     """Sum the evidence of all frames in every voxel of one object's grid.
 
     Returns (nx, ny, nz) each: soft-maximum numerator and denominator of signed distances to the object's seen
     surface, number of frames whose ray passed through, number of frames that saw the object's surface there,
-    number of frames that see something else there that does not hide the voxel, and number of frames that saw the
-    object's surface less than `shell` in front of it.
+    number of frames that see something else there that does not hide the voxel, number of frames that saw the
+    object's surface less than `shell` in front of it, number of frames that saw its surface there well inside
+    its outline, and number of frames that saw its surface before the voxel, but less than `shade` before it.
     """
     nx, ny, nz = shape
     numerator = np.zeros((nx, ny, nz), np.float32)
@@ -117,6 +120,8 @@ def fuse_object(
     support = np.zeros((nx, ny, nz), np.uint16)
     outside = np.zeros((nx, ny, nz), np.uint16)
     behind = np.zeros((nx, ny, nz), np.uint16)
+    within = np.zeros((nx, ny, nz), np.uint16)
+    shaded = np.zeros((nx, ny, nz), np.uint16)
     h, w = depth.shape[1:]
     for i in prange(nx):
         gx = origin[0] + (i + 0.5) * voxel
@@ -125,6 +130,7 @@ def fuse_object(
             for k in range(nz):
                 gz = origin[2] + (k + 0.5) * voxel
                 num, den, n_free, n_near, n_outside, n_behind = 0.0, 0.0, 0, 0, 0, 0
+                n_within, n_shaded = 0, 0
                 for q in range(len(frames)):
                     f = frames[q]
                     m = camera_from_grid[q]
@@ -147,6 +153,8 @@ def fuse_object(
                         along = (d - z) * ray
                         s = along * max(cos, 0.25)
                         if along < -trunc and s < -0.5 * trunc:
+                            if along > -shade:
+                                n_shaded += 1
                             continue
                         weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
                         if s >= trunc:
@@ -155,6 +163,8 @@ def fuse_object(
                             continue
                         if cos > 0:
                             n_near += 1
+                            if inner[f, iv, iu]:
+                                n_within += 1
                             if s < 0 and s > -shell:
                                 n_behind += 1
                         soft = weight * math.exp(max(s, -trunc) / tau)
@@ -172,7 +182,9 @@ def fuse_object(
                 support[i, j, k] = n_near
                 outside[i, j, k] = n_outside
                 behind[i, j, k] = n_behind
-    return numerator, denominator, freed, support, outside, behind
+                within[i, j, k] = n_within
+                shaded[i, j, k] = n_shaded
+    return numerator, denominator, freed, support, outside, behind, within, shaded
 
 
 @njit(cache=True, inline="always")

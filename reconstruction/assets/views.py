@@ -5,10 +5,13 @@ Prepared once per scene and shared by all objects.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from reconstruction.types import DepthMaps, PosedFrames
 from registry.geometry import invert_rigid, transform_points
+
+_OUTLINE_PX = 3  # so far inside its outline a thing's pixels are surely its own
 
 
 @dataclass(frozen=True)
@@ -19,6 +22,7 @@ class ScenePixels:
     confidence: np.ndarray  # uint8 (n, h, w)
     ids: np.ndarray  # uint16 (n, h, w)
     cosine: np.ndarray  # float32 (n, h, w) of the angle between ray and surface normal; 0 at depth edges
+    inner: np.ndarray  # bool (n, h, w) the pixels around show the same thing: depth and ids err at outlines
     noise_relative: float  # 1-sigma of depth over depth
 
 
@@ -29,13 +33,21 @@ def prepare_pixels(posed: PosedFrames, depth: DepthMaps, id_maps: np.ndarray) ->
     maps = np.ascontiguousarray(depth.depth, np.float32)
     camera = depth.camera
     cosine = incidence_cosines(maps, camera.fx, camera.fy, camera.cx, camera.cy)
+    ids = np.ascontiguousarray(id_maps, np.uint16)
     return ScenePixels(
         maps,
         np.ascontiguousarray(depth.confidence, np.uint8),
-        np.ascontiguousarray(id_maps, np.uint16),
+        ids,
         cosine,
+        inner_pixels(ids),
         measure_noise(posed, depth),
     )
+
+
+def inner_pixels(ids: np.ndarray) -> np.ndarray:
+    """Tell which pixels (n, h, w) of id images have the same id all around, `_OUTLINE_PX` pixels far."""
+    kernel = np.ones((2 * _OUTLINE_PX + 1,) * 2, np.uint8)
+    return np.stack([cv2.erode(image, kernel) == cv2.dilate(image, kernel) for image in ids])
 
 
 def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:

@@ -4,11 +4,12 @@ The `grid` frame has its origin at the support below the object's centre, +z up,
 object space once the shape is complete (only shifted, so that the origin is at the bottom centre).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.tails import away_directions, behind_rims
 from reconstruction.assets.views import ScenePixels, SeenPoints
 from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, rigid, transform_points
@@ -16,6 +17,8 @@ from registry.geometry import invert_rigid, rigid, transform_points
 _SMEAR_M = (0.025, 0.06)  # smeared depth ends before, and what lies farther off says little
 _SMEAR_HEIGHT_M = 0.03
 _LEVEL_M = 0.003
+_MIN_CONFIRMED = 0.7  # of a thing's points, or its volume is too poor to judge them
+_SHADOW_M = 0.05  # behind a thing's rim: there ends what errs at its outline
 
 
 @dataclass(frozen=True)
@@ -261,9 +264,9 @@ def fuse_volume(
     tau = max(0.6 * trunc, 2.0 * noise)
     camera = depth.camera
     shell = max(2.2 * voxel, config.min_thickness_m)
-    numerator, denominator, freed, support, outside, behind = fuse_object(
-        pixels.depth, pixels.confidence, pixels.ids, pixels.cosine, frames, camera_from_grid, camera.fx, camera.fy,
-        camera.cx, camera.cy, target, shape, origin, voxel, trunc, tau, shell,
+    numerator, denominator, freed, support, outside, behind, inner, shadowed = fuse_object(
+        pixels.depth, pixels.confidence, pixels.ids, pixels.cosine, pixels.inner, frames, camera_from_grid, camera.fx,
+        camera.fy, camera.cx, camera.cy, target, shape, origin, voxel, trunc, tau, shell, _SHADOW_M,
     )  # fmt: skip
     # Surface that only one or two of many frames report is a depth error at an outline.
     near = (denominator > 0) & (support >= int(np.clip(len(frames) // 8, 1, 3)))
@@ -272,6 +275,9 @@ def fuse_volume(
     near &= ~skirt
     if size.max() <= config.furniture_m and near.any():
         near &= support >= 0.12 * np.percentile(support[near], 75)
+    if near.any():
+        away = away_directions(camera_from_grid, 0.5 * (low + high))
+        near &= ~behind_rims(near, support, inner, shadowed, away)
     distance = np.where(near, numerator / np.maximum(denominator, 1e-12), 0).astype(np.float32)
     # One stray ray does not free a voxel that many frames saw as surface.
     enough = np.minimum(2, max(1, len(frames) // 6))
@@ -286,3 +292,17 @@ def fuse_volume(
     wall = mixed & (behind >= max(3.0, 0.35 * usual)) & (behind > 0.7 * freed) & (distance > -1.5 * voxel)
     distance[wall] = -1.5 * voxel
     return ObjectVolume(origin, voxel, trunc, noise, distance, near | free, free & (distance > 0), near)
+
+
+def confirmed(frame: ObjectFrame, volume: ObjectVolume) -> ObjectFrame:
+    """Return the frame without points where all frames together see no surface of the object."""
+    from scipy.ndimage import binary_dilation
+
+    near = binary_dilation(volume.seen, np.ones((3, 3, 3)))
+    cell = np.floor((frame.points - volume.origin) / volume.voxel_m).astype(int)
+    inside = np.all((cell >= 0) & (cell < near.shape), axis=1)
+    keep = np.zeros(len(cell), bool)
+    keep[inside] = near[tuple(cell[inside].T)]
+    if keep.mean() < _MIN_CONFIRMED:
+        return frame
+    return replace(frame, points=frame.points[keep], normals=frame.normals[keep])
