@@ -7,6 +7,7 @@ import numpy as np
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
+from reconstruction.instances.doubts import as_drawn, without_doubts
 from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
@@ -14,6 +15,7 @@ from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.refine import refine_by_views
 from reconstruction.instances.rules import cut_by_rules
 from reconstruction.instances.scraps import without_unseen
+from reconstruction.instances.sightings import sightings
 from reconstruction.progress import Progress
 from reconstruction.types import DepthMaps, InstanceSet, PosedFrames, Surface
 
@@ -42,11 +44,13 @@ def find_instances(
     progress.start(3, "base planes and things")
     shell = Shell.of(surface, progress)
     progress.advance()
+    frames = sightings(surface, posed, depth)
     if masks is None:
-        cut = cut_by_rules(shell, surface, posed, depth, config, progress)
+        cut = cut_by_rules(shell, surface, posed, depth, frames, config, progress)
         cut = refine_by_views(shell, cut, surface, posed, depth, config, progress)
     else:
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
+    taken = without_doubts(shell, cut.things, frames, progress)
     progress.advance()
     vertex_instance = cut.owner.copy()
     objects = describe(shell.graph, cut.things, shell.base, vertex_instance)
@@ -54,7 +58,8 @@ def find_instances(
     if not objects:
         progress.note("No separate things were found: the scene is an empty room.")
     told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
-    id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, told, progress=progress)
+    drawn = as_drawn(vertex_instance, taken)
+    id_maps = render_id_maps(posed, depth, surface, drawn, config, told, progress=progress)
     return without_unseen(InstanceSet(vertex_instance, shell.base, objects, id_maps), config, progress)
 
 

@@ -13,6 +13,7 @@ from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.scraps import without_fragments, without_skirts
 from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.side_by_side import cut_side_by_side
+from reconstruction.instances.sightings import Sighting
 from reconstruction.instances.smears import without_smears
 from reconstruction.instances.stacks import cut_stacks
 from reconstruction.instances.stands import merge_stands
@@ -27,6 +28,7 @@ def cut_by_rules(
     surface: Surface,
     posed: PosedFrames,
     depth: DepthMaps,
+    frames: list[Sighting],
     config: InstancesConfig,
     progress: Progress,
 ) -> Cut:
@@ -48,7 +50,7 @@ def cut_by_rules(
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)
-    things = without_smears(shell, surface, things, owner, posed, depth, config, progress)
+    things = without_smears(shell, things, owner, frames, config, progress)
     things = cut_side_by_side(graph, surface, things, config, progress)
     things = cut_stacks(graph, surface, things, posed, depth, config, progress)
     things = without_skirts(graph, things, progress)

@@ -6,23 +6,17 @@ the frames they give themselves away: along the line of sight, what they show is
 from wherever one looks, while a thing has a color of its own before a changing background.
 """
 
-from dataclasses import dataclass
-
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.boxes import quantiles
-from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.sightings import Sighting
 from reconstruction.progress import Progress
-from reconstruction.rasterize import rasterize_mesh
 from reconstruction.surface.base_planes import FittedPlane, plane_axes
-from reconstruction.surface.mesh_graph import MeshGraph, lab_from_rgb, pieces
-from reconstruction.types import DepthMaps, PosedFrames, Surface
-from registry.geometry import invert_rigid
+from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 _LARGEST_M = 0.6  # furniture stands along walls and may have their color
 _REACHES_M = 0.06  # a smear goes on to the wall
@@ -30,30 +24,16 @@ _MAX_FRAMES, _MIN_SEEN, _SURE_SHARE = 36, 2, 0.6
 _ALIKE = 6.0
 _CELL_M, _NEAR_M = 0.015, 0.25  # of the wall's picture; beyond what is known of it
 _ON_WALL_M, _ON_WALL = 0.015, 0.01  # depth this near shows the wall: metres, share of depth
-_SLACK = 0.012  # of depth: surface this far behind what is drawn is seen all the same
 _LEAST_M2 = 5e-4  # of a smear
 _SCRAP_SHARE = 0.1  # of the largest piece that is left
 _MOST_SHARE = 0.6  # of a thing's area: one of the wall's color cannot be told from the wall
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A keyframe at depth resolution."""
-
-    camera_from_world: np.ndarray  # float64 (4, 4)
-    eye: np.ndarray  # float64 (3,)
-    lab: np.ndarray  # float32 (h, w, 3) weighted CIELAB
-    measured: np.ndarray  # float32 (h, w) depth
-    drawn: np.ndarray  # float32 (h, w) depth of the fused surface
-
-
 def without_smears(
     shell: Shell,
-    surface: Surface,
     things: list[Thing],
     owner: np.ndarray,
-    posed: PosedFrames,
-    depth: DepthMaps,
+    frames: list[Sighting],
     config: InstancesConfig,
     progress: Progress,
 ) -> list[Thing]:
@@ -61,11 +41,9 @@ def without_smears(
 
     Args:
         shell: the surface and its base.
-        surface: the surface in world space.
         things: what was found; theirs are the vertices.
         owner: int32 (v,) base entity of each vertex; smears are written into it.
-        posed: keyframes with cameras in world space.
-        depth: their depth in metres.
+        frames: keyframes, the surface drawn into them.
         config: how large a thing is at least.
         progress: told of how many things had smears.
 
@@ -73,15 +51,13 @@ def without_smears(
         The same things.
     """
     graph, cleaned = shell.graph, 0
-    frames: list[_Frame] = []
     for row, wall in enumerate(shell.planes):
         near = [thing for thing in things if wall.label == "wall" and _reaches(graph, thing, wall)]
         if not near:
             continue
-        frames = frames or _frames(surface, posed, depth)
-        picture = _WallPicture(graph, wall, frames, depth)
+        picture = _WallPicture(graph, wall, frames)
         for thing in near:
-            smear = _smear(graph, thing.vertices, wall, picture, frames, depth)
+            smear = _smear(graph, thing.vertices, wall, picture, frames)
             smear = _with_scraps(graph, thing.vertices, smear)
             left = graph.areas[thing.vertices].sum() - graph.areas[smear].sum()
             enough = left > (1.0 - _MOST_SHARE) * graph.areas[thing.vertices].sum()
@@ -101,36 +77,10 @@ def _reaches(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
     return bool(quantiles(wall.distance(points), areas, (0.02,))[0] < _REACHES_M)
 
 
-def _frames(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[_Frame]:
-    count, camera = len(posed.images), depth.camera
-    out = []
-    for row in np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int)):
-        pose = np.asarray(posed.world_from_camera[row], np.float64)
-        image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        drawn = rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth
-        lab = lab_from_rgb(image) * LIGHTNESS_WEIGHT
-        out.append(_Frame(invert_rigid(pose), pose[:3, 3], lab, np.asarray(depth.depth[row]), drawn))
-    return out
-
-
-def _seen_at(
-    points: np.ndarray, frame: _Frame, depth: DepthMaps
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pixel row and column of points (n, 3), clipped, and their z-depth, 0 where they are outside."""
-    camera, pose = depth.camera, frame.camera_from_world
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    z = np.maximum(local[:, 2], 1e-6)
-    u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
-    inside = (local[:, 2] > 0.1) & (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
-    row = np.clip(v, 0, camera.height - 1).astype(int)
-    column = np.clip(u, 0, camera.width - 1).astype(int)
-    return row, column, np.where(inside, local[:, 2], 0.0)
-
-
 class _WallPicture:
     """The colors of a wall where frames see it."""
 
-    def __init__(self, graph: MeshGraph, wall: FittedPlane, frames: list[_Frame], depth: DepthMaps) -> None:
+    def __init__(self, graph: MeshGraph, wall: FittedPlane, frames: list[Sighting]) -> None:
         self.axes = np.stack(plane_axes(wall.plane), axis=1)
         flat = graph.points[wall.members] @ self.axes
         low, high = np.percentile(flat, 0.2, axis=0), np.percentile(flat, 99.8, axis=0)
@@ -139,7 +89,7 @@ class _WallPicture:
         points = cells @ self.axes.T - wall.plane[3] * wall.plane[:3]
         total, count = np.zeros((len(points), 3)), np.zeros(len(points))
         for frame in frames:
-            row, column, z = _seen_at(points, frame, depth)
+            row, column, z = frame.seen_at(points)
             off = np.abs(frame.measured[row, column] - z)
             seen = (z > 0) & (frame.measured[row, column] > 0) & (off < np.maximum(_ON_WALL * z, _ON_WALL_M))
             total[seen] += frame.lab[row[seen], column[seen]]
@@ -158,14 +108,14 @@ class _WallPicture:
 
 
 def _smear(
-    graph: MeshGraph, body: np.ndarray, wall: FittedPlane, picture: _WallPicture, frames: list[_Frame], depth: DepthMaps
+    graph: MeshGraph, body: np.ndarray, wall: FittedPlane, picture: _WallPicture, frames: list[Sighting]
 ) -> np.ndarray:  # fmt: skip
     """Return the vertices of a body that show the wall and go on to it."""
     points = graph.points[body]
     like, seen = np.zeros(len(body)), np.zeros(len(body))
     for frame in frames:
-        row, column, z = _seen_at(points, frame, depth)
-        shown = (z > 0) & (z < frame.drawn[row, column] * (1.0 + _SLACK))
+        row, column, z = frame.seen_at(points)
+        shown = frame.shown(row, column, z)
         rays = points - frame.eye
         toward = rays @ wall.plane[:3]
         behind = shown & (toward < 0) & (wall.distance(points) > 0)

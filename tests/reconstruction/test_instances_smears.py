@@ -8,6 +8,7 @@ from surfaces import frames_of, looking_at, merged, sheet, solid_box, surface_fr
 from reconstruction.instances import InstancesConfig
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.sightings import sightings
 from reconstruction.instances.smears import without_smears
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.rasterize import rasterize_mesh
@@ -60,7 +61,7 @@ def cleaned(color, striped=True):
     points = shell.graph.points
     thing = Thing(np.flatnonzero((shell.owner == 0) & (points[:, 2] > 0.02)))
     before, owner = thing.vertices, shell.owner.copy()
-    without_smears(shell, surface, [thing], owner, posed, depth, InstancesConfig(), NO_PROGRESS)
+    without_smears(shell, [thing], owner, sightings(surface, posed, depth), InstancesConfig(), NO_PROGRESS)
     smear = before[points[before, 1] > HIGH[1] + 0.02]
     return shell, before, thing.vertices, owner, smear
 
