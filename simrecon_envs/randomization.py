@@ -5,7 +5,7 @@ touch nothing that they did not touch before. Mass and friction stay within the 
 """
 
 import zlib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -52,11 +52,11 @@ class Randomization:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            most = 1.0 if field.name in ("mass", "friction", "lights", "textures") else float("inf")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            most = 1.0 if item.name in ("mass", "friction", "lights", "textures") else float("inf")
             if not isinstance(value, int | float) or not 0 <= value <= most:
-                raise UsageError(f"randomize: {field.name}={value!r} is not a number between 0 and {most:g}")
+                raise UsageError(f"randomize: {item.name}={value!r} is not a number between 0 and {most:g}")
 
     @classmethod
     def everything(cls) -> "Randomization":
@@ -84,7 +84,7 @@ class Randomization:
             return cls.everything()
         if value == "start":
             return cls.start()
-        names = [field.name for field in fields(cls)]
+        names = [item.name for item in fields(cls)]
         if not isinstance(value, dict) or set(value) - set(names):
             raise UsageError(
                 f'randomize: expected "none", "start", "all" or a dict of {", ".join(names)}, got {value!r}'
@@ -132,8 +132,8 @@ class Randomizer:
                 shift, turn = draw[:2] * self.config.shift_m, draw[2] * self.config.turn_rad
                 move = _about(group.center, shift, turn)
                 hull = group.hull @ move[:2, :2].T + move[:2, 3]
-                others = (hulls[k] for k in range(len(hulls)) if k != number and k not in group.touching)
-                if group.on_support(hull) and not any(_overlap(hull, other) for other in others):
+                free = all(_gap(hull, hulls[k]) >= least for k, least in group.gaps.items())
+                if free and group.on_support(hull):
                     hulls[number], moves[number] = hull, move
                     break
         return moves
@@ -247,7 +247,9 @@ class _Group:
     start: dict[int, np.ndarray]  # world_from_object (4, 4)
     level: np.ndarray  # bool (nx, ny): cells of the support at the height it stands on
     lower: np.ndarray  # (2,)
-    touching: frozenset[int] = frozenset()  # groups whose hulls overlap as they were captured
+    gaps: dict[int, float] = field(
+        default_factory=dict
+    )  # least gap to each other group, as seen from above (m)
 
     def on_support(self, hull: np.ndarray) -> bool:
         """Tell whether the outline lies on the level that the group stands on."""
@@ -281,8 +283,10 @@ def _groups(facts: SceneFacts) -> list[_Group]:
         start = {k: np.asarray(items[k].world_from_object) for k in members}
         groups.append(_Group(members, target.center[:2], hull, start, level, own.lower))
     for number, group in enumerate(groups):
-        near = {k for k, other in enumerate(groups) if k != number and _overlap(group.hull, other.hull)}
-        group.touching = frozenset(near)
+        # What overlaps as it was captured (one leans over the other, say) never comes nearer than that.
+        group.gaps = {
+            k: min(_gap(group.hull, other.hull), _GAP_M) for k, other in enumerate(groups) if k != number
+        }
     return groups
 
 
@@ -295,17 +299,19 @@ def _about(center: np.ndarray, shift: np.ndarray, turn: float) -> np.ndarray:
     return out
 
 
-def _overlap(first: np.ndarray, second: np.ndarray) -> bool:
-    """Tell whether two convex outlines (h, 2) are closer than the gap: no edge's normal separates them."""
+def _gap(first: np.ndarray, second: np.ndarray) -> float:
+    """Return how far apart (m) two convex outlines (h, 2) are along the normal that separates them best.
+
+    Negative where they overlap: by how much one has to move to be clear of the other.
+    """
+    gaps = []
     for hull in (first, second):
         edges = np.roll(hull, -1, axis=0) - hull
         normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
         a, b = first @ normals.T, second @ normals.T
-        apart = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0))
-        if apart.max() > _GAP_M:
-            return False
-    return True
+        gaps.append(np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0)).max())
+    return float(max(gaps))
 
 
 def _draw_lights(scene: Any, rng: np.random.RandomState, most: float, home: dict, number: int) -> None:

@@ -8,12 +8,12 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
-from made_scenes import BLOCK, BOX, CRATE, CUBE, CYLINDER
+from made_scenes import BLOCK, BOX, CRATE, CUBE, CYLINDER, TABLE, BundleWriter, add_room, box
 
 import simrecon_envs
-from registry import SceneNotFound, UsageError
+from registry import SceneNotFound, SceneRegistry, UsageError
 from simrecon_envs.multi import split_of
-from simrecon_envs.randomization import Randomization, _overlap
+from simrecon_envs.randomization import _GAP_M, Randomization, _gap
 
 
 def _make(root: Path, scene: str = "things", **kwargs: object) -> gym.Env:
@@ -41,13 +41,38 @@ def test_poses_stay_on_their_support_and_apart(scenes_root: Path) -> None:
         for number, hull in enumerate(hulls):
             assert np.abs(hull - [0, 0.9]).max(axis=0)[0] < 0.6 + 0.01
             assert np.abs(hull - [0, 0.9]).max(axis=0)[1] < 0.4 + 0.01
-            assert not any(_overlap(hull, other) for other in hulls[:number])
+            assert all(_gap(hull, other) >= _GAP_M for other in hulls[:number])
         for _ in range(3):
             env.step(None)
         heights = [float(env.unwrapped.measures.position(key)[0, 2]) for key in env.unwrapped.movable_ids]
         expected = [env.unwrapped.facts.targets[key].center[2] for key in env.unwrapped.movable_ids]
         np.testing.assert_allclose(heights, expected, atol=1e-3)
     assert np.std(seen, axis=0).min() > 0.01  # every thing did move
+    env.close()
+
+
+def test_what_leans_over_another_never_comes_nearer_to_it(tmp_path: Path) -> None:
+    writer = BundleWriter(tmp_path / "made")
+    add_room(writer)
+    table = np.eye(4)
+    table[:2, 3] = 0, 0.9
+    writer.add_object(TABLE, "table", [box((1.2, 0.8, 0.4))], table, 1, mass=20, dynamic=False)
+    post, top, cube = np.eye(4), [box((0.04, 0.04, 0.2)), box((0.2, 0.2, 0.02), 0.2)], np.eye(4)
+    post[:3, 3], cube[:3, 3] = (0, 0.8, 0.4), (0.07, 0.8, 0.4)
+    writer.add_object(BLOCK, "lamp", top, post, TABLE)
+    writer.add_object(CUBE, "cube", [box((0.05, 0.05, 0.06))], cube, TABLE)
+    writer.seal("lamp")
+    SceneRegistry(tmp_path / "registry", create=True).publish(writer.folder, "lamp")
+    env = _make(tmp_path / "registry", "lamp", randomize={"shift_m": 0.05, "turn_rad": 0.5})
+    lamp, under = env.unwrapped._randomizer._groups
+    captured = _gap(lamp.hull, under.hull)
+    assert captured < -0.02  # the lamp's top is over the cube
+    gaps = []
+    for seed in range(20):
+        env.reset(seed=seed)
+        gaps.append(_gap(_outline(env, BLOCK), _outline(env, CUBE)))
+    assert min(gaps) >= captured - 1e-6
+    assert max(gaps) > captured + 0.005
     env.close()
 
 

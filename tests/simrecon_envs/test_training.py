@@ -314,7 +314,7 @@ def test_a_killed_run_goes_on_to_the_same_number_of_steps(scenes_root: Path, tmp
 
 @pytest.mark.slow
 def test_reach_is_learned(scenes_root: Path, tmp_path: Path) -> None:
-    config = TrainConfig(scene="things", steps=60_000, envs=2, registry=str(scenes_root))
+    config = TrainConfig(scene="things", steps=30_000, envs=2, registry=str(scenes_root))
     found = train(config, tmp_path / "run", video=False)
     assert found["evaluation"]["success_rate"] >= 0.9
 
