@@ -34,11 +34,15 @@ def write_generation_page(kept: Sequence[dict[str, Any]], page: Path) -> None:
     """Write the page from the kept results of captures."""
     records = [record for one in kept for record in one["objects"]]
     lines = [_HEAD, "", f"## Completed objects ({len(records)})", "", *_table(records)]
+    least = min(record["hidden"] for record in records)
     machines = sorted({machine_line(one["machine"]) for one in kept})
     commits = ", ".join(sorted({one["commit"] for one in kept}))
     lines += [
         "",
-        f"Distances in centimeters, F at 1 cm. Measured on {'; '.join(machines)}; commits {commits}.",
+        f"{len(records)} objects of {len(kept)} rooms, of which other things hide {100 * least:.0f} % or more of the "
+        "outline over the film. Distances in centimeters, F at 1 cm.",
+        "",
+        f"Measured on {'; '.join(machines)}; commits {commits}.",
     ]
     words = (
         "From the left: the truth, the embedded completion, then for `avo`, `max-visibility`, `canonical` and "

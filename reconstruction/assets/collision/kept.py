@@ -69,7 +69,8 @@ class _Watch(NoProgress):
 
 def _digest(solid: Solid, config: AssetsConfig, levels: tuple[float, ...]) -> str:
     options = {key: value for key, value in asdict(config).items() if not key.startswith(_ELSEWHERE)}
-    code = [source_digest(f"reconstruction.assets.{part}") for part in ("collision", "solid")]
+    modules = ("reconstruction.assets.collision", "reconstruction.assets.solid", "registry.primitives")
+    code = [source_digest(module) for module in modules]
     digest = hashlib.sha256(json.dumps([options, levels, code, version("coacd")]).encode())
     for array in (np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int32)):
         digest.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
