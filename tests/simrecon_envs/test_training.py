@@ -319,6 +319,7 @@ def test_reach_is_learned(scenes_root: Path, tmp_path: Path) -> None:
     assert found["evaluation"]["success_rate"] >= 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_pictures_are_learned_from_and_the_end_is_filmed(scenes_root: Path, tmp_path: Path) -> None:
     settings = parse_settings(
