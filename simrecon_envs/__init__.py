@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from simrecon_envs.catalog import TaskEntry, list_scenes, list_tasks
 from simrecon_envs.errors import EnvNotFound, SceneAssetsMissing
 from simrecon_envs.registration import (
+    answer_running_look_up,
     env_id,
     make,
     make_cpu,
@@ -69,3 +70,4 @@ def __getattr__(name: str) -> Any:
 
 teach_gymnasium()
 register_default_scenes()
+answer_running_look_up()

@@ -8,6 +8,7 @@ the id when it is made, and their version is that of the rules of success and re
 
 import difflib
 import re
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -157,6 +158,26 @@ def teach_gymnasium() -> None:
         gym.spec = spec
     gym_registration._simrecon = True
 
+
+def answer_running_look_up() -> None:
+    """Make `gym.make("simrecon_envs:SimRecon/scene0001-pick_mug-v0")` work in a process that has not imported us yet.
+
+    Gymnasium imports the package in the midst of its own look-up, which began before ours was in place and reads the
+    table once more afterwards: the task that it looks for gets a row there.
+
+    Raises:
+        EnvNotFound: there is no such scene or task's version; names what exists, and the nearest.
+    """
+    frame = sys._getframe()
+    while frame is not None and frame.f_code is not _GYMNASIUM_CODE:
+        frame = frame.f_back
+    name = frame.f_locals.get("env_name") if frame is not None else None
+    if isinstance(name, str) and (spec := find_spec(name)) is not None:
+        gym.registry[name] = spec
+
+
+# Of Gymnasium's own look-up; this module is imported once, before `teach_gymnasium` puts another in its place.
+_GYMNASIUM_CODE = getattr(getattr(gym_registration, "_find_spec", None), "__code__", None)
 
 _TEMPLATE = vars(
     EnvSpec(

@@ -133,6 +133,39 @@ def test_task_ids_are_found_without_being_listed(scenes_root: Path) -> None:
         gym.make("SimRecon/room-pick_bix-v0")
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("room-reach_box-v0", "reach_box SimRecon/room-reach_box-v0"),
+        (
+            "room-reach_box-v3",
+            "EnvNotFound SimRecon/room-reach_box-v3 does not exist: the version of tasks is 0",
+        ),
+        (
+            "roam",
+            "EnvNotFound SimRecon/roam does not exist among the registered scenes. Did you mean SimRecon/room?",
+        ),
+    ],
+)
+def test_gymnasium_imports_the_package_for_an_id(
+    name: str, told: str, scenes_root: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "registry").symlink_to(scenes_root)
+    code = f"""
+import gymnasium
+try:
+    env = gymnasium.make("simrecon_envs:SimRecon/{name}")
+    print(env.unwrapped.task, env.spec.id)
+except gymnasium.error.Error as error:
+    print(type(error).__name__, error)
+"""
+    environment = {**os.environ, "SIMRECON_HOME": str(tmp_path)}
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert run.stdout.startswith(told), run.stderr
+
+
 def test_scenes_are_filtered(scenes_root: Path) -> None:
     def found(*args: object, **kwargs: object) -> list[str]:
         return [r.scene_id for r in simrecon_envs.list_scenes(*args, registry=scenes_root, **kwargs)]
