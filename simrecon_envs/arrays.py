@@ -2,48 +2,60 @@
 
 One environment on the CPU is computed in NumPy, many on a GPU in torch: for a handful of numbers an operation of torch
 costs as much as ten of NumPy, and a task's fifty operations more than the physics does. Operators, slices, `sum(1)` and
-`all(1)` are the same in both. Arrays are batched, (b, ...), float32 or bool.
+`all(1)` are the same in both. Arrays are batched, (b, ...), float32 or bool. In NumPy b is 1, and what is (b,) may be a
+number of NumPy's, with which an operation costs a tenth of that with an array: take it as a whole, not by index.
 """
+
+import math
 
 import numpy as np
 import torch
 
-Array = np.ndarray | torch.Tensor
+Array = np.ndarray | np.generic | torch.Tensor
 
 
 def tensor(x: Array) -> torch.Tensor:
-    """Return an array as a tensor of its own; doubles become floats."""
+    """Return an array as a tensor of its own, a number as one of shape (1,); doubles become floats."""
     if isinstance(x, torch.Tensor):
         return x
+    if isinstance(x, np.generic):
+        x = np.array([x])
+        return torch.from_numpy(x if x.dtype != np.float64 else x.astype(np.float32))
     return torch.from_numpy(x.astype(np.float32) if x.dtype == np.float64 else x.copy())
 
 
 def numpy(x: Array) -> np.ndarray:
     """Return an array as NumPy's, on the CPU."""
-    return x if isinstance(x, np.ndarray) else x.cpu().numpy()
+    return x.cpu().numpy() if isinstance(x, torch.Tensor) else x
 
 
 def norm(x: Array) -> Array:
     """Return the lengths (...) of vectors (..., d)."""
-    if isinstance(x, np.ndarray):
-        return np.sqrt((x * x).sum(-1))
-    return torch.linalg.norm(x, dim=-1)
+    if isinstance(x, torch.Tensor):
+        return torch.linalg.norm(x, dim=-1)
+    if x.ndim == 2 and len(x) == 1:
+        return np.float32(math.hypot(*x[0].tolist()))
+    return np.sqrt((x * x).sum(-1))
 
 
 def real(x: Array) -> Array:
     """Return an array of bool or integers as float32."""
-    return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()
+    if isinstance(x, np.generic):
+        return np.float32(x)
+    return x.float() if isinstance(x, torch.Tensor) else x.astype(np.float32)
 
 
 def whole(x: Array) -> Array:
     """Return an array as integers."""
-    return x.astype(np.int64) if isinstance(x, np.ndarray) else x.long()
+    return x.long() if isinstance(x, torch.Tensor) else x.astype(np.int64)
 
 
 def where(condition: Array, yes: Array | float, no: Array | float) -> Array:
     """Return `yes` where the condition holds, else `no`; numbers stand for arrays of them."""
     if isinstance(condition, torch.Tensor):
         return torch.where(condition, yes, no)
+    if isinstance(condition, np.bool_):
+        return _float32(yes if condition else no)
     return np.where(condition, _float32(yes), _float32(no))
 
 
@@ -51,13 +63,18 @@ def clamp(x: Array, least: float | None = None, most: float | None = None) -> Ar
     """Return an array with its values brought between two bounds."""
     if isinstance(x, torch.Tensor):
         return torch.clamp(x, least, most)
+    if isinstance(x, np.generic):
+        x = x if least is None or x >= least else type(x)(least)
+        return x if most is None or x <= most else type(x)(most)
     x = x if least is None else np.maximum(x, least)
     return x if most is None else np.minimum(x, most)
 
 
 def tanh(x: Array) -> Array:
     """Return the hyperbolic tangent."""
-    return np.tanh(x) if isinstance(x, np.ndarray) else torch.tanh(x)
+    if isinstance(x, np.generic):
+        return np.float32(math.tanh(x))
+    return torch.tanh(x) if isinstance(x, torch.Tensor) else np.tanh(x)
 
 
 def atan2(y: Array, x: Array) -> Array:
@@ -72,7 +89,19 @@ def cos_sin(x: Array) -> tuple[Array, Array]:
 
 def stack(parts: list[Array]) -> Array:
     """Return arrays (b, ...) side by side, (b, n, ...)."""
-    return np.stack(parts, 1) if isinstance(parts[0], np.ndarray) else torch.stack(parts, dim=1)
+    if isinstance(parts[0], torch.Tensor):
+        return torch.stack(parts, dim=1)
+    return np.stack([np.atleast_1d(part) for part in parts], 1)
+
+
+def component(x: Array, axis: int) -> Array:
+    """Return one component (b,) of vectors (b, k)."""
+    return x[:, axis] if isinstance(x, torch.Tensor) else x[0, axis]
+
+
+def column(x: Array) -> Array:
+    """Return an array (b,) as (b, 1)."""
+    return np.array([[x]]) if isinstance(x, np.generic) else x[:, None]
 
 
 def largest(x: Array) -> Array:
@@ -103,5 +132,5 @@ def rotate(quat: Array, vector: Array) -> Array:
     return vector + quat[..., :1] * twice + torch.linalg.cross(axis, twice)
 
 
-def _float32(x: Array | float) -> Array | np.float32:
-    return x if isinstance(x, np.ndarray) else np.float32(x)
+def _float32(x: Array | float) -> Array:
+    return x if isinstance(x, np.ndarray | np.generic) else np.float32(x)

@@ -60,11 +60,11 @@ class DirectReads:
         """Return where (1, 3) a direction (3,) of a thing's actor points in the world."""
         return (self._entities[row].pose.to_transformation_matrix()[:3, :3] @ direction)[None]
 
-    def speeds(self, row: int) -> np.ndarray:
-        """Return the linear (m/s) and angular (rad/s) speed (1, 2) of a thing."""
+    def speeds(self, row: int) -> tuple[np.float32, np.float32]:
+        """Return the linear (m/s) and angular (rad/s) speed of a thing."""
         body = self._bodies[row]
-        pair = [math.hypot(*v.tolist()) for v in (body.linear_velocity, body.angular_velocity)]
-        return np.array([pair], np.float32)
+        linear, angular = body.linear_velocity.tolist(), body.angular_velocity.tolist()
+        return np.float32(math.hypot(*linear)), np.float32(math.hypot(*angular))
 
     def link_pose(self, link: Any) -> np.ndarray:
         """Return the pose (1, 7) of one of the robot's links."""
@@ -73,6 +73,11 @@ class DirectReads:
     def qvel(self) -> np.ndarray:
         """Return the speeds (1, d) of the robot's joints (rad/s, m/s)."""
         return self._env.agent.robot._objs[0].qvel[None]
+
+    def joint_speed(self) -> np.float32:
+        """Return the speed of the robot's fastest joint, fingers left out."""
+        speeds = self._env.agent.robot._objs[0].qvel.tolist()
+        return np.float32(max(map(abs, speeds[:-2] if len(speeds) > 2 else speeds)))
 
     def held(self, row: int, actor: Any) -> bool:
         """Return whether the robot says that it grasps a thing, without asking it where that cannot be."""
@@ -140,38 +145,47 @@ class DirectDrive:
     def __init__(self, agent: BaseAgent) -> None:
         """Look at the controllers that the agent has now."""
         self.controller = agent.controller
-        self._parts: list[tuple[slice, BaseController, _Joints | _Tip | None]] = []
+        self.foreign: list[tuple[slice, BaseController]] = []
+        """Those that ManiSkill drives itself, with their share of the action."""
+        self._tips: list[tuple[slice, _Tip]] = []
+        children, joints = [], []
         if type(self.controller) is CombinedController:
             for name, child in self.controller.controllers.items():
                 share = slice(*self.controller.action_mapping[name])
-                kind = next((kind for kind in (_Joints, _Tip) if kind.fits(child)), None)
-                self._parts.append((share, child, None if kind is None else kind(child)))
+                children.append(child)
+                if _Joints.fits(child):
+                    joints.append((share, child))
+                elif _Tip.fits(child):
+                    self._tips.append((share, _Tip(child)))
+                else:
+                    self.foreign.append((share, child))
+        self._joints = _Joints(joints) if joints else None
         idle = {BaseController.before_simulation_step, PDJointPosController.before_simulation_step}
         self.idle = (
-            bool(self._parts)
+            bool(children)
             and type(agent).before_simulation_step is BaseAgent.before_simulation_step
             and all(
                 type(child).before_simulation_step in idle and not getattr(child.config, "interpolate", False)
-                for _, child, _ in self._parts
+                for child in children
             )
         )
         """Whether controllers have nothing to do between a control step's time steps."""
 
-    def set_action(self, action: torch.Tensor) -> None:
-        """Give the controllers an action (1, k), as `controller.set_action` does."""
-        if not self._parts:
+    def set_action(self, action: torch.Tensor, numbers: np.ndarray) -> None:
+        """Give the controllers an action (1, k), whose numbers are (k,), as `controller.set_action` does."""
+        if self._joints is None and not self._tips:
             self.controller.set_action(action)
             return
-        numbers = action.numpy()[0]
-        for share, child, joints in self._parts:
-            if joints is not None:
-                joints.drive(numbers[share])
-            else:
-                child.set_action(action[:, share])
+        if self._joints is not None:
+            self._joints.drive(numbers)
+        for share, tip in self._tips:
+            tip.drive(numbers[share])
+        for share, child in self.foreign:
+            child.set_action(action[:, share])
 
 
 class _Joints:
-    """A `PDJointPosController`, or one with mimicked joints, without interpolation and virtual targets."""
+    """All `PDJointPosController`, and those with mimicked joints, without interpolation and virtual targets, as one."""
 
     @staticmethod
     def fits(controller: BaseController) -> bool:
@@ -179,35 +193,57 @@ class _Joints:
         plain = type(controller) in (PDJointPosController, PDJointPosMimicController)
         return plain and not (controller.config.interpolate or controller.config.use_target)
 
-    def __init__(self, controller: PDJointPosController) -> None:
-        self._controller = controller
-        self._robot = controller.articulation._objs[0]
-        self._targets = _Targets(controller)
-        self._indices = controller.active_joint_indices.numpy()
-        self._delta = controller.config.use_delta
-        self._scale = None
-        if controller._normalize_action:
-            low, high = controller.action_space_low.numpy(), controller.action_space_high.numpy()
-            self._scale = 0.5 * (high + low), 0.5 * (high - low)
-        self._mimic = None
-        if type(controller) is PDJointPosMimicController:
-            columns = (controller.control_joint_indices, controller.mimic_joint_indices,
-                       controller.mimic_control_joint_indices, controller._multiplier, controller._offset)  # fmt: skip
-            self._mimic = [column.numpy().reshape(-1) for column in columns]
+    def __init__(self, parts: list[tuple[slice, PDJointPosController]]) -> None:
+        controllers = [controller for _, controller in parts]
+        self._robot = controllers[0].articulation._objs[0]
+        self._targets = _Targets(controllers)
+        # Of every joint: which it is, whose angle and which number of the action its target comes from, and how:
+        # target = (angle * delta + middle + half * action) * factor + offset, the last two where joints are mimicked.
+        rows = [np.concatenate(column) for column in zip(*(_columns(*part) for part in parts), strict=True)]
+        self._indices, self._source, self._number = (row.astype(np.int64) for row in rows[:3])
+        self._low, self._high, self._delta, self._middle, self._half, self._factor, self._offset = (
+            row.astype(np.float32) for row in rows[3:]
+        )
+        self._mimics = bool((self._factor != 1).any() or self._offset.any())
 
     def drive(self, action: np.ndarray) -> None:
-        """Set the joints' targets from an action (k,)."""
-        if self._scale is not None:
-            action = self._scale[0] + self._scale[1] * np.minimum(np.maximum(action, -1), 1)
-        start = self._robot.qpos[self._indices]
-        if self._mimic is None:
-            target = start + action if self._delta else np.zeros_like(start) + action
-        else:
-            control, mimic, source, multiplier, offset = self._mimic
-            target = np.empty_like(start)
-            target[control] = start[control] + action if self._delta else action
-            target[mimic] = target[source] * multiplier + offset
-        self._targets.set(start, target)
+        """Set the joints' targets from the whole action (k,)."""
+        qpos = self._robot.qpos
+        target = action[self._number]
+        np.maximum(target, self._low, out=target)
+        np.minimum(target, self._high, out=target)
+        target *= self._half
+        target += self._middle
+        target += qpos[self._source] * self._delta
+        if self._mimics:
+            target = target * self._factor + self._offset
+        self._targets.set(qpos[self._indices], target)
+
+
+def _columns(share: slice, controller: PDJointPosController) -> list[np.ndarray]:
+    """Return what `_Joints` keeps of each of a controller's joints, ten arrays (k,)."""
+    indices = controller.active_joint_indices.numpy()
+    count = len(indices)
+    source, factor, offset = np.arange(count), np.ones(count), np.zeros(count)
+    control = source
+    if type(controller) is PDJointPosMimicController:
+        control, mimic, leader = (
+            column.numpy().reshape(-1)
+            for column in (controller.control_joint_indices, controller.mimic_joint_indices,
+                           controller.mimic_control_joint_indices)
+        )  # fmt: skip
+        source[mimic], factor[mimic], offset[mimic] = leader, controller._multiplier, controller._offset
+    number = np.zeros(count, int)
+    number[control] = share.start + np.arange(len(control))
+    middle, half, bound = np.zeros(len(control)), np.ones(len(control)), np.inf
+    if controller._normalize_action:
+        low, high = controller.action_space_low.numpy(), controller.action_space_high.numpy()
+        middle, half, bound = 0.5 * (high + low), 0.5 * (high - low), 1.0
+    scale = np.zeros((2, count), np.float32)
+    scale[:, control] = middle, half
+    delta = np.full(count, float(controller.config.use_delta))
+    return [indices, indices[source], number[source], np.full(count, -bound), np.full(count, bound), delta,
+            *scale[:, source], factor, offset]  # fmt: skip
 
 
 class _Tip:
@@ -228,7 +264,7 @@ class _Tip:
     def __init__(self, controller: PDEEPosController) -> None:
         self._controller = controller
         self._robot = controller.articulation._objs[0]
-        self._targets = _Targets(controller)
+        self._targets = _Targets([controller])
         self._indices = controller.active_joint_indices.numpy()
         self._root, self._tip = controller.root_link._objs[0], controller.ee_link._objs[0]
         low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
@@ -261,24 +297,26 @@ class _Tip:
 
 
 class _Targets:
-    """Joints' targets, and what `get_state` and whoever converts trajectories reads of the controller."""
+    """Joints' targets, and what `get_state` and whoever converts trajectories reads of the controllers."""
 
-    def __init__(self, controller: PDJointPosController) -> None:
-        self._controller = controller
-        self._joints = [joint._objs[0] for joint in controller.joints]
+    def __init__(self, controllers: list[PDJointPosController]) -> None:
+        joints = [joint._objs[0] for controller in controllers for joint in controller.joints]
+        self._set = [joint.set_drive_target for joint in joints]
         # One tensor each for all steps: to make them anew costs more than to set the joints.
-        self._start, self._target = (torch.zeros((1, len(self._joints))) for _ in range(2))
-        self._views = self._start.numpy()[0], self._target.numpy()[0]
+        start, target = (torch.zeros((1, len(joints))) for _ in range(2))
+        self._views = start.numpy()[0], target.numpy()[0]
+        counts = [len(controller.joints) for controller in controllers]
+        self._parts = list(zip(controllers, start.split(counts, 1), target.split(counts, 1), strict=True))
 
     def set(self, start: np.ndarray, target: np.ndarray) -> None:
         """Set the targets (k,) of joints that are at `start` (k,)."""
-        controller = self._controller
-        controller._step = 0
-        controller._start_qpos, controller._target_qpos = self._start, self._target
+        for controller, before, after in self._parts:
+            controller._step = 0
+            controller._start_qpos, controller._target_qpos = before, after
         self._views[0][:] = start
         self._views[1][:] = target
-        for joint, value in zip(self._joints, target.tolist(), strict=True):
-            joint.set_drive_target(value)
+        for give, value in zip(self._set, target.tolist(), strict=True):
+            give(value)
 
 
 def _about(turn: np.ndarray, axis: int) -> sapien.Pose:

@@ -120,10 +120,8 @@ class Measures:
                 self._cache[name] = self._direct.speeds(self._row[key])
             else:
                 actor = self._actors[self._row[key]]
-                pair = [torch.linalg.norm(v, dim=1) for v in (actor.linear_velocity, actor.angular_velocity)]
-                self._cache[name] = torch.stack(pair, dim=1)
-        both = self._cache[name]
-        return both[:, 0], both[:, 1]
+                self._cache[name] = norm(actor.linear_velocity), norm(actor.angular_velocity)
+        return self._cache[name]
 
     def at_rest(self, key: int, linear_m_s: float = 0.05, angular_rad_s: float = 0.6) -> Array:
         """Return whether a thing hardly moves (b,)."""
@@ -150,9 +148,12 @@ class Measures:
     def joint_speed(self) -> Array:
         """Return the speed (b,) of the robot's fastest joint, fingers left out."""
         if "joint_speed" not in self._cache:
-            qvel = self.qvel
-            keep = qvel.shape[1] - 2 if qvel.shape[1] > 2 else qvel.shape[1]
-            self._cache["joint_speed"] = largest(abs(qvel[:, :keep]))
+            if self._direct is not None:
+                self._cache["joint_speed"] = self._direct.joint_speed()
+            else:
+                qvel = self.qvel
+                keep = qvel.shape[1] - 2 if qvel.shape[1] > 2 else qvel.shape[1]
+                self._cache["joint_speed"] = largest(abs(qvel[:, :keep]))
         return self._cache["joint_speed"]
 
     @property
@@ -173,7 +174,7 @@ class Measures:
             if self._direct is None:
                 self._cache[name] = self._env.agent.is_grasping(self._actors[row]) & near
             else:
-                self._cache[name] = near & self._direct.held(row, self._actors[row]) if near[0] else near
+                self._cache[name] = np.bool_(near and self._direct.held(row, self._actors[row]))
         return self._cache[name]
 
     # ---- Contacts.

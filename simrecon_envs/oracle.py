@@ -117,7 +117,7 @@ class Hand:
         """Reach over a thing, go down where it can be gripped and close the fingers; try another grasp if it slips."""
         for grasp in (self._env.facts.targets[key].grasps or (self._across(key),))[:_GRIPS]:
             yield from self._grip(key, grasp)
-            if bool(self._env.measures.held(key)[0]):
+            if bool(self._env.measures.held(key)):
                 return
         self._opening = None
 

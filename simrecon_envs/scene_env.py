@@ -256,14 +256,15 @@ class SceneEnv(BaseEnv):
             UsageError: the action has another shape than the action space, or is not finite.
         """
         numbers = isinstance(action, np.ndarray | torch.Tensor)
-        if numbers:
-            check_action(self, action)
         if self.gpu_sim_enabled:
+            if numbers:
+                check_action(self, action)
             return super().step(action)
-        if self._stepper is None or not self._stepper.current:
-            self._stepper = DirectStep(self)
-        action = self._stepper.simulate(action) if numbers else super()._step_action(action)
-        return self._stepper.outcome(action)
+        stepper = self._stepper
+        if stepper is None or not stepper.current:
+            stepper = self._stepper = DirectStep(self)
+        action = stepper.simulate(action) if numbers else super()._step_action(action)
+        return stepper.outcome(action)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
@@ -310,7 +311,7 @@ class SceneEnv(BaseEnv):
         reward = self.task_object.reward(self._info)
         if isinstance(reward, torch.Tensor):
             return reward / most
-        return torch.from_numpy(reward.astype(np.float32) / np.float32(most))
+        return tensor(reward / np.float32(most))
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return 1 where the task is done, else 0 (num_envs,)."""

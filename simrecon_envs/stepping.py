@@ -4,6 +4,7 @@ What ManiSkill's own step does, computed in NumPy and made tensors once, at the 
 caches are cold, each operation of torch takes tens of microseconds.
 """
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -32,6 +33,10 @@ class DirectStep:
         plain = agent is not None and type(agent).get_proprioception is BaseAgent.get_proprioception
         self._flat = env.obs_mode == "state" and plain and not agent.controller.get_state()
         self._robot = None if agent is None else agent.robot._objs[0]
+        # Written to at every step: to make a tensor anew costs more than to fill it.
+        self._action = None if agent is None else torch.zeros((1, *agent.single_action_space.shape))
+        self._numbers = None if agent is None else self._action.numpy()[0]
+        self._laid_out = False
 
     @property
     def current(self) -> bool:
@@ -41,11 +46,17 @@ class DirectStep:
         return self._scene is env.scene and self._controller is (None if agent is None else agent.controller)
 
     def simulate(self, action: np.ndarray | torch.Tensor) -> torch.Tensor:
-        """Simulate one control step with an action (k,) or (1, k); return it as (1, k)."""
-        env, drive = self._env, self._drive
-        numbers = action if isinstance(action, np.ndarray) else action.numpy(force=True)
-        batched = torch.from_numpy(numbers.astype(np.float32).reshape(1, -1))
-        drive.set_action(batched)
+        """Simulate one control step with an action (k,) or (1, k); return it as (1, k), valid until the next step.
+
+        Raises:
+            UsageError: as `check_action`.
+        """
+        env, drive, batched = self._env, self._drive, self._action
+        check_action(env, action)
+        self._numbers[:] = (action if isinstance(action, np.ndarray) else action.numpy(force=True)).reshape(
+            -1
+        )
+        drive.set_action(batched, self._numbers)
         if drive.idle and not self._hooked:
             step = env.scene.px.step
             for _ in range(env._sim_steps_per_control):
@@ -70,18 +81,19 @@ class DirectStep:
         obs = env.get_obs(info, unflattened=True) if flat is None else flat
         reward = env.get_reward(obs=obs, action=action, info=info)
         env._last_obs = obs = env._flatten_raw_obs(obs) if flat is None else flat
-        ended = np.zeros(1, bool)
-        for reason in ("success", "fail"):
-            if reason in info:
-                ended |= info[reason].numpy()
-        return obs, reward, torch.from_numpy(ended), torch.from_numpy(np.zeros(1, bool)), info
+        ended = any([info[reason].item() for reason in ("success", "fail") if reason in info])
+        return obs, reward, torch.from_numpy(np.array([ended])), torch.from_numpy(np.array([False])), info
 
     def _observe(self) -> torch.Tensor | None:
         """Return the observation "state" (1, n); None where a task observes something else than rows of numbers."""
-        parts = [self._robot.qpos[None], self._robot.qvel[None], *self._env.known().values()]
-        if any(part.ndim != 2 for part in parts):
-            return None
-        return torch.from_numpy(np.concatenate(parts, axis=1, dtype=np.float32))
+        known = list(self._env.known().values())
+        if not self._laid_out:
+            if any(part.ndim != 2 for part in known):
+                return None
+            self._laid_out = True
+        robot = self._robot
+        rows = [robot.qpos, robot.qvel, *[part[0] for part in known]]
+        return torch.from_numpy(np.concatenate(rows, dtype=np.float32)[None])
 
 
 def check_action(env: Any, action: np.ndarray | torch.Tensor) -> None:
@@ -92,12 +104,12 @@ def check_action(env: Any, action: np.ndarray | torch.Tensor) -> None:
     """
     if env.agent is None:
         raise UsageError("this environment has no robot: step(None)")
-    single, shape = env._orig_single_action_space.shape, tuple(action.shape)
+    single, shape = env._orig_single_action_space.shape, action.shape
     if shape != (env.num_envs, *single) and not (env.num_envs == 1 and shape == single):
         raise UsageError(f"action: expected the shape {(env.num_envs, *single)} or, of one environment, "
-                         f"{single}; got {shape}")  # fmt: skip
+                         f"{single}; got {tuple(shape)}")  # fmt: skip
     if isinstance(action, np.ndarray):
-        finite = np.isfinite(action).all()
+        finite = all(map(math.isfinite, action.ravel().tolist()))
     else:
         finite = env.gpu_sim_enabled or torch.isfinite(action).all()
     if not finite:

@@ -27,6 +27,7 @@ class BatchedTimeLimit(gym.Wrapper, RecordConstructorArgs):
             self._max_episode_steps = env._max_episode_steps
             env = env.env
         gym.Wrapper.__init__(self, env)
+        self._base = env.unwrapped
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -41,11 +42,9 @@ class BatchedTimeLimit(gym.Wrapper, RecordConstructorArgs):
         """Step; `truncated` (num_envs,) is set where the limit is reached."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         if self._max_episode_steps is not None:
-            steps = self.unwrapped.elapsed_steps
-            if steps.device.type == "cpu":  # in NumPy, which is several times as fast with one number
-                over = steps.numpy() >= self._max_episode_steps
-                truncated = torch.from_numpy(truncated.numpy() | over) if over.any() else truncated
-            else:
+            steps = self._base.elapsed_steps
+            # Of one environment no tensor is made unless it must: that takes longer than the rest of it.
+            if self._base.num_envs > 1 or steps.item() >= self._max_episode_steps:
                 truncated = truncated | (steps >= self._max_episode_steps)
         return obs, reward, terminated, truncated, info
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from simrecon_envs.arrays import Array, norm, numpy, real, where
+from simrecon_envs.arrays import Array, column, norm, numpy, real, where
 from simrecon_envs.tasks.base import Info, Task, draw, nearness, subject_problems
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -102,7 +102,7 @@ class Carry(Task):
         measures = self.env.measures
         pose, goal = measures.pose(self.subject), self.live_goal()
         return {
-            "is_grasped": info["is_grasped"][:, None],
+            "is_grasped": column(info["is_grasped"]),
             "target_pose": pose,
             "tcp_to_target": pose[:, :3] - measures.tcp[:, :3],
             "goal_position": goal,

@@ -11,6 +11,7 @@ from simrecon_envs.arrays import (
     Array,
     atan2,
     clamp,
+    column,
     largest,
     norm,
     numpy,
@@ -124,7 +125,7 @@ class Navigate(Task):
         # In the base's own axes: forward, left.
         local = stack([(way * ahead).sum(1), way[:, 1] * ahead[:, 0] - way[:, 0] * ahead[:, 1]])
         return {"base_position": here, "base_ahead": ahead, "target_from_base": local,
-                "distance": info["distance_m"][:, None]}  # fmt: skip
+                "distance": column(info["distance_m"])}  # fmt: skip
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
         here = numpy(self._base()[0])[0]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from simrecon_envs.arrays import Array, clamp, real, where
+from simrecon_envs.arrays import Array, clamp, column, component, real, where
 from simrecon_envs.tasks.base import Info, Task, nearness
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -41,14 +41,13 @@ class Pick(Task):
         return self.env.task_config
 
     def start(self, env_idx: torch.Tensor, rng: object) -> None:
-        if not hasattr(self, "_start_height"):
-            self._start_height = self._zeros(1)[:, 0]
-        self._start_height[env_idx] = self.env.measures.position(self.subject)[env_idx, 2]
+        if not hasattr(self, "_home"):
+            self._home = self._zeros(3)
+        self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
 
     def evaluate(self) -> Info:
         measures, config = self.env.measures, self.config
-        position = measures.position(self.subject)
-        lift = position[:, 2] - self._start_height
+        lift = component(measures.position(self.subject), 2) - component(self._home, 2)
         held = measures.held(self.subject)
         lifted = lift >= config.lift_m
         speed = measures.speeds(self.subject)[0]
@@ -72,10 +71,10 @@ class Pick(Task):
     def observe(self, info: Info) -> dict[str, Array]:
         pose = self.env.measures.pose(self.subject)
         return {
-            "is_grasped": info["is_grasped"][:, None],
+            "is_grasped": column(info["is_grasped"]),
             "target_pose": pose,
             "tcp_to_target": pose[:, :3] - self.env.measures.tcp[:, :3],
-            "target_lift": info["lift_m"][:, None],
+            "target_lift": column(info["lift_m"]),
         }
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821

@@ -149,7 +149,7 @@ class Rearrange(Task):
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
         for _ in range(2):  # once more for what was knocked away
             for stage in self.stages:
-                if not bool(stage.evaluate()["success"][0]):
+                if not bool(stage.evaluate()["success"]):
                     yield from stage.script(hand)
 
 
