@@ -25,7 +25,8 @@ _POLICY = """a policy:
       def act(self, observation): return self.env.action_space.sample()
 
 Any callable that takes the environment and returns such an object will do. `--policy-option model=net.zip` is given to
-it as the keyword argument model="net.zip"."""
+it as the keyword argument model="net.zip". What `simrecon train` trained is a policy, too:
+  simrecon benchmark run suite.json --policy simrecon_envs.training:trained --policy-option run=FOLDER"""
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
@@ -211,7 +212,8 @@ def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None
         "--demo-obs",
         default="state_dict",
         metavar="MODE",
-        help="what demonstrations observe: state_dict, or rgb and the like where this machine renders",
+        help="what demonstrations observe: state_dict, or rgb and the like where this machine renders (default: "
+        "state_dict)",
     )
 
 

@@ -9,14 +9,14 @@ from typing import Any
 
 from registry import UsageError
 from simrecon_envs.benchmark.compare import Difference, compare_results
-from simrecon_envs.benchmark.files import Records
 from simrecon_envs.benchmark.generate import GenerateConfig, generate_suite
 from simrecon_envs.benchmark.policies import PolicySpec
-from simrecon_envs.benchmark.proof import registry_text
+from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.results import Results, load_results
 from simrecon_envs.benchmark.run import RunSettings, run_suite
 from simrecon_envs.benchmark.suite import Suite, SuiteTask, load_suite
+from simrecon_envs.files import absolute
 
 
 def generate(arguments: argparse.Namespace) -> int:
@@ -65,8 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
         episodes=arguments.episodes,
         fresh=arguments.fresh_seeds,
         any_revision=arguments.any_revision,
-        videos=registry_text(arguments.videos),
-        registry=registry_text(arguments.registry),
+        videos=absolute(arguments.videos),
+        registry=absolute(arguments.registry),
     )
     if arguments.videos is not None:
         from simrecon_envs.backends import choose_render_backend

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from registry import UsageError
 from simrecon_envs.benchmark.episodes import run_episode
 from simrecon_envs.benchmark.policies import CONTROL_MODE, OraclePolicy
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.run import RunSettings, check_revisions
 from simrecon_envs.benchmark.suite import Suite, SuiteTask
+from simrecon_envs.files import absolute
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,15 +60,17 @@ def record_demonstrations(
         {"tasks", "episodes", "steps", "written": files and folders, "failed": texts}.
 
     Raises:
-        UsageError: scenes are missing or of another revision; a folder is there already and not empty.
+        UsageError: scenes are missing or of another revision; a folder is there already and not empty; nothing can
+            be observed so.
         EnvironmentMissing: the extra `lerobot` is not installed, or pictures cannot be rendered.
     """
     from simrecon_envs.benchmark.demonstrations_maniskill import TrajectoryFile
 
     reporter = reporter or Reporter(quiet=True)
-    root = None if registry is None else str(Path(registry).expanduser().absolute())
-    failed = check_revisions(tasks, RunSettings(registry=root, any_revision=any_revision))
-    datasets = _Datasets(lerobot) if lerobot is not None else None
+    root = absolute(registry)
+    settings = RunSettings(registry=root, any_revision=any_revision, episodes=episodes)
+    failed = check_revisions(tasks, settings)
+    datasets = _Datasets(lerobot, obs_mode) if lerobot is not None else None
     reporter.start(len(tasks), f"recording {len(tasks)} tasks")
     count = steps = 0
     written: list[str] = []
@@ -127,9 +131,14 @@ class _Recorder:
 class _Datasets:
     """One LeRobot dataset a robot, begun with its first demonstration."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, obs_mode: str) -> None:
         from simrecon_envs.benchmark.demonstrations_lerobot import check_folder, need_pyarrow
 
+        if obs_mode in ("state", "none"):
+            raise UsageError(
+                f"--demo-obs {obs_mode}: a LeRobot dataset keeps joints apart from the rest, which needs state_dict, "
+                "or a mode with pictures such as rgb"
+            )
         need_pyarrow()
         check_folder(folder)
         self._folder = folder

@@ -18,7 +18,7 @@ import numpy as np
 
 from registry import EnvironmentMissing, UsageError
 from simrecon_envs.benchmark.demonstrations import Demonstration
-from simrecon_envs.benchmark.files import write_json
+from simrecon_envs.files import write_json
 from simrecon_envs.rollout import open_video
 
 VERSION = "v3.0"

@@ -14,7 +14,7 @@ import gymnasium as gym
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from registry import UsageError
-from simrecon_envs.benchmark.files import write_json
+from simrecon_envs.files import write_json
 from simrecon_envs.registration import env_id
 
 _NAME = "trajectory"

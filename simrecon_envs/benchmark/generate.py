@@ -6,12 +6,13 @@ from pathlib import Path
 
 from registry import SceneRegistry, UsageError
 from simrecon_envs.benchmark.candidates import SEQUENCE, Candidate, check_kinds, composites, scene_candidates
-from simrecon_envs.benchmark.files import Records, versions
 from simrecon_envs.benchmark.parallel import Workers
-from simrecon_envs.benchmark.proof import Proof, ProofSettings, prove, registry_text
+from simrecon_envs.benchmark.proof import Proof, ProofSettings, prove
+from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.splits import side_of
 from simrecon_envs.benchmark.suite import LeftOut, OracleRun, Suite, SuiteTask
+from simrecon_envs.files import absolute, versions
 from simrecon_envs.randomization import Randomization
 from simrecon_envs.robots import check_robot
 
@@ -78,7 +79,7 @@ def generate_suite(
     kinds = check_kinds(config.kinds)
     names = check_scenes(scenes, registry)
     settings = ProofSettings(seed=config.seed, seeds=config.seeds, randomize=config.randomization(),
-                             registry=registry_text(registry))  # fmt: skip
+                             registry=absolute(registry))  # fmt: skip
     tasks: list[SuiteTask] = []
     left_out: list[LeftOut] = []
     with Workers(jobs) as workers:

@@ -21,6 +21,7 @@ class Workers:
 
     def __enter__(self) -> "Workers":
         """Start; processes begin with the first work."""
+        self._frozen_before = gc.get_freeze_count()
         prepare_process()
         if self.jobs > 1:
             # A simulator must not be forked, so every process starts afresh.
@@ -32,7 +33,8 @@ class Workers:
         """End the processes; what was not begun is dropped."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
-        gc.unfreeze()  # of whoever called, once more its own affair
+        if not self._frozen_before:
+            gc.unfreeze()  # of whoever called, once more its own affair
 
     def map(
         self, function: Callable[..., Any], items: Sequence[Any], *arguments: Any

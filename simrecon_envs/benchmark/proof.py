@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -117,8 +116,3 @@ def _limit(env: gym.Env, steps: int) -> None:
     while not isinstance(wrapper, BatchedTimeLimit):
         wrapper = wrapper.env
     wrapper._max_episode_steps = steps
-
-
-def registry_text(registry: Path | None) -> str | None:
-    """Return a registry's folder as other processes need it."""
-    return None if registry is None else str(Path(registry).expanduser().absolute())

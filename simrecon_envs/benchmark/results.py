@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from registry import UsageError
-from simrecon_envs.benchmark.files import read_json, write_json
 from simrecon_envs.benchmark.statistics import bootstrap_mean, wilson
+from simrecon_envs.files import read_json, write_json
 
 SCHEMA = "simrecon.results/1"
 STEP_S = 0.05  # a control step
@@ -53,7 +53,7 @@ class Results:
     """Episodes in the order of the suite."""
 
     suite: dict[str, Any]  # name, digest
-    policy: dict[str, Any]  # name, arguments, options
+    policy: dict[str, Any]  # name, arguments, options (of gym.make, those that all tasks have in common)
     selection: dict[str, Any]
     episodes: tuple[EpisodeResult, ...]
     notes: tuple[str, ...] = ()
@@ -89,10 +89,7 @@ def load_results(path: Path | str) -> Results:
         UsageError: the file is absent or no results of a version that is known here.
     """
     path = Path(path)
-    body = read_json(path, "results")
-    if not isinstance(body, dict) or body.get("schema") != SCHEMA:
-        found = body.get("schema") if isinstance(body, dict) else type(body).__name__
-        raise UsageError(f"results {path}: expected the schema {SCHEMA!r}, found {found!r}")
+    body = read_json(path, "results", SCHEMA)
     try:
         episodes = tuple(EpisodeResult(**entry) for entry in body["episodes"])
         return Results(suite=body["suite"], policy=body["policy"], selection=body["selection"], episodes=episodes,

@@ -7,13 +7,14 @@ from typing import Any
 
 from registry import SceneRegistry, UsageError
 from simrecon_envs.benchmark.episodes import run_episode
-from simrecon_envs.benchmark.files import Records, versions
 from simrecon_envs.benchmark.parallel import Workers
 from simrecon_envs.benchmark.policies import PolicySpec
+from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.results import EpisodeResult, Results
 from simrecon_envs.benchmark.splits import episode_seed
 from simrecon_envs.benchmark.suite import Suite, SuiteTask
+from simrecon_envs.files import versions
 from simrecon_envs.rollout import open_video
 
 
@@ -34,8 +35,12 @@ class RunSettings:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.fresh < 0 or (self.episodes is not None and self.episodes < 1):
-            raise UsageError(f"--episodes {self.episodes}, --fresh-seeds {self.fresh}: expected at least 1")
+        if self.episodes is not None and self.episodes < 1:
+            raise UsageError(f"--episodes {self.episodes}: expected at least 1")
+        if self.fresh < 0:
+            raise UsageError(
+                f"--fresh-seeds {self.fresh}: expected at least 1, or 0 for the suite's own seeds"
+            )
 
 
 def run_suite(
@@ -70,12 +75,11 @@ def run_suite(
     notes = check_revisions(tasks, settings)
     for note in notes:
         reporter.note(f"note: {note}")
-    options = policy.options()
-    policy.load()  # a wrong name is said before anything is built
+    options = [policy.options(task) for task in tasks]  # what is wrong is said before anything is built
     made_with = versions()
     frame = {
         "suite": suite.digest,
-        "policy": asdict(policy),
+        "policy": {**asdict(policy), "digest": policy.digest()},
         "settings": asdict(settings),
         "versions": made_with,
     }
@@ -95,7 +99,7 @@ def run_suite(
             reporter.done(f"{task.name}: {sum(row.success for row in rows)} of {len(rows)}")
     return Results(
         suite={"name": suite_name, "digest": suite.digest},
-        policy={"name": policy.name, "arguments": policy.arguments, "options": options},
+        policy={"name": policy.name, "arguments": policy.arguments, "options": _common(options)},
         selection={**(selection or {}), "episodes": settings.episodes, "fresh_seeds": settings.fresh},
         episodes=tuple(row for task in tasks for row in found[task.name]),
         notes=tuple(notes),
@@ -135,13 +139,13 @@ def run_task(
 ) -> list[EpisodeResult]:
     """Run a task's episodes one after the other, in an environment of its own."""
     suite = Suite(tasks=(task,), options=options)
-    extra: dict[str, Any] = policy.options()
+    extra: dict[str, Any] = policy.options(task)
     if settings.videos is not None:
         size = settings.video_size_px
         extra |= {"render_mode": "rgb_array", "human_render_camera_configs": {"width": size, "height": size}}
     env = suite.make(task, registry=settings.registry, **extra)
     try:
-        actor = policy.load()(env)
+        actor = policy.make(env)
         rows = []
         for number, seed in enumerate(_seeds(task, settings, int(made.get("seed", 0)))):
             video = f"{task.name}-{seed}.mp4" if settings.videos is not None and number == 0 else ""
@@ -154,6 +158,11 @@ def run_task(
         return rows
     finally:
         env.close()
+
+
+def _common(options: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the options that are the same for all tasks."""
+    return {key: value for key, value in options[0].items() if all(o.get(key) == value for o in options)}
 
 
 def _seeds(task: SuiteTask, settings: RunSettings, suite_seed: int) -> list[int]:

@@ -10,9 +10,9 @@ from typing import Any
 
 import gymnasium as gym
 
-from registry import UsageError
-from simrecon_envs.benchmark.files import read_json, write_json
+from registry import SimReconError, UsageError
 from simrecon_envs.benchmark.splits import SIDES
+from simrecon_envs.files import read_json, write_json
 
 SCHEMA = "simrecon.suite/1"
 SPLITS = ("all", *SIDES)
@@ -132,10 +132,21 @@ class Suite:
         return chosen
 
     def make(self, task: SuiteTask, *, registry: Path | str | None = None, **kwargs: Any) -> gym.Env:
-        """Make the environment of a task, with NumPy observations."""
+        """Make the environment of a task, with NumPy observations.
+
+        Raises:
+            UsageError: ManiSkill knows no such observations, control mode or other argument; says what it said.
+        """
         from simrecon_envs.registration import make_cpu
 
-        return make_cpu(task.env_id, registry=registry, **{**self.options, **task.options(), **kwargs})
+        try:
+            return make_cpu(task.env_id, registry=registry, **{**self.options, **task.options(), **kwargs})
+        except SimReconError:
+            raise
+        except (AssertionError, KeyError, TypeError, ValueError) as error:
+            said = str(error).partition(" was raised from the environment creator")[0]
+            wanted = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no options"
+            raise UsageError(f"{task.name}: no environment can be made with {wanted}: {said}") from error
 
     def save(self, path: Path) -> None:
         """Write the suite, whole or not at all."""
@@ -152,10 +163,7 @@ def load_suite(path: Path | str) -> Suite:
         UsageError: the file is absent or no suite of a version that is known here; says what is wrong.
     """
     path = Path(path)
-    body = read_json(path, "suite")
-    if not isinstance(body, dict) or body.get("schema") != SCHEMA:
-        found = body.get("schema") if isinstance(body, dict) else type(body).__name__
-        raise UsageError(f"suite {path}: expected the schema {SCHEMA!r}, found {found!r}")
+    body = read_json(path, "suite", SCHEMA)
     try:
         tasks = tuple(_task(entry) for entry in body["tasks"])
         left_out = tuple(LeftOut(**entry) for entry in body["left_out"])

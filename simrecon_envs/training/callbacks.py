@@ -11,7 +11,8 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from simrecon_envs.training.folder import RunFolder, write_json
+from simrecon_envs.files import write_json
+from simrecon_envs.training.folder import RunFolder
 from simrecon_envs.training.models import save
 from simrecon_envs.training.progress import Interrupted, Progress
 

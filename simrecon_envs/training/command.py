@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from registry import UsageError
+from simrecon_envs.files import absolute
 from simrecon_envs.registration import NAMESPACE
 from simrecon_envs.training.config import (
     TrainConfig,
@@ -75,7 +76,7 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
         scene=arguments.scene.removeprefix(NAMESPACE + "/"),
         task=arguments.task,
         algo=arguments.algo,
-        registry=None if arguments.registry is None else str(arguments.registry.expanduser().absolute()),
+        registry=absolute(arguments.registry),
         settings=parse_settings(arguments.algo, arguments.set),
         **given,
     )
@@ -96,7 +97,7 @@ def _find(arguments: argparse.Namespace) -> RunFolder:
         if config["scene"] != scene:
             raise UsageError(f"--out {arguments.out}: is a run in {config['scene']}, not in {scene}")
         return folder
-    folder = RunFolder.newest(scene, arguments.task, arguments.algo)
+    folder = RunFolder.newest(scene, arguments.task, algo=arguments.algo)
     if folder is None:
         raise UsageError(
             f"no run of {scene}, {arguments.task}, {arguments.algo} to go on with; name its folder with --out, or "

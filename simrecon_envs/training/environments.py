@@ -34,18 +34,22 @@ def env_kwargs(config: TrainConfig) -> dict[str, Any]:
     return kwargs
 
 
-def make_one(config: TrainConfig, *, bonus: bool = True, **more: Any) -> gym.Env:
-    """Make one environment.
+def make_plain(config: TrainConfig, **more: Any) -> gym.Env:
+    """Make the environment of a run as it is, to evaluate in.
 
     Args:
         config: Of the run, with a control mode that the robot has.
-        bonus: Pay at success what staying there would; not where rewards are measured.
         **more: As for `simrecon_envs.make`.
     """
-    env: gym.Env = make_cpu(config.scene, registry=config.registry, **(env_kwargs(config) | more))
+    return make_cpu(config.scene, registry=config.registry, **(env_kwargs(config) | more))
+
+
+def make_one(config: TrainConfig) -> gym.Env:
+    """Make one environment to train in."""
+    env = make_plain(config)
     if config.obs_mode != "state":
         env = FlatPictures(env)
-    gamma = config.settings.gamma if bonus and config.settings.success_bonus else 0.0
+    gamma = config.settings.gamma if config.settings.success_bonus else 0.0
     return EpisodeInfo(env, bonus=gamma / (1 - gamma))
 
 

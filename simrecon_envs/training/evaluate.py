@@ -5,20 +5,18 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-import numpy as np
-
 from registry import EnvironmentMissing
+from simrecon_envs.benchmark.episodes import run_episode
+from simrecon_envs.benchmark.policies import Policy
 from simrecon_envs.benchmark.statistics import wilson
 from simrecon_envs.rollout import open_video
 from simrecon_envs.training.config import LARGEST_SEED, TrainConfig
-from simrecon_envs.training.environments import make_one
+from simrecon_envs.training.environments import make_plain
 
 FIRST_SEED = LARGEST_SEED + 1
 VIDEO_EPISODES = 4
 _VIDEO_PX = 384
 _LAST_FRAMES = 8  # of an episode's last picture
-
-Policy = Callable[[Any], np.ndarray]
 
 
 def evaluate(
@@ -31,7 +29,7 @@ def evaluate(
 
     Args:
         config: Of the run.
-        policy: Observation -> action.
+        policy: Acts.
         episodes: How many, at least one.
         on_episode: Called after every episode with how many are done and how many succeeded.
 
@@ -40,11 +38,14 @@ def evaluate(
         "steps_to_success_median" (None without success), "seeds": [first, last], "per_episode": [{"seed",
         "success", "return", "steps"}]}; steps are 1/20 s, returns are the environment's own.
     """
-    env = make_one(config, bonus=False)
+    env = make_plain(config)
     rows: list[dict[str, Any]] = []
     try:
         for seed in range(FIRST_SEED, FIRST_SEED + episodes):
-            rows.append({"seed": seed, **_episode(env, policy, seed)})
+            found = run_episode(env, policy, seed)
+            rows.append(
+                {"seed": seed, "success": found.success, "return": found.reward, "steps": found.steps}
+            )
             on_episode(len(rows), sum(row["success"] for row in rows))
     finally:
         env.close()
@@ -71,31 +72,15 @@ def record(config: TrainConfig, policy: Policy, path: Path, episodes: int = VIDE
     """
     size = {"width": _VIDEO_PX, "height": _VIDEO_PX}
     try:
-        env = make_one(config, bonus=False, render_mode="rgb_array", human_render_camera_configs=size)
+        env = make_plain(config, render_mode="rgb_array", human_render_camera_configs=size)
     except EnvironmentMissing as error:
         return str(error)
     try:
         with open_video(path, env.unwrapped.control_freq) as add:
             for seed in range(FIRST_SEED, FIRST_SEED + episodes):
-                _episode(env, policy, seed, lambda: add(_picture(env)))
+                run_episode(env, policy, seed, lambda *_: add(env.render()))
                 for _ in range(_LAST_FRAMES):
-                    add(_picture(env))
+                    add(env.render())
     finally:
         env.close()
     return ""
-
-
-def _episode(env: Any, policy: Policy, seed: int, look: Callable[[], None] = lambda: None) -> dict[str, Any]:
-    obs, _ = env.reset(seed=seed)
-    done = False
-    while not done:
-        look()
-        obs, _, terminated, truncated, info = env.step(policy(obs))
-        done = terminated or truncated
-    return {"success": info["is_success"], "return": info["episode"]["r"], "steps": info["episode"]["l"]}
-
-
-def _picture(env: Any) -> np.ndarray:
-    picture = env.render()
-    picture = picture.cpu().numpy() if hasattr(picture, "cpu") else np.asarray(picture)
-    return picture.reshape(picture.shape[-3:]).astype(np.uint8)

@@ -7,7 +7,6 @@ results.json, video.mp4  the evaluation at the end
 """
 
 import contextlib
-import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from typing import Any
 
 from registry import UsageError, default_registry_root
 from registry.locks import LockHeld, file_lock
+from simrecon_envs.files import read_json
 
 SCHEMA = "simrecon.training/1"
 _KEPT = 2  # checkpoints
@@ -69,16 +69,23 @@ class RunFolder:
         return folder
 
     @classmethod
-    def newest(cls, scene: str, task: str, algo: str) -> "RunFolder | None":
-        """Return the last begun of the runs of a scene, a task (or kind of task) and an algorithm."""
+    def newest(cls, scene: str, task: str, *, usable: bool = False, **other: str) -> "RunFolder | None":
+        """Return the last begun of the runs of a scene and a task (or kind of task).
+
+        Args:
+            scene: A scene's id.
+            task: A task's name, or a kind of task.
+            usable: Only of those with a checkpoint.
+            **other: What else the configuration has to say, such as algo="ppo", robot="panda".
+        """
         found = []
-        for path in runs_root().glob(f"{scene}-{task}*-{algo}-*"):
-            folder = cls(path)
+        for path in runs_root().glob("*"):
             with contextlib.suppress(UsageError, KeyError):
-                entry = folder.read_config()
+                entry = cls(path).read_config()
                 config = entry["config"]
-                same_task = config["task"] == task or config["task"].startswith(f"{task}_")
-                if config["scene"] == scene and config["algo"] == algo and same_task:
+                same_task = task in (config["task"], config["task"].split("_")[0])
+                same = all(config[key] == value for key, value in {"scene": scene, **other}.items())
+                if same_task and same and (cls(path).checkpoints() or not usable):
                     found.append((entry["began"], path))
         return cls(max(found)[1]) if found else None
 
@@ -98,13 +105,7 @@ class RunFolder:
         Raises:
             UsageError: it is damaged, or of another version.
         """
-        try:
-            entry = json.loads(self.config_file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise UsageError(f"{self.config_file}: cannot be read ({error})") from error
-        if not isinstance(entry, dict) or entry.get("schema") != SCHEMA:
-            raise UsageError(f"{self.config_file}: expected the schema {SCHEMA}")
-        return entry
+        return read_json(self.config_file, "training run", SCHEMA)
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -148,16 +149,3 @@ class RunFolder:
             shutil.rmtree(partial, ignore_errors=True)
         for _, old in self.checkpoints()[:-_KEPT]:
             shutil.rmtree(old)
-
-
-def write_json(path: Path, entry: dict[str, Any]) -> None:
-    """Write a file whole or not at all."""
-    partial = path.with_name(f".{path.name}-{os.getpid()}")
-    try:
-        with open(partial, "w", encoding="utf-8") as handle:
-            handle.write(json.dumps(entry, indent=2) + "\n")
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -1,6 +1,5 @@
 """What was trained, as a policy: observation -> action."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,13 @@ from registry import UsageError
 from simrecon_envs.training.config import TrainConfig
 from simrecon_envs.training.environments import env_kwargs, flat_pictures
 from simrecon_envs.training.folder import RunFolder, runs_root
+
+_HOW = (
+    "obs_mode",
+    "control_mode",
+    "observe_objects",
+    "sensor_configs",
+)  # of env_kwargs: the rest makes the episode
 
 
 class TrainedPolicy:
@@ -94,39 +100,46 @@ def trained(env: Any, run: str | None = None) -> TrainedPolicy:
         UsageError: no run fits, or the environment was made in another way than the one it was trained in.
     """
     scene = env.unwrapped
-    if run is None:
-        wanted = (scene.scene_id, scene.task, scene.robot_uids)
-        found = [path for path in runs_root().glob("*") if _made_for(path) == wanted]
-        if not found:
-            raise UsageError(
-                f"no run of scene {wanted[0]}, task {wanted[1]}, robot {wanted[2]} in {runs_root()}: train one with "
-                f"`simrecon train {wanted[0]} --task {wanted[1]}`"
-            )
-        run = str(max(found, key=lambda path: (path / "config.json").stat().st_mtime))
-    policy = TrainedPolicy(run)
-    mode, ours = scene.agent.control_mode, policy.config.control_mode
-    if mode != ours:
-        raise UsageError(f"{policy.folder}: trained with control_mode={ours!r}, the environment has {mode!r}")
-    size = env.observation_space.shape
-    if policy.config.obs_mode == "state" and size[-1:] != policy.observation_shape:
+    policy = TrainedPolicy(run or _newest(scene.scene_id, scene.task, scene.robot_uids).path)
+    for what, ours, theirs in (
+        ("robot", policy.config.robot, scene.robot_uids),
+        ("control_mode", policy.config.control_mode, scene.agent.control_mode),
+    ):
+        if ours != theirs:
+            raise UsageError(f"{policy.folder}: trained with {what}={ours!r}, the environment has {theirs!r}")
+    shape = env.observation_space.shape
+    if policy.config.obs_mode == "state" and (shape is None or shape[-1:] != policy.observation_shape):
         raise UsageError(
-            f"{policy.folder}: trained with observations {policy.observation_shape}, the environment's are {size}; "
-            f"make it with {policy.env_kwargs}"
+            f"{policy.folder}: trained for {policy.config.task} with observations {policy.observation_shape}, those "
+            f"of {scene.scene_id}, {scene.task} are {shape}; choose a task of the same kind, or make the environment "
+            f"with {options_of_run(policy.config)}"
         )
     return policy
 
 
-# What `simrecon train --task reach` trains with, for whoever makes the environment.
-trained.policy_options = {"control_mode": "pd_ee_delta_pos", "observe_objects": False}
+def options_of_run(config: TrainConfig) -> dict[str, Any]:
+    """Return how an environment observes and acts in which a run's policy can be used, whatever the task."""
+    kwargs = env_kwargs(config)
+    return {key: kwargs[key] for key in _HOW if key in kwargs}
 
 
-def _made_for(path: Path) -> tuple[str, str, str] | None:
-    try:
-        config = json.loads((path / "config.json").read_text(encoding="utf-8"))["config"]
-        whole = any((path / "checkpoints").glob("step_*"))
-        return (config["scene"], config["task"], config["robot"]) if whole else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def _options(task: Any, run: str | None = None) -> dict[str, Any]:
+    """Return what `trained` needs of `gym.make` for a suite's task."""
+    folder = RunFolder.open(run) if run else _newest(task.scene, task.task, task.robot)
+    return options_of_run(TrainConfig.from_json(folder.read_config()["config"]))
+
+
+trained.policy_options = _options
+
+
+def _newest(scene: str, task: str, robot: str) -> RunFolder:
+    folder = RunFolder.newest(scene, task, usable=True, robot=robot)
+    if folder is None:
+        raise UsageError(
+            f"no run of scene {scene}, task {task}, robot {robot} in {runs_root()}: train one with "
+            f"`simrecon train {scene} --task {task} --robot {robot}`"
+        )
+    return folder
 
 
 def _numpy(value: Any) -> Any:

@@ -4,17 +4,15 @@ import datetime
 import json
 import platform
 import time
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from registry import SimReconError, UsageError
+from simrecon_envs.files import versions, write_json
 from simrecon_envs.training.config import TrainConfig
 from simrecon_envs.training.environments import env_kwargs, make_several, resolve
-from simrecon_envs.training.folder import SCHEMA, RunFolder, write_json
+from simrecon_envs.training.folder import SCHEMA, RunFolder
 from simrecon_envs.training.progress import Interrupted, Progress
-
-_VERSIONS = ("simrecon", "stable-baselines3", "torch", "gymnasium", "mani-skill", "sapien", "numpy")
 
 
 def train(
@@ -51,7 +49,7 @@ def train(
             "scene": scene,
             "environment": env_kwargs(config),
             "total_steps": config.total_steps,
-            "versions": _versions(),
+            "versions": {"python": platform.python_version(), **versions("stable-baselines3")},
             "began": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         }
         write_json(folder.config_file, entry)
@@ -150,7 +148,7 @@ def _learn(config: TrainConfig, folder: RunFolder, progress: Progress) -> None:
     except (EOFError, ConnectionError) as error:
         raise SimReconError(
             f"an environment's process ended unexpectedly ({error!r}); too little memory? Fewer --envs need less. "
-            f"Go on from the last checkpoint with --resume {folder.path}"
+            f"Go on from the last checkpoint: simrecon train {config.scene} --resume --out {folder.path}"
         ) from error
     finally:
         _close(vec)
@@ -221,13 +219,3 @@ def _headline(config: TrainConfig, scene: dict, folder: RunFolder, done: int) ->
 
 def _name(config: TrainConfig) -> str:
     return f"{config.scene}-{config.task}-{config.algo}"
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in _VERSIONS:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

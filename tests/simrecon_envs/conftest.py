@@ -10,9 +10,16 @@ from made_scenes import publish
 from made_suites import SUITE_CONFIG, DyingRecords, Killed
 
 from registry import SceneRegistry
-from simrecon_envs.benchmark.files import Records
 from simrecon_envs.benchmark.generate import generate_suite
+from simrecon_envs.benchmark.parallel import prepare_process
+from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.suite import Suite, load_suite
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _loaded() -> None:
+    """Load the simulator, and keep it out of the garbage collections of every scene that is built or closed."""
+    prepare_process()
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,7 @@
 """A small suite's options, and a generation that is killed half-way."""
 
-from simrecon_envs.benchmark.files import Records
 from simrecon_envs.benchmark.generate import GenerateConfig
+from simrecon_envs.benchmark.records import Records
 
 SUITE_CONFIG = GenerateConfig(kinds=("reach", "pick"), robots=("panda",), per_scene=3, seeds=2)
 

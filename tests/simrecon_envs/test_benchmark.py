@@ -14,11 +14,11 @@ from reconstruction.cli import main
 from registry import EnvironmentMissing, SceneRegistry, UsageError
 from simrecon_envs.benchmark.candidates import Candidate, composites, scene_candidates
 from simrecon_envs.benchmark.compare import compare_results
-from simrecon_envs.benchmark.files import Records
 from simrecon_envs.benchmark.generate import generate_suite
 from simrecon_envs.benchmark.parallel import Workers
 from simrecon_envs.benchmark.policies import PolicySpec
 from simrecon_envs.benchmark.proof import ProofSettings, prove
+from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.results import Results, load_results
 from simrecon_envs.benchmark.run import RunSettings, run_suite
 from simrecon_envs.benchmark.suite import Suite, load_suite
@@ -40,6 +40,19 @@ class Policy:
     def act(self, observation):
         assert self.resets and observation["agent"]["qpos"].shape == (9,)
         return np.full(self.env.action_space.shape, self.gain, np.float32)
+
+class Wrong:
+    def __init__(self, env, how):
+        self.answer = {"nan": np.full(8, np.nan), "short": np.zeros(7), "words": "left", "none": None}.get(how)
+        self.how = how
+
+    def act(self, observation):
+        if self.how == "raise":
+            raise KeyError("qpos")
+        return self.answer
+
+class Smell:
+    policy_options = {"obs_mode": "smell"}
 
 class Greedy:
     policy_options = {"task": "none"}
@@ -217,15 +230,31 @@ def test_a_policy_of_anybody_runs_and_wrong_ones_say_why(
     assert result.policy["options"]["control_mode"] == "pd_joint_delta_pos"
     again = run_suite(suite, task, mine, fresh, records=Records(tmp_path / "out.json"))
     assert again == result  # act_ms, too: nothing was run again
+    (tmp_path / "my_test_policy.py").write_text(POLICY + "\n")
+    run_suite(suite, task, mine, fresh, records=Records(tmp_path / "out.json"))
+    assert len(list(Records(tmp_path / "out.json").folder.iterdir())) == 2  # it is another policy now
     for name, message in {
         "nobody": "expected oracle, still, random or module:callable",
         "no_such_module:Policy": "there is no module 'no_such_module'",
         "my_test_policy:Absent": "no callable 'Absent'",
         "my_test_policy:Greedy": "policy_options has task, which the suite decides",
+        "my_test_policy:Smell": "no environment can be made with obs_mode='smell': .*'smell'",
         "my_test_policy:lazy": r"what it returned \(object\) has no act",
     }.items():
         with pytest.raises(UsageError, match=message):
             run_suite(suite, task, PolicySpec(name), settings)
+    at = "at step 1 of an episode of things, reach_.*, panda"
+    for how, message in {
+        "raise": rf"act\(\) {at} raised KeyError: 'qpos' \(.*my_test_policy.py:\d+\)",
+        "nan": rf"an action that is not finite .* {at}; expected 8 finite numbers",
+        "short": rf"an action of shape \(7,\) {at}",
+        "words": rf"no array of numbers \(str\) {at}",
+        "none": rf"no array of numbers \(NoneType\) {at}",
+    }.items():
+        with pytest.raises(UsageError, match=message):
+            run_suite(suite, task, PolicySpec("my_test_policy:Wrong", {"how": how}), settings)
+    with pytest.raises(UsageError, match=r"making it for things, .* argument 'size'"):
+        run_suite(suite, task, PolicySpec("my_test_policy:Policy", {"size": "1"}), settings)
 
 
 def test_the_command_line_runs_compares_and_explains(
@@ -266,6 +295,8 @@ def test_the_command_line_runs_compares_and_explains(
         ("generate", "things", "--out", "x.json", "--robots", "pandda"): "panda",
         ("generate", "things", "--out", "x.json", "--jobs", "0"): "--jobs 0",
         ("demos", str(suite_file)): "say where demonstrations go",
+        ("demos", str(suite_file), "--maniskill", "d", "--episodes", "0"): "--episodes 0",
+        ("demos", str(suite_file), "--lerobot", "d", "--demo-obs", "state"): "which needs state_dict",
     }.items():
         assert main(["benchmark", *wrong, "--registry", str(scenes_root)]) == 2
         assert message in capsys.readouterr().err

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,6 +18,9 @@ import torch
 import simrecon_envs
 from reconstruction.cli import main
 from registry import UsageError
+from simrecon_envs.benchmark import Suite, SuiteTask, load_results
+from simrecon_envs.benchmark.suite import OracleRun
+from simrecon_envs.registration import env_id
 from simrecon_envs.training import RunFolder, TrainConfig, load_policy, train, trained
 from simrecon_envs.training.config import describe_settings, parse_settings
 from simrecon_envs.training.environments import EpisodeInfo
@@ -152,6 +156,36 @@ def test_a_trained_policy_acts_wherever_its_observations_come_from(
     ):
         trained(env)
     env.close()
+
+
+def test_a_run_goes_through_a_suite_as_it_was_trained(
+    scenes_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _config(
+        scenes_root, task="pick", control_mode="pd_joint_delta_pos", steps=60, eval_episodes=0, seed=3
+    )
+    run = train(config, tmp_path / "runs" / "one", video=False)
+    oracle = (OracleRun(seed=7, steps=10, path_m=0.3),)
+    task = SuiteTask(
+        name="things-it-panda", env_id=env_id("things", run["task"]), scene="things", revision=run["revision"],
+        task=run["task"], kind="pick", robot="panda", instruction=run["instruction"], max_steps=20, objects=(),
+        scene_side="train", object_side="train", oracle=oracle,
+    )  # fmt: skip
+    Suite(tasks=(task,), options={"reconfiguration_freq": 1}).save(tmp_path / "suite.json")
+    monkeypatch.setenv("SIMRECON_HOME", str(tmp_path))
+    command = ["benchmark", "run", str(tmp_path / "suite.json"), "--registry", str(scenes_root), "--quiet"]
+    command += ["--policy", "simrecon_envs.training:trained"]
+    found = {}
+    for name, option in {"newest": [], "named": ["--policy-option", f"run={run['folder']}"]}.items():
+        assert main([*command, *option, "--out", str(tmp_path / name)]) == 0
+        found[name] = load_results(tmp_path / name)
+        assert found[name].policy["options"] == {
+            "obs_mode": "state", "control_mode": "pd_joint_delta_pos", "observe_objects": True
+        }  # fmt: skip
+    one, two = (replace(found[name].episodes[0], act_ms=0.0) for name in found)
+    assert one == two
+    assert one.success or one.steps == 20
+    assert one.path_m > 0
 
 
 class _Hover(gym.Env):
@@ -328,6 +362,7 @@ def test_pictures_are_learned_from_and_the_end_is_filmed(scenes_root: Path, tmp_
     config = _config(scenes_root, obs_mode="rgb", steps=8, eval_episodes=1, settings=settings)
     found = train(config, tmp_path / "run")
     assert found["training"]["steps"] == 8
+    assert found["evaluation"]["episodes"] == 1
     assert Path(found["video"]).stat().st_size > 1000
     policy = load_policy(tmp_path / "run")
     env = simrecon_envs.make_cpu("things", registry=scenes_root, **policy.env_kwargs)

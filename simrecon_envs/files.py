@@ -1,0 +1,90 @@
+"""JSON files that are written whole or not at all, and the versions that results depend on."""
+
+import hashlib
+import json
+import os
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from registry import EnvironmentMissing, UsageError
+
+PACKAGES = ("simrecon", "mani_skill", "sapien", "gymnasium", "torch", "numpy")
+
+
+def read_json(path: Path, what: str, schema: str) -> dict[str, Any]:
+    """Read a JSON file of a schema.
+
+    Args:
+        path: The file.
+        what: What it is, for errors, such as "suite".
+        schema: What its "schema" has to be.
+
+    Raises:
+        UsageError: it is absent, no JSON, or of another schema.
+    """
+    try:
+        body = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"{what} {path}: there is no such file") from None
+    except OSError as error:
+        raise UsageError(f"{what} {path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise UsageError(f"{what} {path}: this is no JSON: {error}") from error
+    found = body.get("schema") if isinstance(body, dict) else type(body).__name__
+    if found != schema:
+        raise UsageError(f"{what} {path}: expected the schema {schema!r}, found {found!r}")
+    return body
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file in place of the old one, whole or not at all.
+
+    Raises:
+        EnvironmentMissing: the folder cannot be written.
+    """
+    partial = path.with_name(f".{path.name}-{os.getpid()}")
+    text = json.dumps(value, indent=1, allow_nan=False) + "\n"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "w", encoding="utf-8") as handle:
+            handle.write(text)
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise EnvironmentMissing(
+            f"cannot write {path}: {error.strerror}; make room there, or choose another --out"
+        ) from error
+
+
+def absolute(path: Path | str | None) -> str | None:
+    """Return a path as other processes need it; None stays None."""
+    return None if path is None else str(Path(path).expanduser().absolute())
+
+
+def versions(*more: str) -> dict[str, str]:
+    """Return the versions of what decides how an episode goes, and of more packages.
+
+    `source` is the digest of this package's files.
+    """
+    found = {}
+    for package in (*PACKAGES, *more):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "source tree" if package == "simrecon" else "not installed"
+    return {**found, "source": _source_digest()}
+
+
+def _source_digest() -> str:
+    """Return a digest of the environments' source, which a version does not tell apart between releases."""
+    root = Path(__file__).resolve().parent
+    digest = hashlib.sha256()
+    for file in sorted(root.rglob("*.py")):
+        parts = file.relative_to(root).parts
+        if parts[0] == "training":
+            continue  # learners see environments, not the other way round
+        digest.update("/".join(parts).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
