@@ -89,7 +89,7 @@ def measure_capture(capture: Capture, out: Path, least_hidden: float, pictures: 
         views = make_views(scene, wanted, AvoConfig(strategy=strategy, views=1, picture_side_px=384))
         asked = replace(config, generator="hunyuan3d", generator_model=f"one-view {strategy}")
         sent[strategy], fetched = _recorded(scene, wanted, posed, evidence, views, asked)
-        trusting = replace(asked, generator_missed=1.0, generator_intruding=1.0)
+        trusting = replace(asked, generator_missed=1.0, generator_intruding=1.0, generator_filling=1.0)
         for name, bounds in ((strategy, trusting), (f"{strategy}, checked", asked)):
             own = replace(evidence, fetched=fetched, config=bounds)
             shapes[name] = {item.id: object_shape(item, own) for item in wanted.objects}

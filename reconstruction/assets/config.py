@@ -91,6 +91,9 @@ class AssetsConfig:
     """A mesh is rejected if a larger share of what was seen is farther from it than 1 cm and 3 % of the object."""
     generator_intruding: float = 0.1
     """A mesh is rejected if a larger share of its surface lies as deep in space that rays passed through."""
+    generator_filling: float = 0.05
+    """A mesh is rejected if a larger share of its volume is space that rays passed through, as deep inside of the
+    mesh: that is one that fills the space below a table, or a bowl."""
 
     def with_hulls(self, most: int) -> "AssetsConfig":
         """Return the config with no more than so many convex pieces for one object, but `LEAST_HULLS`."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -132,6 +133,20 @@ def test_what_agrees_is_used_and_what_does_not_is_rejected(small_capture, server
     book, bowl = items["book"].provenance.geometry, items["bowl"].provenance.geometry
     assert re.fullmatch(r"observed\+.*; rodin rejected: .*", book)
     assert re.fullmatch(r"observed\+.*; no mesh by rodin: .*", bowl)
+
+
+def test_a_bowl_that_is_filled_is_rejected(small_capture, server):
+    """Even where nothing is asked of its surface: what was seen into is known to be empty."""
+    server.meshes["bowl"] = as_glb(true_mesh(small_capture, "bowl").convex_hull)
+    config = config_of(server, generator_budget=1.5, generator_missed=1.0, generator_intruding=1.0)
+    found = instances_of(small_capture)
+    (bowl,) = (item for item in found.objects if item.label == "bowl")
+    found = replace(found, objects=(bowl,))
+    assets = build_assets(small_capture.posed, small_capture.depth, EMPTY, found, config)
+    how = assets.objects[0].provenance.geometry
+    assert re.search(
+        r"rodin rejected: \d+% of its volume fills what rays passed through \(at most 5% may\)", how
+    )
 
 
 def test_a_rerun_pays_nothing_and_gives_the_same_bytes(small_capture, seen, server):

@@ -8,9 +8,10 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.generation.base import GenerationError
 from reconstruction.assets.generation.closing import closed_solid
 from reconstruction.assets.generation.fetch import Fetched
+from reconstruction.assets.generation.filling import filled_share
 from reconstruction.assets.generation.meshes import GeneratedMesh, read_generated
 from reconstruction.assets.registration import FreeDepth, Registration, SeenSurface, register
-from reconstruction.assets.solid import Solid
+from reconstruction.assets.solid import Solid, manifold_of
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 from reconstruction.types import SpaceGrid
 from registry.geometry import transform_points
@@ -61,14 +62,20 @@ def generated_shape(
     except GenerationError as error:
         return Attempt(f"{fetched.by} rejected: {error}", rejected=True)
     seen = believed_surface(frame, volume)
-    fit = register(mesh.points, mesh.normals, seen, free_space(frame, volume, space))
+    free = free_space(frame, volume, space)
+    fit = register(mesh.points, mesh.normals, seen, free)
     fault = fit.fault(config.generator_missed, config.generator_intruding)
     if fault:
         return Attempt(f"{fetched.by} rejected: {fault}", rejected=True)
     placed = mesh.moved(fit.scale, fit.rotation, fit.translation)
     body = closed_solid(placed, config, config.faces_furniture if furniture else config.faces_small)
-    if body is None:
+    manifold = None if body is None else manifold_of(body)
+    if manifold is None:
         return Attempt(f"{fetched.by} rejected: its mesh cannot be closed to a solid", rejected=True)
+    filled, most = filled_share(manifold, free, fit.near_m), config.generator_filling
+    if filled > most:
+        fault = f"{filled:.0%} of its volume fills what rays passed through (at most {most:.0%} may)"
+        return Attempt(f"{fetched.by} rejected: {fault}", rejected=True)
     return Attempt(_description(fetched.by, fit), body, _colors(placed, frame))
 
 

@@ -1,0 +1,87 @@
+"""A generated mesh that fills what was looked into is told; the true one is not, nor where it is a little off."""
+
+import numpy as np
+import pytest
+import trimesh
+from generation_servers import as_glb, thing_mesh
+from test_generation_registration import free_around
+
+from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.generation.closing import closed_solid
+from reconstruction.assets.generation.filling import filled_share
+from reconstruction.assets.generation.meshes import read_generated
+from reconstruction.assets.solid import manifold_of
+from reconstruction.synthetic.containers import make_basket, make_bowl, make_crate, make_mug
+from reconstruction.synthetic.furnishing import (
+    make_bench,
+    make_bookcase,
+    make_cabinet,
+    make_chair,
+    make_round_table,
+    make_stool,
+    make_table,
+)
+
+BOUND = AssetsConfig().generator_filling
+HOLLOW = [
+    (make_table, 0.0), (make_round_table, 0.0), (make_bench, 0.0), (make_stool, 0.0), (make_chair, 0.0),
+    (make_bookcase, 0.0), (make_bowl, 0.5), (make_mug, 0.5), (make_crate, 0.5), (make_basket, 0.5),
+]  # fmt: skip
+
+
+def cameras(stands_at: float) -> list[np.ndarray]:
+    """Four places on the open side of a thing, as high as one holds a camera above the floor."""
+    angles = np.radians((-109.0, -92.0, -75.0, -58.0))
+    return [np.array([1.7 * np.cos(a), 1.7 * np.sin(a), 1.5 - stands_at]) for a in angles]
+
+
+def near_of(mesh: trimesh.Trimesh) -> float:
+    return max(0.01, 0.03 * float(mesh.extents.max()))
+
+
+def filling(mesh: trimesh.Trimesh, free, near_m: float) -> float:
+    """How much of the volume that is made of a generated mesh is free."""
+    body = manifold_of(closed_solid(read_generated(as_glb(mesh)), AssetsConfig(), 6000))
+    return filled_share(body, free, near_m)
+
+
+@pytest.mark.parametrize(("make", "stands_at"), HOLLOW)
+def test_what_is_filled_is_told_and_what_is_a_little_off_is_not(make, stands_at):
+    mesh = thing_mesh(make, seed=1)
+    free, near = free_around(mesh, cameras(stands_at)), near_of(mesh)
+    assert filling(mesh, free, near) == 0.0
+    for way in ((0.01, 0, 0), (0, -0.01, 0), (0.007, 0.007, 0)):
+        off = mesh.copy()
+        off.apply_translation(way)
+        assert filling(off, free, near) < 0.01
+    assert filling(mesh.convex_hull, free, near) > BOUND
+
+
+def test_what_is_massive_may_be_massive():
+    mesh = thing_mesh(make_cabinet, seed=1)
+    free, near = free_around(mesh, cameras(0.0)), near_of(mesh)
+    assert filling(mesh, free, near) == 0.0
+    assert filling(mesh.convex_hull, free, near) == 0.0
+
+
+def test_a_hollow_that_nobody_looked_into_may_be_filled():
+    mesh = thing_mesh(make_bookcase, seed=1)
+    behind = [eye * [1, -1, 1] for eye in cameras(0.0)]
+    assert filling(mesh.convex_hull, free_around(mesh, behind), near_of(mesh)) == 0.0
+
+
+def test_the_share_is_that_of_the_volume():
+    """A cube of 40 cm, of whose lower half what is deeper inside than 5 cm is free."""
+    import manifold3d
+
+    body = manifold3d.Manifold.cube((0.4, 0.4, 0.4)).translate((1.0, -2.0, 0.0))
+    share = filled_share(body, lambda points: (points[:, 2] < 0.2).astype(float), 0.05)
+    assert share == pytest.approx(0.3 * 0.3 * 0.15 / 0.4**3, rel=0.05)
+
+
+def test_lanes_between_legs_count_though_none_is_wide():
+    import manifold3d
+
+    body = manifold3d.Manifold.cube((1.0, 1.0, 1.0))
+    share = filled_share(body, lambda points: 0.02 * (np.floor(points[:, 0] / 0.04) % 2), 0.03)
+    assert share == pytest.approx(0.5 * 0.94**3, rel=0.1)
