@@ -25,12 +25,14 @@ _EXACT_M, _EXACT_SHARE = 2e-5, 2e-5  # files round to seven digits, arrays to fl
 
 @dataclass(frozen=True)
 class Primitive:
-    """One primitive. Its axis, if it has one, is the z axis of its own space; lengths in metres."""
+    """One primitive. Its axis, if it has one, is the z axis of its own space.
+
+    The size, in metres, is of a box its half extents (3), of a cylinder radius and half length, of a sphere its radius,
+    of a capsule radius and half length without caps.
+    """
 
     shape: Shape
-    size: tuple[
-        float, ...
-    ]  # box: half extents; cylinder: radius, half length; sphere: radius; capsule: radius, half length without caps
+    size: tuple[float, ...]
     pose: np.ndarray  # float64 (4, 4) object_from_primitive, rigid
 
     @property
@@ -51,12 +53,12 @@ class Primitive:
 
 
 def corners_of(primitive: Primitive) -> np.ndarray:
-    """Return the corners (n, 3) of the convex mesh that stands for a primitive."""
+    """Return the corners (n, 3) of the convex mesh that stands for a primitive, in object space, metres."""
     return transform_points(primitive.pose, _corners(primitive.shape, primitive.size))
 
 
 def primitive_of(points: np.ndarray) -> Primitive | None:
-    """Return the primitive whose corners these points (n, 3) are, in any order; None for anything else."""
+    """Return the primitive whose corners these points (n, 3) in metres are, in any order; None for anything else."""
     points = np.unique(np.asarray(points, np.float64).round(7), axis=0)
     if not np.isfinite(points).all():
         return None

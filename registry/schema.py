@@ -210,7 +210,7 @@ def _primitives(item: dict, where: str) -> None:
             continue
         place = f"{where}[{k}]"
         shape = _mapping(entry, place).get("shape")
-        if shape not in SIZES:
+        if not isinstance(shape, str) or shape not in SIZES:
             _fail(f"{place}.shape", " or ".join(f'"{x}"' for x in SIZES), shape)
         if min(_vector(entry, "size", place, (SIZES[shape],), high=_MAX_METRES)) <= 0:
             _fail(f"{place}.size", "lengths above 0 in metres", entry["size"])

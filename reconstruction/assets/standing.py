@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from reconstruction.assets.support import support_height
 from reconstruction.assets.views import ScenePixels, SeenPoints, lift_object, within_outlines
-from reconstruction.assets.volume import ObjectFrame, ObjectVolume, support_height, without_outliers
+from reconstruction.assets.volume import ObjectFrame, ObjectVolume, without_outliers
 from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 

@@ -14,9 +14,6 @@ from reconstruction.assets.views import ScenePixels, SeenPoints
 from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, rigid, transform_points
 
-_SMEAR_M = (0.025, 0.06)  # smeared depth ends before, and what lies farther off says little
-_SMEAR_HEIGHT_M = 0.03
-_LEVEL_M = 0.003
 _MIN_CONFIRMED = 0.7  # of a thing's points, or its volume is too poor to judge them
 _SHADOW_M = 0.05  # behind a thing's rim: there ends what errs at its outline
 
@@ -137,83 +134,6 @@ def _wall_of(item: Instance, found: InstanceSet) -> np.ndarray | None:
     return None
 
 
-def support_height(
-    item: Instance, points: np.ndarray, carrier: SeenPoints | None, found: InstanceSet
-) -> float | None:
-    """Return the height of what the object stands on, just below it, or None where that is not known.
-
-    Floors are planes. Other supports are measured: their points (`carrier`) in a ring around the footprint.
-    """
-    lowest = float(np.percentile(points[:, 2], 0.5))
-    height = float(np.percentile(points[:, 2], 99.5)) - lowest
-    for base in found.base:
-        if base.id == item.support_hint and base.label == "floor":
-            n, d = base.surface.plane[:3], base.surface.plane[3]
-            center = np.median(points[:, :2], axis=0)
-            level = float(-(d + n[:2] @ center) / n[2]) if abs(n[2]) > 0.5 else 0.0
-            return level if level < lowest + 0.05 else None
-    if carrier is None:
-        return None
-    ring = _support_ring(points, carrier)
-    if len(ring) < 30:
-        return None
-    level = float(np.percentile(ring, 30))
-    # What encloses the object (a tray's rim) rises beside it; it stands on the low part.
-    if level > lowest + 0.01:
-        level = float(np.percentile(ring, 8))
-    if level > lowest + 0.02 or lowest - level > max(0.04, 0.6 * height):
-        return None
-    around = _level_around(points, carrier)
-    # Depth smears what is flat into a slope around it, as wide as a few centimetres: it stands at the slope's foot.
-    if around is not None and level - _SMEAR_HEIGHT_M < around < level:
-        level = around
-    return min(level, lowest + 0.004)
-
-
-def _level_around(points: np.ndarray, support: SeenPoints) -> float | None:
-    """Return the height of a flat support a few centimetres off an object, or None: not flat, or not all around it."""
-    low, high = points[:, :2].min(axis=0) - _SMEAR_M[1], points[:, :2].max(axis=0) + _SMEAR_M[1]
-    inside = np.all((support.points[:, :2] > low) & (support.points[:, :2] < high), axis=1)
-    near = support.points[inside & (support.normals[:, 2] > 0.7)]
-    if len(near) < 60:
-        return None
-    away = _footprint_distance(points, near)
-    ring = near[(away > _SMEAR_M[0]) & (away < _SMEAR_M[1])]
-    offset = ring[:, :2] - np.median(points[:, :2], axis=0)
-    sector = np.floor((np.arctan2(offset[:, 1], offset[:, 0]) / np.pi + 1) * 6).astype(int) % 12
-    heights = [np.median(ring[sector == k, 2]) for k in range(12) if (sector == k).sum() >= 5]
-    if len(heights) < 6:
-        return None
-    level = float(np.median(heights))
-    agree = np.abs(np.array(heights) - level) < _LEVEL_M
-    return level if agree.mean() >= 0.75 else None
-
-
-def _footprint_distance(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return how far (n,) points `near` are from an object's points, seen from above."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(points[:: max(1, len(points) // 5000), :2]).query(near[:, :2])[0]
-
-
-def _support_ring(points: np.ndarray, support: SeenPoints) -> np.ndarray:
-    """Heights of the support's surface in a ring of a few centimetres around the object."""
-    if len(support.points) == 0:
-        return np.zeros(0)
-    low, high = points[:, :2].min(axis=0) - 0.04, points[:, :2].max(axis=0) + 0.04
-    upward = (support.normals[:, 2] > 0.7) | (np.linalg.norm(support.normals, axis=1) < 0.5)
-    inside = np.all((support.points[:, :2] > low) & (support.points[:, :2] < high), axis=1) & upward
-    near = support.points[inside]
-    if len(near) < 30:
-        return np.zeros(0)
-    distance = _footprint_distance(points, near)
-    for reach in (0.012, 0.025, 0.04):
-        ring = near[distance < reach, 2]
-        if len(ring) >= 60:
-            return ring
-    return near[:, 2]
-
-
 def fuse_volume(
     target: int,
     frame: ObjectFrame,
@@ -226,6 +146,54 @@ def fuse_volume(
     """Fuse the object's pixels into its grid, and the free space of all pixels."""
     from reconstruction.assets.kernels import fuse_object
 
+    frames = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8).astype(
+        np.int32
+    )
+    grid_from_camera = invert_rigid(frame.world_from_grid)[None] @ posed.world_from_camera[frames]
+    distance_m = float(np.median(np.linalg.norm(grid_from_camera[:, :3, 3], axis=1))) if len(frames) else 1.0
+    camera, noise = depth.camera, noise_relative * distance_m
+    box = _box(frame, config)
+    voxel = _voxel_size(box, max(0.7 * noise, 0.7 * distance_m / camera.fx), config)
+    origin, shape = _grid(box, voxel, standing=frame.wall_y is None)
+    camera_from_grid = np.stack(
+        [invert_rigid(posed.world_from_camera[f]) @ frame.world_from_grid for f in frames]
+    )
+    trunc = max(2.5 * voxel, 3.0 * noise)
+    tau = max(0.6 * trunc, 2.0 * noise)
+    shell = max(2.2 * voxel, config.min_thickness_m)
+    evidence = _Evidence(*fuse_object(
+        pixels.depth, pixels.confidence, pixels.ids, pixels.cosine, pixels.inner, frames, camera_from_grid, camera.fx,
+        camera.fy, camera.cx, camera.cy, target, shape, origin, voxel, trunc, tau, shell, _SHADOW_M,
+    ))  # fmt: skip
+    # What lies outside the outline in many frames that see past it is skirt: outlines are sharper than depth.
+    skirt = (evidence.outside >= 2) & (evidence.outside > 0.35 * evidence.support)
+    near = evidence.surface(len(frames), skirt, small=box.size.max() <= config.furniture_m)
+    if near.any():
+        away = away_directions(camera_from_grid, 0.5 * (box.low + box.high))
+        near &= ~behind_rims(near, evidence.support, evidence.inner, evidence.shadowed, away)
+    # One stray ray does not free a voxel that many frames saw as surface.
+    enough = np.minimum(2, max(1, len(frames) // 6))
+    free = (evidence.freed >= enough) | skirt
+    distance = evidence.distances(near, free, voxel, trunc)
+    return ObjectVolume(origin, voxel, trunc, noise, distance, near | free, free & (distance > 0), near)
+
+
+@dataclass(frozen=True)
+class _Box:
+    """What the grid of an object covers, grid frame, metres."""
+
+    low: np.ndarray  # float64 (3,) of what was seen, down to the support
+    high: np.ndarray  # float64 (3,)
+    margin: np.ndarray  # float64 (3,) beyond it, on either side
+    size: np.ndarray  # float64 (3,) of what was seen alone
+
+    @property
+    def span(self) -> np.ndarray:
+        """Return its size with margins (3,)."""
+        return self.high - self.low + 2 * self.margin
+
+
+def _box(frame: ObjectFrame, config: AssetsConfig) -> _Box:
     low, high = np.percentile(frame.points, 0.2, axis=0), np.percentile(frame.points, 99.8, axis=0)
     size = np.maximum(high - low, 0.01)
     # Unseen sides may lie a little beyond what was seen, by symmetry.
@@ -236,62 +204,67 @@ def fuse_volume(
         high[1] = min(high[1], low[1] + max(config.flat_thickness_m, 0.25 * max(size[0], size[2])))
     else:
         low[2] = min(low[2], 0.0)
-    span = high - low + 2 * margin
-    # Flat and thin things have few voxels along their short sides: they can afford finer ones, down to the noise.
-    frames = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8).astype(
-        np.int32
-    )
-    depths = invert_rigid(frame.world_from_grid)[None] @ posed.world_from_camera[frames]
-    distance_m = float(np.median(np.linalg.norm(depths[:, :3, 3], axis=1))) if len(frames) else 1.0
-    noise = noise_relative * distance_m
-    finest = max(config.voxel_min_m, 0.7 * noise, 0.7 * distance_m / depth.camera.fx)
+    return _Box(low, high, margin, size)
+
+
+def _voxel_size(box: _Box, finest_m: float, config: AssetsConfig) -> float:
+    """Return the size of a voxel: flat and thin things have few along their short sides, and can afford finer ones."""
+    span = box.span
+    finest = max(config.voxel_min_m, finest_m)
     cubic = float((span.prod() / (0.7 * config.cells_along_longest**3)) ** (1 / 3))
+    affordable = float((span.prod() / config.max_voxels) ** (1 / 3))
     voxel = max(min(float(span.max()) / config.cells_along_longest, max(cubic, finest)), config.voxel_min_m)
-    if size.max() > config.furniture_m:
-        voxel = float((span.prod() / config.max_voxels) ** (1 / 3))
-        voxel = float(np.clip(voxel, 0.004, 0.02))
-    voxel = max(voxel, float((span.prod() / config.max_voxels) ** (1 / 3)))
+    if box.size.max() > config.furniture_m:
+        voxel = float(np.clip(affordable, 0.004, 0.02))
+    return max(voxel, affordable)
+
+
+def _grid(box: _Box, voxel: float, *, standing: bool) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Return the corner (3,) of a grid around a box, and how many voxels it has along each axis."""
     pad = 2
-    origin = low - margin - pad * voxel
-    if frame.wall_y is None:
+    origin = box.low - box.margin - pad * voxel
+    if standing:
         # z = 0 lies between two layers, so that bottoms come out flat on the support.
-        origin[2] = -np.ceil(max(-(low[2] - margin[2]), 0.0) / voxel) * voxel - pad * voxel
-    shape = tuple(int(np.ceil((high[a] + margin[a] - origin[a]) / voxel)) + pad for a in range(3))
-    camera_from_grid = np.stack(
-        [invert_rigid(posed.world_from_camera[f]) @ frame.world_from_grid for f in frames]
+        origin[2] = -np.ceil(max(-(box.low[2] - box.margin[2]), 0.0) / voxel) * voxel - pad * voxel
+    return origin, tuple(
+        int(np.ceil((box.high[a] + box.margin[a] - origin[a]) / voxel)) + pad for a in range(3)
     )
-    trunc = max(2.5 * voxel, 3.0 * noise)
-    tau = max(0.6 * trunc, 2.0 * noise)
-    camera = depth.camera
-    shell = max(2.2 * voxel, config.min_thickness_m)
-    numerator, denominator, freed, support, outside, behind, inner, shadowed = fuse_object(
-        pixels.depth, pixels.confidence, pixels.ids, pixels.cosine, pixels.inner, frames, camera_from_grid, camera.fx,
-        camera.fy, camera.cx, camera.cy, target, shape, origin, voxel, trunc, tau, shell, _SHADOW_M,
-    )  # fmt: skip
-    # Surface that only one or two of many frames report is a depth error at an outline.
-    near = (denominator > 0) & (support >= int(np.clip(len(frames) // 8, 1, 3)))
-    # What lies outside the outline in many frames that see past it is skirt: outlines are sharper than depth.
-    skirt = (outside >= 2) & (outside > 0.35 * support)
-    near &= ~skirt
-    if size.max() <= config.furniture_m and near.any():
-        near &= support >= 0.12 * np.percentile(support[near], 75)
-    if near.any():
-        away = away_directions(camera_from_grid, 0.5 * (low + high))
-        near &= ~behind_rims(near, support, inner, shadowed, away)
-    distance = np.where(near, numerator / np.maximum(denominator, 1e-12), 0).astype(np.float32)
-    # One stray ray does not free a voxel that many frames saw as surface.
-    enough = np.minimum(2, max(1, len(frames) // 6))
-    free = (freed >= enough) | skirt
-    vote = freed.astype(np.float32) * np.exp(1.0) * 0.7
-    mixed = near & free
-    blended = (numerator + vote * trunc) / np.maximum(denominator + vote, 1e-12)
-    distance[mixed] = blended[mixed]
-    distance[free & ~near] = trunc
-    # A wall thinner than the noise is freed from its other side; what many frames saw just before it keeps it.
-    usual = np.percentile(behind[near], 85) if near.any() else 0.0
-    wall = mixed & (behind >= max(3.0, 0.35 * usual)) & (behind > 0.7 * freed) & (distance > -1.5 * voxel)
-    distance[wall] = -1.5 * voxel
-    return ObjectVolume(origin, voxel, trunc, noise, distance, near | free, free & (distance > 0), near)
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What all frames say of every voxel (nx, ny, nz), as `fuse_object` sums it."""
+
+    numerator: np.ndarray
+    denominator: np.ndarray
+    freed: np.ndarray
+    support: np.ndarray
+    outside: np.ndarray
+    behind: np.ndarray
+    inner: np.ndarray
+    shadowed: np.ndarray
+
+    def surface(self, frames: int, skirt: np.ndarray, *, small: bool) -> np.ndarray:
+        """Tell which voxels have surface, out of so many frames: what few of many report errs at an outline."""
+        near = (self.denominator > 0) & (self.support >= int(np.clip(frames // 8, 1, 3)))
+        near &= ~skirt
+        if small and near.any():
+            near &= self.support >= 0.12 * np.percentile(self.support[near], 75)
+        return near
+
+    def distances(self, near: np.ndarray, free: np.ndarray, voxel: float, trunc: float) -> np.ndarray:
+        """Return signed distances in metres, float32, where there is surface or free space."""
+        distance = np.where(near, self.numerator / np.maximum(self.denominator, 1e-12), 0).astype(np.float32)
+        vote = self.freed.astype(np.float32) * np.exp(1.0) * 0.7
+        mixed = near & free
+        blended = (self.numerator + vote * trunc) / np.maximum(self.denominator + vote, 1e-12)
+        distance[mixed] = blended[mixed]
+        distance[free & ~near] = trunc
+        # A wall thinner than the noise is freed from its other side; what many frames saw just before it keeps it.
+        usual = np.percentile(self.behind[near], 85) if near.any() else 0.0
+        wall = mixed & (self.behind >= max(3.0, 0.35 * usual)) & (self.behind > 0.7 * self.freed)
+        distance[wall & (distance > -1.5 * voxel)] = -1.5 * voxel
+        return distance
 
 
 def confirmed(frame: ObjectFrame, volume: ObjectVolume) -> ObjectFrame:

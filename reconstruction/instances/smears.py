@@ -20,7 +20,7 @@ from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 _LARGEST_M = 0.6  # furniture stands along walls and may have their color
 _REACHES_M = 0.06  # a smear goes on to the wall
-_MAX_FRAMES, _MIN_SEEN, _SURE_SHARE = 36, 2, 0.6
+_MIN_SEEN, _SURE_SHARE = 2, 0.6
 _ALIKE = 6.0
 _CELL_M, _NEAR_M = 0.015, 0.25  # of the wall's picture; beyond what is known of it
 _ON_WALL_M, _ON_WALL = 0.015, 0.01  # depth this near shows the wall: metres, share of depth

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from reconstruction.assets.standing import Standing, _agreed, _hidden_foot, within_walls, without_children
+from reconstruction.assets.support import support_height
 from reconstruction.assets.views import SeenPoints
-from reconstruction.assets.volume import ObjectFrame, ObjectVolume, support_height
+from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane
 from registry.geometry import rigid
 

@@ -52,6 +52,7 @@ MISTAKES = [
     ("objects[1].id", True, "whole number"),
     ("objects[1].collision_primitives", [], "one for each collision part"),
     ("objects[1].collision_primitives", [{**BALL, "shape": "cone"}], '"sphere"'),
+    ("objects[1].collision_primitives", [{**BALL, "shape": ["box"]}], '"sphere"'),
     ("objects[1].collision_primitives", [{**BALL, "size": [0.1, 0.1]}], "1 finite numbers"),
     ("objects[1].collision_primitives", [{**BALL, "size": [0.0]}], "above 0"),
     ("objects[1].collision_primitives", [{**BALL, "object_from_primitive": SCALED}], "rigid"),

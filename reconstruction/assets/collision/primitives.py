@@ -1,7 +1,7 @@
 """Boxes, cylinders, spheres and capsules in place of hulls, where they fit a solid within two millimetres."""
 
 import math
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -95,10 +95,10 @@ def _first_guess(solid: Solid, shape: Shape, lying: bool) -> np.ndarray:
 
 
 def _refined(shape: Shape, lying: bool, first: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the least squares fit."""
+    """Return center (3), heading and size, from a first guess, that lie nearest to points (n, 3) in least squares."""
     from scipy.optimize import least_squares
 
-    fit: Callable[[np.ndarray], np.ndarray] = lambda values: _distance(shape, lying, values, points)  # noqa: E731
+    fit = partial(_distance, shape, lying, points=points)
     return least_squares(fit, first, x_scale=np.maximum(np.abs(first), 0.05), max_nfev=40).x
 
 
@@ -106,10 +106,8 @@ def _made(shape: Shape, lying: bool, values: np.ndarray, low: float) -> Primitiv
     """Return the primitive of fitted values, standing where the solid does."""
     size = np.abs(values[4:])
     center = values[:3].copy()
-    if shape == "box" or (
-        shape == "cylinder" and not lying
-    ):  # its foot is the solid's, its top stays where it fits
-        top = center[2] + size[-1]
+    if shape == "box" or (shape == "cylinder" and not lying):
+        top = center[2] + size[-1]  # stays where it fits, while its foot becomes the solid's
         size[-1] = 0.5 * (top - low)
         center[2] = 0.5 * (top + low)
     else:
@@ -127,6 +125,7 @@ def _rotation(lying: bool, heading: float) -> np.ndarray:
 
 
 def _distance(shape: Shape, lying: bool, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the signed distance (n,) of points (n, 3) to the primitive of fitted values."""
     return _own_distance(shape, np.abs(values[4:]), (points - values[:3]) @ _rotation(lying, values[3]))
 
 
