@@ -159,10 +159,23 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
 
 
 def write_obj(part: ConvexPart, path: Path) -> None:
-    """Write a convex part as Wavefront OBJ in its own space (+z up, metres)."""
-    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in np.asarray(part.vertices, np.float64)]
-    lines += [f"f {a} {b} {c}" for a, b, c in np.asarray(part.faces, np.int64) + 1]
+    """Write a convex part as Wavefront OBJ in its own space (+z up, metres, seven digits).
+
+    Where these digits do not tell two corners apart, as after a cut, the hull of those that they do is written: once
+    readers join what lies in the same place, the triangles between would leave openings.
+    """
+    from reconstruction.assets.solid import hull_solid
+
+    corners, faces = _corner_lines(part.vertices), np.asarray(part.faces, np.int64)
+    if len(set(corners)) < len(corners):
+        hull = hull_solid(np.array([line.split()[1:] for line in sorted(set(corners))], np.float64))
+        corners, faces = _corner_lines(hull.vertices), hull.faces
+    lines = corners + [f"f {a} {b} {c}" for a, b, c in faces + 1]
     Path(path).write_text("\n".join(lines) + "\n")
+
+
+def _corner_lines(vertices: np.ndarray) -> list[str]:
+    return [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in np.asarray(vertices, np.float64)]
 
 
 def read_obj(path: Path) -> ConvexPart:

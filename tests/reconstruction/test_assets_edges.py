@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from reconstruction.assembly.base import convex_part
 from reconstruction.assets.collision.build import _part
 from reconstruction.assets.edges import with_simple_edges
 from reconstruction.assets.gltf import read_obj, write_obj
@@ -52,6 +53,20 @@ def test_what_is_watertight_keeps_its_surface_and_what_is_open_comes_back():
     assert with_simple_edges(box).volume == pytest.approx(1e-3)
     opened = Solid(box.vertices, box.faces[:-1])
     assert with_simple_edges(opened) is opened
+
+
+def test_what_a_cut_left_in_the_same_place_is_one_in_the_file(tmp_path):
+    """A hull keeps corners that float32 does not tell apart; the file has them once, and no hole between them."""
+    box = box_solid(np.zeros(3), np.array([0.3, 0.2, 0.1]))
+    corner = box.vertices[-1]
+    twice = corner - 1e-9 * np.array([[0, 0, 1], [0, 1, 0]])
+    part = convex_part(np.concatenate([box.vertices[:-1], twice]))
+    assert len(part.vertices) == 9
+    write_obj(part, tmp_path / "part.obj")
+    back = read_obj(tmp_path / "part.obj")
+    assert len(back.vertices) == 8
+    assert is_watertight(Solid(back.vertices.astype(float), back.faces))
+    assert Solid(back.vertices.astype(float), back.faces).volume == pytest.approx(0.006)
 
 
 def test_collision_parts_are_watertight_in_their_files(tmp_path):
