@@ -120,16 +120,12 @@ def _add_run(parts: argparse._SubParsersAction) -> None:
     _add_choice(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="the results, such as results.json")
     parser.add_argument("--videos", type=Path, metavar="DIR", help="a video of each task's first episode")
-    parser.add_argument("--episodes", type=int, metavar="N", help="most episodes of a task (default: all)")
     parser.add_argument(
         "--fresh-seeds",
         type=int,
         default=0,
         metavar="N",
         help="N episodes of each task from seeds that are not the suite's, in place of those",
-    )
-    parser.add_argument(
-        "--any-revision", action="store_true", help="go on where a scene has another revision, and note it"
     )
     _add_work(parser)
     parser.set_defaults(run=run_by_name(f"{_RUNNER}:run"))
@@ -161,10 +157,6 @@ def _add_demos(parts: argparse._SubParsersAction) -> None:
     parser.add_argument("suite", type=Path, metavar="SUITE", help="a file of `simrecon benchmark generate`")
     _add_choice(parser)
     _add_demo_flags(parser, long=True)
-    parser.add_argument("--episodes", type=int, metavar="N", help="most episodes of a task (default: all)")
-    parser.add_argument(
-        "--any-revision", action="store_true", help="go on where a scene has another revision, and note it"
-    )
     _add_work(parser, jobs=False)
     parser.set_defaults(run=run_by_name(f"{_RUNNER}:demos"))
 
@@ -192,6 +184,10 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tasks", default="*", metavar="GLOB", help="names, such as '*-push_*', with commas")
     parser.add_argument("--kinds", type=_words, default=(), help="only these kinds, with commas")
     parser.add_argument("--robots", type=_words, default=(), help="only these robots, with commas")
+    parser.add_argument("--episodes", type=int, metavar="N", help="most episodes of a task (default: all)")
+    parser.add_argument(
+        "--any-revision", action="store_true", help="go on where a scene has another revision, and note it"
+    )
 
 
 def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None:
@@ -218,17 +214,12 @@ def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None
 
 
 def _add_work(parser: argparse.ArgumentParser, jobs: bool = True) -> None:
+    from reconstruction.cli import add_common
+
     if jobs:
         parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument(
-        "--registry",
-        type=Path,
-        metavar="DIR",
-        help="where scenes live (default: $SIMRECON_HOME/registry, or ~/.simrecon/registry)",
-    )
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
-    parser.add_argument("--verbose", action="store_true", help="log what is decided")
-    parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
+    add_common(parser)
 
 
 def _words(text: str) -> tuple[str, ...]:

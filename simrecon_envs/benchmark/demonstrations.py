@@ -76,8 +76,9 @@ def record_demonstrations(
     written: list[str] = []
     for task in tasks:
         env = suite.make(task, registry=root, control_mode=CONTROL_MODE, obs_mode=obs_mode)
-        file = TrajectoryFile(env, maniskill / task.name) if maniskill is not None else None
+        file = None
         try:
+            file = TrajectoryFile(env, maniskill / task.name) if maniskill is not None else None
             recorded = file.env if file is not None else env
             policy = OraclePolicy(recorded)
             done = 0
