@@ -12,6 +12,7 @@ import numpy as np
 from registry import UsageError
 from simrecon_envs.arrays import numpy
 from simrecon_envs.grasps import Grasp
+from simrecon_envs.tasks.push import HAND_BEHIND_M
 
 CONTROL_MODE = "pd_ee_delta_pose"
 _HOVER_M = 0.09
@@ -27,7 +28,6 @@ _LOWER_PATIENCE_STEPS = 35
 _TURN_RAD = 0.06
 _PUSH_SHARE = 0.12
 _LEVER = 1.4  # how high a thing may be pushed, to half its width
-_FINGER_M = 0.022  # half the thickness of closed fingers, along the push
 _TORSO, _FORWARD, _TURN = 9, 10, 11  # places in Fetch's action
 
 Goal = Callable[[], np.ndarray]
@@ -204,7 +204,7 @@ class Hand:
         low = min(low, max(_LEVER * facts.targets[key].grip_width_m / 2, 0.03) - half)
         low = max(low, _TIP_CLEARANCE_M + 0.006 - half)
         yaw = float(np.arctan2(along[0], -along[1]))  # the fingers side by side, across the way
-        behind = self.place(key) - along * (radius + _FINGER_M + 0.03)
+        behind = self.place(key) - along * (radius + HAND_BEHIND_M)
         yield from self.rise(float(behind[2]) + half + _HOVER_M)
         yield from self.go(lambda: behind + _up(half + _HOVER_M), yaw=lambda: yaw)
         yield from self.go(lambda: behind + _up(low), yaw=lambda: yaw, within_m=0.01, patience=40)

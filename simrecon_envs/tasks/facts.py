@@ -15,6 +15,8 @@ from simrecon_envs.robots import RobotTraits, robot_shape, traits_of
 from simrecon_envs.standing import Places
 from simrecon_envs.surfaces import Container, find_container, free_spots
 
+_FOOT_M = 0.012  # vertices this high above the bottom are of what a thing stands on
+
 
 class SceneFacts:
     """A bundle as tasks see it, for one robot; what is expensive is measured when it is asked for."""
@@ -76,6 +78,13 @@ class SceneFacts:
         """Return the radius of the circle around a movable object's box, seen from above."""
         cloud = np.concatenate([s.vertices[:, :2] for s in self.solids if s.owner == key])
         return float(np.linalg.norm(cloud - self.targets[key].center[:2], axis=1).max())
+
+    def foot_width_m(self, key: int) -> float:
+        """Return how wide what a movable object stands on is where it is narrowest, seen from above."""
+        cloud = np.concatenate([s.vertices for s in self.solids if s.owner == key])
+        foot = cloud[cloud[:, 2] <= self.targets[key].bottom_m + _FOOT_M, :2]
+        angles = np.arange(36) * np.pi / 36
+        return float(np.ptp(foot @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).min())
 
     def height_m(self, key: int) -> float:
         """Return how high a movable object is."""

@@ -14,7 +14,8 @@ WITHIN_M = 0.035
 _DISTANCES_M = (0.10, 0.20)
 _UPRIGHT = 0.94
 _MAX_PUSHED_KG = 5.0
-_SLIM = 2.6  # times as high as wide
+_SLIM = 2.6  # times as high as what it stands on is wide
+HAND_BEHIND_M = 0.052  # from the object's outline to the middle of closed fingers, before they push
 
 
 class Push(Task):
@@ -28,12 +29,12 @@ class Push(Task):
         if subject not in facts.targets:
             return super().problems(facts, subject, place)
         problems = []
-        target, height = facts.targets[subject], facts.height_m(subject)
+        height = facts.height_m(subject)
         if facts.above(subject):
             problems.append("something stands on it or hangs from it")
         if height < 0.03:
             problems.append(f"only {1000 * height:.0f} mm high")
-        if height > _SLIM * target.grip_width_m:
+        if height > _SLIM * facts.foot_width_m(subject):
             problems.append("so slim that it tips over")
         if facts.mass_kg[subject] > _MAX_PUSHED_KG:
             problems.append(f"weighs {facts.mass_kg[subject]:.1f} kg")
@@ -43,7 +44,8 @@ class Push(Task):
 
     @classmethod
     def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
-        return [cls._goals(facts, spec.subject)]
+        goals = cls._goals(facts, spec.subject)
+        return [goals, _behind(facts, spec.subject, goals)]
 
     @classmethod
     def _goals(cls, facts: SceneFacts, subject: int) -> np.ndarray:
@@ -72,7 +74,10 @@ class Push(Task):
     def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
         super().__init__(env, spec, placement)
         goals = self._goals(self.facts, spec.subject)
-        mask = placement.reaches(goals, self.facts.traits)
+        traits = self.facts.traits
+        mask = placement.reaches(goals, traits)
+        goals = goals[mask] if mask.any() else goals
+        mask = placement.reaches(_behind(self.facts, spec.subject, goals), traits)
         goals = goals[mask] if mask.any() else goals
         # Away from the robot or across: the hand comes from behind, and pulling is no pushing.
         outward = np.array([np.cos(placement.yaw_rad), np.sin(placement.yaw_rad)])
@@ -136,6 +141,14 @@ class Push(Task):
             yield from hand.push(self.subject, lambda: numpy(self.goal)[0], 0.4 * WITHIN_M)
             yield from hand.lift(0.10)
             yield from hand.wait(15)
+
+
+def _behind(facts: SceneFacts, subject: int, goals: np.ndarray) -> np.ndarray:
+    """Return from where (k, 3) the hand pushes an object to each of the goals (k, 3)."""
+    target = facts.targets[subject]
+    way = (target.center - goals) * [1, 1, 0]
+    way /= np.linalg.norm(way, axis=1, keepdims=True).clip(1e-6)
+    return target.center + (facts.radius_m(subject) + HAND_BEHIND_M) * way
 
 
 def _touches(near: set[tuple[int, int]], cell: np.ndarray) -> bool:

@@ -1,5 +1,6 @@
 """Tasks of the graph: what is listed, that scripts can do them and nobody else does, that success is physical."""
 
+import dataclasses
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from registry import SceneRegistry, UsageError
 from simrecon_envs.oracle import CONTROL_MODE, Oracle
 from simrecon_envs.tasks import KINDS, list_specs, parse_task
 from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.push import Push
 
 EACH_KIND = (
     "reach_crate",
@@ -178,6 +180,30 @@ def test_a_thing_above_the_rim_is_not_in_the_crate(scenes_root: Path) -> None:
     assert not info["is_within_walls"]
     assert not info["success"]
     env.close()
+
+
+def test_the_hand_gets_behind_what_it_pushes(scenes_root: Path) -> None:
+    env = _make(scenes_root, "push_block").unwrapped
+    middle = env.target.center[:2]
+    for goal in env.task_object.goals:
+        way = (middle - goal[:2]) / np.linalg.norm(middle - goal[:2])
+        behind = np.array([*(middle + (env.facts.radius_m(BLOCK) + 0.04) * way), env.target.center[2]])
+        assert env.placement.reaches(behind[None], env.facts.traits).all()
+    env.close()
+
+
+def test_what_stands_on_a_narrow_foot_is_not_pushed(scenes_root: Path) -> None:
+    facts = SceneFacts(SceneRegistry(scenes_root).load("things"), "panda")
+    assert facts.foot_width_m(BLOCK) == pytest.approx(0.14, abs=1e-3)
+    assert not Push.problems(facts, BLOCK, None)
+    middle = facts.targets[BLOCK].center
+    for number, solid in enumerate(facts.solids):
+        if solid.owner == BLOCK:
+            narrow = solid.vertices.copy()
+            low = narrow[:, 2] < middle[2]
+            narrow[low, :2] = middle[:2] + 0.1 * (narrow[low, :2] - middle[:2])
+            facts.solids[number] = dataclasses.replace(solid, vertices=narrow)
+    assert Push.problems(facts, BLOCK, None) == ["so slim that it tips over"]
 
 
 def test_a_toppled_block_is_not_pushed(scenes_root: Path) -> None:
