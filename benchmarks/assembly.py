@@ -5,7 +5,7 @@
     python -m benchmarks.assembly --page-only
 
 Captures are reconstructed in the work folder that `python -m benchmarks.run` uses, too, so that only what is not kept
-there is done. Results are kept as <out>/assembly/<scene>.json; the page is written from all of them.
+there is done. Results are kept as <out>/assembly/scenes/<scene>.json; the page is written from all of them.
 """
 
 import argparse
@@ -33,6 +33,9 @@ from registry.report_card import failures
 
 DEFAULT_PAGE = ROOT / "docs" / "assembly_benchmark.md"
 METHODS = ("hierarchical", "in-situ", "mcmc")
+RESULTS = (
+    Path("assembly") / "scenes"
+)  # below --out: deeper than the results of `benchmarks.run`, which may share it
 _FEWEST, _MOST = 5, 40  # objects of a generated room
 _SAME_THING = 0.25  # box IoU
 
@@ -176,7 +179,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     out = arguments.out.resolve()
-    folder = out / "assembly"
+    folder = out / RESULTS
     folder.mkdir(parents=True, exist_ok=True)
     captures = find_captures(arguments.captures, arguments.only) if arguments.captures else []
     if not arguments.page_only:

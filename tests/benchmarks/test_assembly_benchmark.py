@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.assembly import main, measure_room, objects_of
+from benchmarks.assembly import RESULTS, main, measure_room, objects_of
 from benchmarks.assembly_page import write_assembly_page
 from benchmarks.assembly_rooms import SHIFT_M, room_task
+from benchmarks.results import load_results
 from registry.simulation import pose_change
 
 
@@ -56,8 +57,9 @@ def test_assembly_brings_rest_and_the_others_are_measured_alike(record):
 
 
 def test_the_page_is_written_from_what_is_kept(record, tmp_path):
-    (tmp_path / "assembly").mkdir()
-    (tmp_path / "assembly" / "a.json").write_text(json.dumps(record))
+    (tmp_path / RESULTS).mkdir(parents=True)
+    (tmp_path / RESULTS / "a.json").write_text(json.dumps(record))
+    assert load_results(tmp_path) == []  # the other benchmark may keep its results in the same folder
     page = tmp_path / "page.md"
     assert main(["--page-only", "--out", str(tmp_path), "--page", str(page)]) == 0
     text = page.read_text()
