@@ -120,7 +120,7 @@ def room_registry(folder: Path) -> Path:
     from registry import SceneRegistry
 
     tests = ROOT / "tests"
-    spec = importlib.util.spec_from_file_location("perf_room", tests / "simrecon_envs" / "conftest.py")
+    spec = importlib.util.spec_from_file_location("perf_room", tests / "simrecon_envs" / "made_scenes.py")
     fixtures = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(tests))  # what the tests share lies there
     try:

@@ -13,7 +13,7 @@ from reconstruction.synthetic.procedural import RoomSpec, build_procedural_room
 from reconstruction.types import ConvexPart, TexturedMesh
 from registry import SceneBundle, seal_bundle
 from registry.geometry import matrix_from_quat, rigid, transform_points
-from registry.simulation import read_obj_points
+from registry.simulation import read_obj_points, standing_primitive
 
 FLOOR, WALL, TABLE, MUG, BOOK, KNOB, PICTURE, CABINET, LEAF, HANDLE = range(1, 11)
 MOVING = {TABLE, MUG, BOOK, KNOB, LEAF}
@@ -190,6 +190,7 @@ def generated_room(folder: Path, seed: int, objects: int) -> ExportScene:
                 world_from_object=spec.world_from_object,
                 visual=folder / f"{spec.id}.glb",
                 parts=parts,
+                primitives=tuple(None if spec.base else standing_primitive(points) for points in spec.parts),
                 mass_kg=spec.mass_kg,
                 center_of_mass=spec.center_of_mass,
                 inertia=np.zeros((3, 3)) if spec.base else uniform_inertia(parts, spec.mass_kg),
