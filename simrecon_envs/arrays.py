@@ -79,12 +79,12 @@ def tanh(x: Array) -> Array:
 
 def atan2(y: Array, x: Array) -> Array:
     """Return the angle of (x, y)."""
-    return np.arctan2(y, x) if isinstance(y, np.ndarray) else torch.atan2(y, x)
+    return torch.atan2(y, x) if isinstance(y, torch.Tensor) else np.arctan2(y, x)
 
 
 def cos_sin(x: Array) -> tuple[Array, Array]:
     """Return cosine and sine."""
-    return (np.cos(x), np.sin(x)) if isinstance(x, np.ndarray) else (torch.cos(x), torch.sin(x))
+    return (torch.cos(x), torch.sin(x)) if isinstance(x, torch.Tensor) else (np.cos(x), np.sin(x))
 
 
 def stack(parts: list[Array]) -> Array:

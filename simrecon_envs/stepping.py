@@ -89,6 +89,7 @@ class DirectStep:
         known = list(self._env.known().values())
         if not self._laid_out:
             if any(part.ndim != 2 for part in known):
+                self._flat = False
                 return None
             self._laid_out = True
         robot = self._robot

@@ -87,13 +87,18 @@ def _cloud(scene: ViewScene, target: Target, number: int) -> np.ndarray:
     """Return the centers (n, 3) of one thing's Gaussians that can be seen, without strays."""
     rows = target.rows[scene.instance[target.rows] == number]
     packed = scene.packed[rows].astype(np.float64)
-    opaque = 1.0 / (1.0 + np.exp(-packed[:, 9])) > _OPAQUE
+    opaque = _opaque(packed)
     means = packed[opaque if opaque.sum() > 3 else slice(None), :3]
     if not len(means):
         return means
     low, high = np.percentile(means, _STRAYS, axis=0)
     near = ((means >= low - 0.01) & (means <= high + 0.01)).all(axis=1)
     return means[near] if near.any() else means
+
+
+def _opaque(packed: np.ndarray) -> np.ndarray:
+    """Tell which Gaussians stop enough light to be surface."""
+    return 1.0 / (1.0 + np.exp(-packed[:, 9])) > _OPAQUE
 
 
 def _in_hull(cloud: np.ndarray, centers: np.ndarray, slack: float) -> np.ndarray:
@@ -146,7 +151,7 @@ def _occupied(scene: ViewScene, target: Target, cloud: np.ndarray) -> np.ndarray
         cells = np.floor((points - space.origin) / space.voxel_size_m).astype(np.int64)
         return cells[((cells >= 0) & (cells < shape)).all(axis=1)]
 
-    opaque = 1.0 / (1.0 + np.exp(-scene.packed[:, 9])) > _OPAQUE
+    opaque = _opaque(scene.packed)
     opaque[target.rows] = False
     others = np.zeros(out.shape, bool)
     others[tuple(cells_of(scene.packed[opaque, :3].astype(np.float64)).T)] = True

@@ -16,7 +16,6 @@ from reconstruction.evaluation.object_facts import SUPPORTS
 SIZE_EDGES_CM = (5.0, 10.0, 20.0, 50.0)  # of the longest side; a bin holds its lower edge
 GAP_EDGES_CM = (2.0, 5.0, 10.0, 30.0)  # to the nearest neighbor
 SEEN_EDGES = (10_000.0, 30_000.0, 100_000.0)  # pixels in all frames together
-_Z_95 = 1.959963984540054  # two-sided 95 % of the normal distribution
 _ON = {"floor": "on the floor", "furniture": "on furniture", "thing": "on a thing", "wall": "on a wall"}
 
 
@@ -47,14 +46,14 @@ class Bin:
     recall_50: Share
 
 
-def wilson(found: int, count: int, z: float = _Z_95) -> tuple[float, float]:
-    """Return Wilson's score interval of a rate; (0, 1) where nothing was counted."""
+def wilson(found: int, count: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a rate; (0, 1) where nothing was counted."""
+    from scipy.stats import binomtest
+
     if not count:
         return 0.0, 1.0
-    rate = found / count
-    center = (rate + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * np.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
-    return float(max(0.0, center - half)), float(min(1.0, center + half))
+    low, high = binomtest(found, count).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 def breakdown(records: Sequence[dict[str, Any]]) -> dict[str, list[Bin]]:

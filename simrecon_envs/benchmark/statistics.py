@@ -1,4 +1,4 @@
-"""Rates, means and their 95 % intervals. NumPy only, deterministic."""
+"""Rates, means and their 95 % intervals. Deterministic."""
 
 import math
 from collections.abc import Hashable, Sequence
@@ -6,7 +6,6 @@ from collections.abc import Hashable, Sequence
 import numpy as np
 
 Interval = tuple[float, float]
-_Z = 1.959964  # of the normal distribution, two-sided 95 %
 _DRAWS = 4000
 
 
@@ -16,12 +15,10 @@ def wilson(successes: int, count: int) -> Interval:
         raise ValueError(
             f"expected 0 <= successes <= count and a count of at least 1, got {successes} of {count}"
         )
-    rate, z2 = successes / count, _Z**2
-    middle = (rate + z2 / (2 * count)) / (1 + z2 / count)
-    half = _Z / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
-    low = 0.0 if successes == 0 else middle - half
-    high = 1.0 if successes == count else middle + half
-    return max(low, 0.0), min(high, 1.0)
+    from scipy.stats import binomtest
+
+    low, high = binomtest(successes, count).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 def bootstrap_mean(values: Sequence[float], groups: Sequence[Hashable]) -> Interval | None:
