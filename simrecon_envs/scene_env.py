@@ -21,6 +21,7 @@ from simrecon_envs.arrays import Array, tensor
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
 from simrecon_envs.errors import SceneAssetsMissing
+from simrecon_envs.forgetting import renew_physics
 from simrecon_envs.measures import Measures
 from simrecon_envs.placement import Target
 from simrecon_envs.planning import Plan, plan_task
@@ -265,6 +266,11 @@ class SceneEnv(BaseEnv):
             stepper = self._stepper = DirectStep(self)
         action = stepper.simulate(action) if numbers else super()._step_action(action)
         return stepper.outcome(action)
+
+    def _clear_sim_state(self) -> None:
+        if not self.gpu_sim_enabled:
+            renew_physics(self)
+        super()._clear_sim_state()
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)

@@ -14,8 +14,6 @@ from simrecon_envs.benchmark.splits import episode_seed
 from simrecon_envs.benchmark.suite import OracleRun
 from simrecon_envs.randomization import Randomization
 
-# Every episode builds the scene anew: PhysX remembers contacts, and a run must not depend on the runs before it.
-OPTIONS = {"reconfiguration_freq": 1}
 _ORACLE_HORIZON = 2.0  # times the usual steps: what the oracle gets
 _SLACK = 1.5  # times the oracle's longest run: what a policy gets at least
 _STEPS_UNIT = 50
@@ -32,7 +30,7 @@ class ProofSettings:
 
     def options(self) -> dict[str, Any]:
         """Return the suite's keyword arguments of `gym.make`."""
-        return {**OPTIONS, **({"randomize": self.randomize} if self.randomize else {})}
+        return {"randomize": self.randomize} if self.randomize else {}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -84,7 +84,7 @@ def test_a_suite_says_what_is_to_be_done_and_holds_no_place_of_this_machine(
         assert len(set(task.seeds)) == 2
         assert all(0 < run.steps < task.max_steps and run.path_m > 0.02 for run in task.oracle)
         assert all(name.startswith("things/") for name in task.objects)
-    assert suite.options == {"reconfiguration_freq": 1, "randomize": {"shift_m": 0.03, "turn_rad": 0.3}}
+    assert suite.options == {"randomize": {"shift_m": 0.03, "turn_rad": 0.3}}
     text = suite_file.read_text()
     assert str(scenes_root) not in text
     assert "/root" not in text
@@ -156,7 +156,7 @@ def test_seeds_that_change_nothing_are_one_episode(scenes_root: Path) -> None:
     config = replace(SUITE_CONFIG, kinds=("reach",), per_scene=1, seeds=4, randomize="none")
     one = generate_suite(["things"], config, registry=scenes_root)
     assert [len(task.oracle) for task in one.tasks] == [1]
-    assert one.options == {"reconfiguration_freq": 1}
+    assert one.options == {}
 
 
 def test_candidates_take_turns_and_composites_are_about_different_things(scenes_root: Path) -> None:
