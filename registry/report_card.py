@@ -14,6 +14,7 @@ from registry.geometry import rigid
 from registry.simulation import TIMESTEP_S, BodySpec, Contact, Physics, build_physics, pose_change
 
 VERIFY_DURATION_S = 10.0
+STABLE_MOVE_M, STABLE_TURN_DEG = 0.02, 5.0
 MOST_PENETRATION_MM = 1.0
 MOST_GAP_MM = 2.0  # between what is immovable and what carries it or what it hangs on
 REST_J_PER_KG = 5e-5  # of a body that moves at 1 cm/s
@@ -201,7 +202,7 @@ def _object_entry(
         "turned_deg": round(turned, 4),
         "drop_m": round(drop, 6),
         "floating": bool(start[2, 3] - early[2, 3] > _FLOAT_DROP_M),
-        "stable": bool(moved < 0.02 and turned < 5.0),
+        "stable": bool(moved < STABLE_MOVE_M and turned < STABLE_TURN_DEG),
         "stable_10cm_0.1rad": bool(moved < 0.1 and np.deg2rad(turned) < 0.1),
         "stable_5cm_drop_5deg": bool(drop < 0.05 and turned < 5.0),
         "spawn_penetration_mm": depth_mm,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.assembly.config import AssemblyConfig
-from reconstruction.assembly.place import Placement, base_specs, moves_by_rule
+from reconstruction.assembly.placement import Placement, base_specs, moves_by_rule
 from reconstruction.assembly.workbench import Workbench, object_spec
 from reconstruction.progress import Progress
 from reconstruction.types import AssetSet, Edge

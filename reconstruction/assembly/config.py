@@ -19,6 +19,8 @@ class AssemblyConfig:
     """Poses tilted by less than this are set upright before they are let go."""
     penetration_mm: float = 0.3
     """Overlap that counts as touching."""
+    max_give_m: float = 0.012
+    """How much of its collision shape each of two things gives up where they overlap sideways, before one is moved."""
     max_lift_m: float = 0.06
     """How far an object is lifted out of what it was reconstructed in."""
     max_shift_m: float = 0.03
@@ -29,8 +31,6 @@ class AssemblyConfig:
     """How far a hanging thing is moved along a wall's normal to touch it."""
     settle_s: float = 2.0
     """Time an object is given to come to rest."""
-    good_turn_deg: float = 1.0
-    """An object that turns less than this while it settles needs no repair."""
     max_turn_deg: float = 8.0
     """An object that turns more has tipped."""
     max_slide_m: float = 0.015

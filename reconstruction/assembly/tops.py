@@ -6,8 +6,9 @@ surface, or hollowed out where it stands, if they belong to what rises around it
 """
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
+from reconstruction.assembly.base import convex_part
 from reconstruction.assembly.collision import cut
 from reconstruction.scene_graph.surfaces import SampledObject
 from reconstruction.types import ConvexPart
@@ -19,6 +20,7 @@ _HOLLOW_MARGIN_M = 0.008  # an underside is known as the centers of its cells
 _MAX_CUT_M = 0.04
 _MAX_SHARE_LOST = 0.15  # of the visible surface; more means that the piece is a wall, not a bump
 _FIT_BAND_M = 0.015
+_PAD_M, _LEAST_PAD_M2 = 0.006, 1e-4
 _MAX_SLOPE = 0.1
 
 
@@ -53,6 +55,64 @@ def level_tops(
             deepest = max(deepest, depth)
         pieces = made
     return (tuple(pieces), deepest) if deepest > 0 else (parts, 0.0)
+
+
+def seat(
+    parts: tuple[ConvexPart, ...], pose: np.ndarray, place: np.ndarray, level: float, most_m: float
+) -> tuple[ConvexPart, ...]:
+    """Make a carrier level under a thing: what rises within its place goes, and a pad fills what is missing.
+
+    The top under a thing is hidden by it, so that bumps and hollows there are guesses; that the thing stood is not.
+
+    Args:
+        parts: the carrier's convex pieces, object space.
+        pose: (4, 4) where it stands.
+        place: (n, 2) where the foot of the thing is, world.
+        level: of the foot, world, metres.
+        most_m: pieces that rise higher within the place stay (walls, other boards); deeper tops are not padded.
+
+    Returns:
+        The pieces; the same ones where nothing was done.
+    """
+    rotation, origin = pose[:3, :3], pose[:3, 3]
+    under = np.column_stack([place, np.full(len(place), level)])
+    pieces: list[ConvexPart] = []
+    below, highest = [], -np.inf
+    for piece in parts:
+        world = np.asarray(piece.vertices, np.float64) @ rotation.T + origin
+        rise = _rise(world, under)
+        made = _hollowed(piece, place, level, rotation, origin) if 0 < rise <= most_m else ()
+        pieces += made or (piece,)
+        if np.isfinite(rise) and rise <= most_m:
+            below.append(world[:, :2])
+            highest = max(highest, rise)
+    if not below or highest < -most_m:
+        return parts
+    pad = _common(place, np.concatenate(below))
+    if pad is not None:
+        corners = [np.column_stack([pad, np.full(len(pad), level - depth)]) for depth in (0.0, _PAD_M)]
+        pieces.append(convex_part((np.concatenate(corners) - origin) @ rotation))
+    return tuple(pieces)
+
+
+def _common(one: np.ndarray, other: np.ndarray) -> np.ndarray | None:
+    """Return points (n, 2) that span what the hulls of two sets of points (n, 2) have in common; None: too little."""
+    try:
+        inside = [Delaunay(a).find_simplex(b) >= 0 for a, b in ((other, one), (one, other))]
+        points = np.concatenate([one[inside[0]], other[inside[1]]])
+        hull = ConvexHull(points)
+    except QhullError:
+        return None
+    return points[hull.vertices] if hull.volume > _LEAST_PAD_M2 else None
+
+
+def _rise(vertices: np.ndarray, under: np.ndarray) -> float:
+    """Return how high a piece ends above a level place (n, 3); -inf: it is beside or above the place."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    place_low, place_high = under.min(axis=0), under.max(axis=0)
+    if np.any(low[:2] > place_high[:2]) or np.any(high[:2] < place_low[:2]) or low[2] > place_low[2]:
+        return -np.inf
+    return float(high[2] - place_low[2])
 
 
 def _lowered(

@@ -3,9 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
+from reconstruction.assets.gltf import written_corners
 from reconstruction.types import ConvexPart, ObjectAsset
 from registry.simulation import TIMESTEP_S, BodySpec, Contact, Physics, pose_change
+
+_STANDING = 0.7  # of the upward part of a contact's normal
 
 
 @dataclass(frozen=True)
@@ -18,6 +22,7 @@ class Settled:
     turned_deg: float
     at_rest: bool
     carriers: tuple[int, ...]  # bodies that push it up, strongest first
+    support: np.ndarray  # (n, 2) world, where it is carried from below
 
 
 def object_spec(
@@ -28,12 +33,12 @@ def object_spec(
     dynamic: bool,
     fixed_to: int | None = None,
 ) -> BodySpec:
-    """Describe an object to the physics."""
+    """Describe an object to the physics, its pieces as the bundle will hold them."""
     physics = asset.physics
     return BodySpec(
         id=asset.id,
         name=f"{asset.label}_{asset.id}",
-        parts=tuple(np.asarray(p.vertices, np.float64) for p in parts),
+        parts=tuple(written_corners(p) for p in parts),
         mass_kg=float(physics.mass_kg),
         center_of_mass=np.asarray(physics.center_of_mass, np.float64),
         inertia=np.asarray(physics.inertia, np.float64),
@@ -105,69 +110,31 @@ class Workbench:
                     break
         end = physics.pose(body_id)
         push: dict[int, float] = {}
+        points = []
         for c in physics.contacts(1e-3):
             if body_id in (c.first, c.second):
                 other, sign = (c.second, 1.0) if c.first == body_id else (c.first, -1.0)
                 push[other] = push.get(other, 0.0) + sign * float(c.impulse[2])
+                if abs(c.normal[2]) > _STANDING:
+                    points.append(c.position[:2])
         carriers = tuple(sorted((i for i in push if push[i] > 0), key=lambda i: (-push[i], i)))
         physics.set_damping(body_id, 0.0, 0.0)
         self.freeze(body_id, end)
         shift = end[:3, 3] - pose[:3, 3]
         lateral = float(np.hypot(shift[0], shift[1]))
-        return Settled(end, lateral, float(-shift[2]), pose_change(pose, end)[1], at_rest, carriers)
+        support = np.array(points).reshape(-1, 2)
+        return Settled(end, lateral, float(-shift[2]), pose_change(pose, end)[1], at_rest, carriers, support)
 
 
-def make_clear(
-    bench: Workbench,
-    body_id: int,
-    pose: np.ndarray,
-    *,
-    max_lift_m: float,
-    max_shift_m: float,
-    tolerance_m: float,
-) -> tuple[np.ndarray, bool]:
-    """Move an object by as little as possible until nothing is inside it: (pose, whether that worked).
+def support_margin(points: np.ndarray, center: np.ndarray) -> float:
+    """Return how far (m) a center of mass (2,) is inside the hull of what carries it, (n, 2); negative: outside.
 
-    First along the contact normals, which is the shortest way out; where that runs in circles, over a bounded
-    lattice of lifts and sideways shifts, cheapest first.
+    What touches in a line or a point has no inside: 0 at best.
     """
-    out = pose.copy()
-    for _ in range(12):
-        contacts = bench.probe(body_id, out, tolerance_m)
-        if not contacts:
-            return out, True
-        pushes = np.array([-c.separation_m * c.normal for c in contacts])
-        # The same wall pushes at many points: per axis the strongest counts, not the sum.
-        step = pushes.max(axis=0, initial=0.0) + pushes.min(axis=0, initial=0.0)
-        if np.linalg.norm(step) < 0.25 * tolerance_m:
-            break
-        step += np.sign(step) * 0.5 * tolerance_m * (np.abs(step) > 1e-9)
-        out = out.copy()
-        out[:3, 3] += step
-        moved = out[:3, 3] - pose[:3, 3]
-        if np.hypot(moved[0], moved[1]) > max_shift_m or not -0.002 <= moved[2] <= max_lift_m:
-            break
-    best, best_depth = pose, np.inf
-    for shift in _lattice(max_lift_m, max_shift_m):
-        candidate = pose.copy()
-        candidate[:3, 3] += shift
-        contacts = bench.probe(body_id, candidate, tolerance_m)
-        depth = max((-c.separation_m for c in contacts), default=0.0)
-        if depth < best_depth:
-            best, best_depth = candidate, depth
-        if not contacts:
-            return candidate, True
-    return best, False
-
-
-def _lattice(max_lift_m: float, max_shift_m: float) -> list[np.ndarray]:
-    """Return shifts (3,) within the bounds, cheapest first; lifting costs half, settling undoes it."""
-    lifts = np.unique(np.clip([0, 0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.045, 0.06], 0, max_lift_m))
-    rings = [r for r in (0.0, 0.004, 0.008, 0.015, 0.03) if r <= max_shift_m]
-    shifts = []
-    for ring in rings:
-        for angle in np.arange(8 if ring else 1) * np.pi / 4:
-            for lift in lifts:
-                shifts.append((ring + 0.5 * lift, ring * np.cos(angle), ring * np.sin(angle), lift))
-    shifts.sort(key=lambda s: s[0])
-    return [np.array(s[1:]) for s in shifts]
+    if len(points) == 0:
+        return -np.inf
+    try:
+        equations = ConvexHull(points).equations  # normal . x + offset <= 0 inside
+    except (QhullError, ValueError):
+        return -float(np.linalg.norm(points - center, axis=1).min())
+    return -float((equations[:, :2] @ center + equations[:, 2]).max())

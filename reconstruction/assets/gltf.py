@@ -164,14 +164,24 @@ def write_obj(part: ConvexPart, path: Path) -> None:
     Where these digits do not tell two corners apart, as after a cut, the hull of those that they do is written: once
     readers join what lies in the same place, the triangles between would leave openings.
     """
+    corners, faces = _written(part)
+    lines = corners + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    Path(path).write_text("\n".join(lines) + "\n")
+
+
+def written_corners(part: ConvexPart) -> np.ndarray:
+    """Return the corners (n, 3) that whoever reads the file of a convex part gets, to the last bit."""
+    return np.array([line.split()[1:] for line in _written(part)[0]], np.float64)
+
+
+def _written(part: ConvexPart) -> tuple[list[str], np.ndarray]:
     from reconstruction.assets.solid import hull_solid
 
     corners, faces = _corner_lines(part.vertices), np.asarray(part.faces, np.int64)
     if len(set(corners)) < len(corners):
         hull = hull_solid(np.array([line.split()[1:] for line in sorted(set(corners))], np.float64))
         corners, faces = _corner_lines(hull.vertices), hull.faces
-    lines = corners + [f"f {a} {b} {c}" for a, b, c in faces + 1]
-    Path(path).write_text("\n".join(lines) + "\n")
+    return corners, faces
 
 
 def _corner_lines(vertices: np.ndarray) -> list[str]:

@@ -10,7 +10,7 @@ from reconstruction.assembly import AssemblyConfig, assemble, base_slabs, scene_
 from reconstruction.assembly.base import convex_part
 from reconstruction.assembly.baselines import in_situ
 from reconstruction.assembly.collision import cut, flatten_foot
-from reconstruction.assembly.place import base_specs
+from reconstruction.assembly.placement import base_specs
 from reconstruction.instances.anchors import Pointer
 from reconstruction.overrides import Overrides
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
@@ -41,9 +41,9 @@ def test_stack_of_three_that_overlaps_and_floats():
     )
     scene, placed = build(assets)
     assert_at_rest(scene)
-    for height, i in zip((0.0, 0.1, 0.2), (10, 11, 12)):
-        assert placed[i].world_from_object[2, 3] == pytest.approx(height, abs=1e-3)
-        assert placed[i].moved_m < 0.02
+    for height, i in zip((-0.008, 0.085, 0.205), (10, 11, 12)):
+        assert placed[i].world_from_object[2, 3] == pytest.approx(height, abs=9e-3)
+        assert placed[i].moved_m < 0.0125
         assert placed[i].dynamic
         assert placed[i].stable
 
@@ -58,7 +58,8 @@ def test_box_in_an_open_tray_ends_inside():
     assert_at_rest(scene)
     assert not placed[10].dynamic
     inside = np.linalg.inv(placed[11].world_from_object) @ placed[12].world_from_object
-    assert inside[2, 3] == pytest.approx(0.012, abs=2e-3)
+    # It was seen 7 mm above the tray's bottom's underside: it ends between there and the bottom's top.
+    assert 0.0055 < inside[2, 3] < 0.013
     assert abs(inside[0, 3]) < 0.2 - 0.012 - 0.03
     assert {e.child: e.parent for e in scene.graph.edges}[12] == 11
 
@@ -86,7 +87,7 @@ def test_tilted_and_sunk_box_is_set_upright_on_the_floor():
     scene, placed = build(room(box(10, (0.3, 0.2, 0.25), (0.3, 0, -0.012), turn=tilt(3.0))))
     assert_at_rest(scene)
     assert placed[10].world_from_object[2, 2] > np.cos(np.radians(0.2))
-    assert placed[10].world_from_object[2, 3] == pytest.approx(0, abs=1e-3)
+    assert -0.006 < placed[10].world_from_object[2, 3] < 1e-3
 
 
 def test_bumpy_underside_is_flattened_and_recorded():
@@ -99,12 +100,23 @@ def test_bumpy_underside_is_flattened_and_recorded():
     assert len(placed[10].collision) == 1
 
 
-def test_neighbors_that_overlap_are_moved_apart():
-    assets = room(box(10, (0.1, 0.1, 0.15), (0, 0, 0)), box(11, (0.1, 0.1, 0.15), (0.09, 0, 0)))
+def test_neighbors_that_overlap_by_more_than_shapes_are_off_are_moved_apart():
+    assets = room(box(10, (0.1, 0.1, 0.15), (0, 0, 0)), box(11, (0.1, 0.1, 0.15), (0.072, 0, 0)))
     scene, placed = build(assets)
     assert_at_rest(scene)
     assert placed[11].world_from_object[0, 3] - placed[10].world_from_object[0, 3] >= 0.0995
-    assert max(p.moved_m for p in scene.placed) < 0.02
+    assert max(p.moved_m for p in scene.placed) < 0.03
+
+
+def test_neighbors_that_overlap_a_little_stay_and_both_shapes_give_way():
+    assets = room(box(10, (0.1, 0.1, 0.15), (0, 0, 0)), box(11, (0.1, 0.1, 0.15), (0.09, 0, 0)))
+    scene, placed = build(assets)
+    assert_at_rest(scene)
+    assert max(p.moved_m for p in scene.placed) < 1e-3
+    for i in (10, 11):
+        assert "gave way" in placed[i].repair
+        (part,) = placed[i].collision
+        assert np.ptp(part.vertices[:, 0]) == pytest.approx(0.095, abs=5e-4)
 
 
 def test_what_hangs_on_a_thing_that_moves_is_fixed_to_it():
