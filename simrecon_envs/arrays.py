@@ -79,18 +79,26 @@ def tanh(x: Array) -> Array:
 
 def atan2(y: Array, x: Array) -> Array:
     """Return the angle of (x, y)."""
+    if isinstance(y, np.generic):
+        return np.float32(math.atan2(y, x))
     return torch.atan2(y, x) if isinstance(y, torch.Tensor) else np.arctan2(y, x)
 
 
-def cos_sin(x: Array) -> tuple[Array, Array]:
-    """Return cosine and sine."""
-    return (torch.cos(x), torch.sin(x)) if isinstance(x, torch.Tensor) else (np.cos(x), np.sin(x))
+def turn(x: Array, yaw: Array) -> Array:
+    """Turn vectors (b, 3) about +z by angles (b,)."""
+    if isinstance(yaw, np.generic):
+        c, s, (along, across, up) = math.cos(yaw), math.sin(yaw), x[0].tolist()
+        return np.array([[c * along - s * across, s * along + c * across, up]], np.float32)
+    c, s, (along, across, up) = yaw.cos(), yaw.sin(), x.unbind(-1)
+    return torch.stack([c * along - s * across, s * along + c * across, up], dim=1)
 
 
 def stack(parts: list[Array]) -> Array:
     """Return arrays (b, ...) side by side, (b, n, ...)."""
     if isinstance(parts[0], torch.Tensor):
         return torch.stack(parts, dim=1)
+    if all(isinstance(part, np.generic) for part in parts):
+        return np.array([parts])
     return np.stack([np.atleast_1d(part) for part in parts], 1)
 
 

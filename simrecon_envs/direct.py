@@ -18,6 +18,8 @@ from mani_skill.agents.robots import Fetch, Panda
 
 _MARGIN_M = 0.02  # more than PhysX keeps between bodies in contact
 _GRASP_N, _GRASP_DEG = 0.5, 85  # as in `is_grasping`
+# Inverse kinematics: ManiSkill's goes a tenth of the way to the goal a step, until 1e-4 are left.
+_BOLD, _POSE_TOLERANCE = 0.5, 1e-6
 
 
 class DirectReads:
@@ -91,12 +93,14 @@ class DirectReads:
 
     def _may_touch(self, row: int) -> bool:
         """Return whether the box around the thing meets those around both fingers: asking for contacts is slow."""
-        low, high = self._bodies[row].get_global_aabb_fast().tolist()
-        for finger in self._fingers:
-            least, most = finger.get_global_aabb_fast().tolist()
-            if any(least[k] > high[k] + _MARGIN_M or most[k] < low[k] - _MARGIN_M for k in (0, 1, 2)):
-                return False
-        return True
+        return all(self._meet(self._bodies[row], finger) for finger in self._fingers)
+
+    @staticmethod
+    def _meet(one: Any, other: Any) -> bool:
+        """Return whether the boxes around two bodies meet."""
+        low, high = one.get_global_aabb_fast().tolist()
+        least, most = other.get_global_aabb_fast().tolist()
+        return all(least[k] <= high[k] + _MARGIN_M and most[k] >= low[k] - _MARGIN_M for k in (0, 1, 2))
 
     def _pressed(self, row: int) -> bool:
         """Return what `is_grasping` of the Panda and Fetch does: both fingers press on it, from where they close."""
@@ -113,7 +117,9 @@ class DirectReads:
 
     def force(self, row: int, others: list) -> np.ndarray:
         """Return the force (1, 3) (N) of other actors on a thing."""
-        return self._force(row, {id(other._bodies[0]) for other in others})[None]
+        bodies = [other._bodies[0] for other in others]
+        near = {id(body) for body in bodies if self._meet(self._bodies[row], body)}
+        return self._force(row, near)[None] if near else np.zeros((1, 3), np.float32)
 
     def _force(self, row: int, wanted: set[int]) -> np.ndarray:
         """Return the force (3,) (N) on a thing of the bodies with these ids."""
@@ -281,19 +287,23 @@ class _Tip:
         move = self._scale[0] + self._scale[1] * np.minimum(np.maximum(action[:3], -1), 1)
         quat = here.q
         if self._turn is not None:
-            turn = action[3:] / max(float(np.linalg.norm(action[3:])), 1.0) * self._turn
-            quat = (_about(turn, 0) * _about(turn, 1) * _about(turn, 2) * sapien.Pose(q=quat)).q
-        kinematics, qpos = self._controller.kinematics, self._robot.qpos
-        solution, found, _ = kinematics.pmodel.compute_inverse_kinematics(
-            kinematics.end_link_idx,
-            sapien.Pose(here.p + move, quat),
-            initial_qpos=qpos[self._known],
-            active_qmask=self._mask,
-            max_iterations=100,
-        )
+            angles = action[3:].tolist()
+            scale = self._turn / max(math.hypot(*angles), 1.0)
+            quat = (sapien.Pose(q=_turned(*(scale * angle / 2 for angle in angles))) * sapien.Pose(q=quat)).q
+        qpos, goal = self._robot.qpos, sapien.Pose(here.p + move, quat)
+        known = qpos[self._known]
+        solution, found, _ = self._solve(known, goal, eps=_POSE_TOLERANCE, dt=_BOLD, max_iterations=30)
+        if not found:
+            solution, found, _ = self._solve(known, goal, max_iterations=100)
         start = qpos[self._indices]
         target = solution[self._solved].astype(np.float32) if found else start
         self._targets.set(start, target)
+
+    def _solve(self, qpos: np.ndarray, goal: sapien.Pose, **options: float) -> tuple[np.ndarray, bool, Any]:
+        kinematics = self._controller.kinematics
+        return kinematics.pmodel.compute_inverse_kinematics(
+            kinematics.end_link_idx, goal, initial_qpos=qpos, active_qmask=self._mask, **options
+        )
 
 
 class _Targets:
@@ -319,11 +329,10 @@ class _Targets:
             give(value)
 
 
-def _about(turn: np.ndarray, axis: int) -> sapien.Pose:
-    """Return the turn about one axis by its part of (3,) angles (rad)."""
-    quat = [math.cos(turn[axis] / 2), 0.0, 0.0, 0.0]
-    quat[1 + axis] = math.sin(turn[axis] / 2)
-    return sapien.Pose(q=quat)
+def _turned(x: float, y: float, z: float) -> list[float]:
+    """Return the quaternion of the turn about x, after that about y, after that about z, of half angles (rad)."""
+    (a, b, c), (d, e, f) = map(math.cos, (x, y, z)), map(math.sin, (x, y, z))
+    return [a * b * c - d * e * f, d * b * c + a * e * f, a * e * c - d * b * f, a * b * f + d * e * c]
 
 
 def _row(pose: sapien.Pose) -> np.ndarray:

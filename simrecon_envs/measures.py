@@ -4,13 +4,14 @@ With many environments on a GPU these are tensors of ManiSkill's structs. On the
 NumPy's and come straight from SAPIEN (`direct`): the structs and tensors cost more than the physics does.
 """
 
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import numpy as np
 import torch
 
 from registry.geometry import invert_rigid, transform_points
-from simrecon_envs.arrays import Array, atan2, largest, norm, rotate
+from simrecon_envs.arrays import Array, atan2, component, largest, norm, rotate
 from simrecon_envs.direct import DirectReads
 
 _GRASP_REACH_M = 0.12  # nothing farther from the hand than this and its own half diagonal is held
@@ -64,6 +65,12 @@ class Measures:
         if self._direct is not None:
             self._direct.refresh()
 
+    def once(self, name: Hashable, compute: Callable[[], Array]) -> Array:
+        """Return what `compute` does, computed once until the simulator moves on."""
+        if name not in self._cache:
+            self._cache[name] = compute()
+        return self._cache[name]
+
     def forget(self, env_idx: torch.Tensor) -> None:
         """Forget what carried what in the environments that start anew."""
         self.refresh()
@@ -105,12 +112,15 @@ class Measures:
 
     def up(self, key: int) -> Array:
         """Return by which cosine (b,) a thing's upright axis still points up, as in the bundle."""
-        return self._turned(key, 2)[:, 2]
+        return component(self._turned(key, 2), 2)
 
     def yaw(self, key: int) -> Array:
         """Return by which angle (b,) a thing is turned about +z from how it was captured."""
-        side = self._turned(key, 0)
-        return atan2(side[:, 1], side[:, 0])
+        name = ("yaw", key)
+        if name not in self._cache:
+            side = self._turned(key, 0)
+            self._cache[name] = atan2(component(side, 1), component(side, 0))
+        return self._cache[name]
 
     def speeds(self, key: int) -> tuple[Array, Array]:
         """Return the linear (m/s) and angular (rad/s) speed (b,) of a thing."""
@@ -196,6 +206,16 @@ class Measures:
             self._supported[key, support] = known
             self._cache[name] = known
         return self._cache[name]
+
+    def rests_on(self, key: int, support: int) -> Array:
+        """Return whether a thing is at rest, and carried by a support (b,).
+
+        What moves is not asked for its contacts, which is slow: nothing falls asleep before it was at rest for long.
+        """
+        rest = self.at_rest(key)
+        if self._direct is not None and not rest:
+            return rest
+        return rest & self.supported(key, support)
 
     def _force_on(self, key: int, support: int) -> Array:
         others = self._env.builder.carrying_actors(support)

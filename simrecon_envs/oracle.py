@@ -126,7 +126,7 @@ class Hand:
         top = facts.height_m(key) / 2 + _HOVER_M
 
         def turned() -> float:
-            return float(measures.yaw(key)[0])
+            return float(measures.yaw(key))
 
         def there() -> np.ndarray:
             c, s = math.cos(turned()), math.sin(turned())

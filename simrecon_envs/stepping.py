@@ -37,13 +37,20 @@ class DirectStep:
         self._action = None if agent is None else torch.zeros((1, *agent.single_action_space.shape))
         self._numbers = None if agent is None else self._action.numpy()[0]
         self._laid_out = False
+        self._elapsed = env._elapsed_steps
+        self._count = self._elapsed.numpy()
 
     @property
     def current(self) -> bool:
         """Return whether it was made for what the environment has now."""
         env = self._env
         agent = env.agent
-        return self._scene is env.scene and self._controller is (None if agent is None else agent.controller)
+        controller = None if agent is None else agent.controller
+        return (
+            self._scene is env.scene
+            and self._controller is controller
+            and self._elapsed is env._elapsed_steps
+        )
 
     def simulate(self, action: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Simulate one control step with an action (k,) or (1, k); return it as (1, k), valid until the next step.
@@ -75,13 +82,13 @@ class DirectStep:
     def outcome(self, action: torch.Tensor | None) -> tuple:
         """Return observation, reward, terminated, truncated and info after the simulation."""
         env = self._env
-        env._elapsed_steps.numpy()[:] += 1
+        self._count += 1
         info = env.get_info()
         flat = self._observe() if self._flat else None
         obs = env.get_obs(info, unflattened=True) if flat is None else flat
         reward = env.get_reward(obs=obs, action=action, info=info)
         env._last_obs = obs = env._flatten_raw_obs(obs) if flat is None else flat
-        ended = any([info[reason].item() for reason in ("success", "fail") if reason in info])
+        ended = any([bool(env._info[reason]) for reason in ("success", "fail") if reason in env._info])
         return obs, reward, torch.from_numpy(np.array([ended])), torch.from_numpy(np.array([False])), info
 
     def _observe(self) -> torch.Tensor | None:

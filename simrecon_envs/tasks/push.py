@@ -104,12 +104,12 @@ class Push(Task):
         measures, support = self.env.measures, self.facts.parent[self.subject]
         position = measures.position(self.subject)
         away = norm((position - self.goal)[:, :2])
-        carried = measures.supported(self.subject, support)
         upright = measures.up(self.subject) >= _UPRIGHT
+        carried = measures.rests_on(self.subject, support)
         rest, held = measures.at_rest(self.subject), measures.held(self.subject)
         near = away <= WITHIN_M
         return {
-            "success": near & upright & rest & carried & ~held,
+            "success": near & upright & carried & ~held,
             "is_near": near,
             "is_upright": upright,
             "is_at_rest": rest,

@@ -3,12 +3,13 @@
 import numpy as np
 import torch
 
-from simrecon_envs.arrays import Array, cos_sin, largest, smallest, stack
+from simrecon_envs.arrays import Array, component, largest, smallest, turn
 from simrecon_envs.tasks.base import Info
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
 
+_CELL_REACH_M = 0.01  # cells of the inside are 2 cm apart
 _DROP_M = 0.03  # above the floor of the container, where it is let go
 
 
@@ -53,6 +54,8 @@ class Put(Carry):
         super().start(env_idx, rng)
         inside = self.facts.container(self.spec.place)
         self._cells = self.env.measures.array(inside.cells)
+        self._low = (inside.cells.min(axis=0) - _CELL_REACH_M).tolist()
+        self._high = (inside.cells.max(axis=0) + _CELL_REACH_M).tolist()
         target = self.facts.targets.get(self.spec.place)
         center = np.zeros(3) if target is None else target.center
         self._container_home = self.env.measures.array(center)[None]
@@ -65,23 +68,28 @@ class Put(Carry):
         here, yaw = measures.position(self.spec.place), measures.yaw(self.spec.place)
         if back:
             here, home, yaw = home, here, -yaw
-        c, s = cos_sin(yaw)
-        away = points - home
-        x, y, z = away[:, 0], away[:, 1], away[:, 2]
-        return stack([c * x - s * y, s * x + c * y, z]) + here
+        return turn(points - home, yaw) + here
 
     def live_goal(self) -> Array:
         """Return the goal inside the container, where that is now."""
-        return self._from_captured(self.goal)
+        return self.env.measures.once(("live_goal", id(self)), lambda: self._from_captured(self.goal))
+
+    def _within_walls(self, local: Array) -> Array:
+        """Return whether points (b, 3), where the container was captured, are over its inside."""
+        if isinstance(local, np.ndarray):
+            x, y = local[0, :2].tolist()
+            if not (self._low[0] <= x <= self._high[0] and self._low[1] <= y <= self._high[1]):
+                return np.False_  # spares looking at all cells
+        return smallest(largest(abs(local[:, None, :2] - self._cells[None]))) <= _CELL_REACH_M
 
     def _arrived(self) -> Info:
         inside = self.facts.container(self.spec.place)
         local = self._from_captured(self.env.measures.position(self.subject), back=True)
-        nearest = smallest(largest(abs(local[:, None, :2] - self._cells[None])))
-        within = nearest <= 0.01
-        bottom = local[:, 2] - self.facts.height_m(self.subject) / 2
+        within = self._within_walls(local)
+        height = component(local, 2)
+        bottom = height - self.facts.height_m(self.subject) / 2
         # A thing that fell over inside has another height: its middle below the rim will do as well.
-        below = (bottom < inside.rim_m - 0.008) | (local[:, 2] < inside.rim_m)
+        below = (bottom < inside.rim_m - 0.008) | (height < inside.rim_m)
         there = within & below
         if self.spec.place in self.facts.targets:
             there = there & (self.env.measures.up(self.spec.place) > 0.9)

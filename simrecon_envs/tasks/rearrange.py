@@ -59,7 +59,7 @@ class Restore(Carry):
         measures = self.env.measures
         away = norm((measures.position(self.subject) - self.goal)[:, :2])
         near, upright = away <= WITHIN_M, measures.up(self.subject) >= _UPRIGHT
-        carried = measures.supported(self.subject, self.facts.parent[self.subject])
+        carried = measures.rests_on(self.subject, self.facts.parent[self.subject])
         return {"is_there": near & upright & carried, "is_near": near, "is_upright": upright}
 
 
