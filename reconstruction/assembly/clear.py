@@ -106,7 +106,7 @@ def _lattice(max_lift_m: float, max_shift_m: float, lift_cost: float) -> list[np
     """Return shifts (3,) within the bounds, cheapest first."""
     lifts = np.unique(np.clip(_LIFTS_M, 0, max_lift_m))
     shifts = []
-    for ring in (r for r in _RINGS_M if r <= max_shift_m):
+    for ring in (r for r in _RINGS_M if r <= max_shift_m + 1e-9):
         for angle in np.arange(8 if ring else 1) * np.pi / 4:
             for lift in lifts:
                 shifts.append((ring + lift_cost * lift, ring * np.cos(angle), ring * np.sin(angle), lift))

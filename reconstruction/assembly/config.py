@@ -26,7 +26,7 @@ class AssemblyConfig:
     max_shift_m: float = 0.03
     """How far an object is shifted sideways out of its neighbors."""
     max_snap_m: float = 0.02
-    """How far furniture is moved up or down to meet the floor, or out of a wall."""
+    """How far furniture is moved down to meet the floor, and a movable thing out of a wall."""
     max_wall_snap_m: float = 0.12
     """How far a hanging thing is moved along a wall's normal to touch it."""
     settle_s: float = 2.0

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from reconstruction.assembly.config import AssemblyConfig
 from reconstruction.assembly.placement import (
     TOUCH_GAP_M,
@@ -17,8 +19,12 @@ from reconstruction.assembly.placement import (
 )
 from reconstruction.assembly.settle import Settler
 from reconstruction.assembly.tops import level_tops
+from reconstruction.assembly.workbench import object_spec
 from reconstruction.scene_graph.surfaces import sample_object
 from reconstruction.types import AssetSet, Edge, ObjectAsset
+from registry.report_card import MOST_GAP_MM
+
+_FIXED_SHIFT_M = 0.01  # of what is not let go, out of its neighbors; what is in them deeper is cut
 
 
 class Placer(Settler):
@@ -30,19 +36,15 @@ class Placer(Settler):
         """Start with the base; `movable` is the user's word on what can move."""
         super().__init__(assets, edges, config)
         self._movable = movable
+        self._edges = {edge.child: edge for edge in edges}
         self._samples = {o.id: sample_object(o) for o in assets.objects}
 
     def place(self, asset: ObjectAsset, edge: Edge) -> Placement:
         """Place an object whose parent is placed already."""
-        start = upright(asset.world_from_object, self.config.upright_tilt_deg).copy()
-        parent = self.placed.get(edge.parent)
-        if parent is not None:
-            # A parent that was moved takes along what stands on it; its turn is left to gravity.
-            start[:3, 3] += parent.pose[:3, 3] - parent.asset.world_from_object[:3, 3]
         on_base = edge.parent in self.base
         children = [self._samples[i] for i in sorted(self._carried.get(asset.id, []))]
         parts, depth = level_tops(asset.collision, self._samples[asset.id], asset.world_from_object, children)
-        fresh = Placement(asset, edge, start, parts, parts, True, 0.0, (), True)
+        fresh = Placement(asset, edge, self._seen(asset, edge), parts, parts, True, 0.0, (), True)
         if depth > 0:
             fresh = fresh.noted(f"collision shape cut by up to {depth * 1000:.0f} mm to its visible top")
         moves = self._movable.get(asset.id, not is_furniture(asset, on_base, self.config))
@@ -53,7 +55,17 @@ class Placer(Settler):
         else:
             placement = replace(self.let_settle(fresh), dynamic=moves)
         self.commit(placement)
+        if not placement.stands and self.config.freeze_unstable:
+            return self.hold(asset.id, "made immovable: it does not stand where it was seen")
         return placement
+
+    def _seen(self, asset: ObjectAsset, edge: Edge) -> np.ndarray:
+        """Return the pose (4, 4) at which an object was seen; a parent that was moved takes along what stands on it."""
+        pose = upright(asset.world_from_object, self.config.upright_tilt_deg).copy()
+        parent = self.placed.get(edge.parent)
+        if parent is not None:
+            pose[:3, 3] += parent.pose[:3, 3] - parent.asset.world_from_object[:3, 3]
+        return pose
 
     def again(self, asset_id: int) -> Placement:
         """Settle a placed object once more from where it stands, with a flatter foot than it has."""
@@ -67,10 +79,15 @@ class Placer(Settler):
         return placement
 
     def hold(self, asset_id: int, note: str) -> Placement:
-        """Make a placed thing immovable; where it reaches into its neighbors it is shifted or cut first."""
+        """Make a placed thing immovable where it was seen; where it reaches into its neighbors it is cut."""
         old = self.placed[asset_id].noted(note, dynamic=False)
+        if not any(p.edge.parent == asset_id for p in self.placed.values()):
+            edge = self._edges[asset_id]
+            pose, parts = self._seen(old.asset, edge), old.unflattened
+            self.placed.pop(asset_id)
+            old = self.out_of_walls(replace(old, edge=edge, pose=pose, parts=parts))
         # Whether it stands by itself is another question, answered before.
-        held = replace(self.keep_clear(old, lift=self.config.max_shift_m), stands=old.stands)
+        held = replace(self.let_down(self.keep_clear(old, shift_m=_FIXED_SHIFT_M)), stands=old.stands)
         self.commit(held)
         return held
 
@@ -94,13 +111,13 @@ class Placer(Settler):
                 f"its lowest part is {gap * 100:.0f} cm above the {floor.label}; left where it was seen"
             )
         item = self.out_of_walls(item)
-        return self.keep_clear(item, lift=0.0)
+        return self.keep_clear(item, shift_m=_FIXED_SHIFT_M)
 
     def _hang(self, item: Placement) -> Placement:
         parent = self.base.get(item.edge.parent)
         if parent is None:
             carrier = self.placed[item.edge.parent]
-            hung = self.keep_clear(replace(item, dynamic=carrier.dynamic), lift=self.config.max_shift_m)
+            hung = self.keep_clear(replace(item, dynamic=carrier.dynamic), shift_m=_FIXED_SHIFT_M)
             if hung.stands:
                 return hung
             # It cannot hang there without being inside something: let gravity find what carries it.
@@ -118,4 +135,17 @@ class Placer(Settler):
             item = item.noted(
                 f"{abs(gap) * 100:.0f} cm {'off' if gap > 0 else 'inside'} the {parent.label}; left there"
             )
-        return self.keep_clear(item, lift=self.config.max_shift_m)
+        return self._hung_on(self.keep_clear(item, shift_m=0.0))
+
+    def _hung_on(self, item: Placement) -> Placement:
+        """Keep the wall, unless what hangs there, too, is all that a thing touches: then it hangs on that."""
+        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        near = self.bench.probe(item.asset.id, item.pose, -1e-3 * MOST_GAP_MM)
+        touched = {c.second: c.separation_m for c in sorted(near, key=lambda c: -c.separation_m)}
+        between = {i for i in touched if i in self.placed and self.placed[i].edge.parent == item.edge.parent}
+        if item.edge.parent in touched or not between:
+            return item
+        parent = min(between, key=lambda i: (touched[i], i))
+        evidence = f"touches it, which hangs there; before: {item.edge.parent}, {item.edge.evidence}"
+        edge = replace(item.edge, parent=parent, evidence=evidence)
+        return replace(item, edge=edge).noted(f"hangs on {parent} instead of {item.edge.parent}")

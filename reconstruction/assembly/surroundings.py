@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from reconstruction.assembly.clear import make_clear
 from reconstruction.assembly.collision import cut
 from reconstruction.assembly.config import AssemblyConfig
 from reconstruction.assembly.placement import (
     TOUCH_GAP_M,
+    WORTH_SAYING_M,
     Placement,
     base_specs,
     beside,
@@ -15,12 +18,13 @@ from reconstruction.assembly.placement import (
     normal_of,
     world_points,
 )
-from reconstruction.assembly.workbench import Workbench, object_spec
-from reconstruction.assembly.yielding import give_way
+from reconstruction.assembly.workbench import STANDING, Workbench, object_spec
+from reconstruction.assembly.yielding import cut_out, give_way
 from reconstruction.types import AssetSet, BaseAsset
 from registry.simulation import pose_change
 
-_MAX_CUTS = 8
+_MAX_CUTS = 3
+_NEAR_M = 0.01
 
 
 class Surroundings:
@@ -45,18 +49,18 @@ class Surroundings:
         return {c.second for c in self.bench.probe(item.asset.id, item.pose, tolerance_m)}
 
     def out_of_walls(self, item: Placement) -> Placement:
-        """Move a thing that reaches into a wall out of it a little, and cut its shape off where that is not enough."""
+        """Cut off what reaches into a wall; what is let go is moved out of it if it would lose too much."""
         for wall in self.base.values():
             depth = -float(distance_to(wall, world_points(item.parts, item.pose)).min())
             if wall.label == "floor" or depth <= 0 or not beside(wall, item):
                 continue
-            push = min(depth + TOUCH_GAP_M, self.config.max_snap_m)
-            item = moved_by(item, push * normal_of(wall))
-            if push < depth:
-                item = self.cut_behind(item, wall)
-                item = item.noted(
-                    f"its collision shape was cut off {depth * 100:.1f} cm inside {wall.label} {wall.id}"
-                )
+            if item.dynamic and depth > self.config.max_give_m:
+                push = min(depth - self.config.max_give_m, self.config.max_snap_m)
+                item = moved_by(item, push * normal_of(wall))
+            item = self.cut_behind(item, wall)
+            if depth > WORTH_SAYING_M:
+                said = f"its collision shape was cut off {depth * 100:.1f} cm inside {wall.label} {wall.id}"
+                item = item.noted(said)
         return item
 
     def cut_behind(self, item: Placement, base: BaseAsset) -> Placement:
@@ -66,24 +70,35 @@ class Surroundings:
         parts, unflattened = cut(item.parts, inward, offset), cut(item.unflattened, inward, offset)
         return replace(item, parts=parts, unflattened=unflattened) if parts and unflattened else item
 
-    def keep_clear(self, item: Placement, lift: float) -> Placement:
-        """Shift a thing that will not be let go out of its neighbors."""
+    def keep_clear(self, item: Placement, *, shift_m: float) -> Placement:
+        """Free a thing that will not be let go of its neighbors: shifted by no more than this, or cut."""
         item = self.give_way_to_neighbors(item)
         self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
         pose, clear = make_clear(
             self.bench,
             item.asset.id,
             item.pose,
-            max_lift_m=lift,
-            max_shift_m=self.config.max_shift_m,
+            max_lift_m=0.0,
+            max_shift_m=shift_m,
             tolerance_m=self.config.penetration_mm * 1e-3,
             settles=False,
         )
+        if not clear:
+            opened = self.cut_clear(replace(item, stands=False))
+            if opened.stands or shift_m >= self.config.max_shift_m:
+                return opened
+            return self.keep_clear(item, shift_m=self.config.max_shift_m)
         moved = pose_change(item.pose, pose)[0]
         if moved > 1e-3:
             item = item.noted(f"shifted {moved * 1000:.0f} mm out of its neighbors")
-        item = replace(item, pose=pose, stands=clear)
-        return item if clear else self.cut_clear(item)
+        return replace(item, pose=pose, stands=True)
+
+    def let_down(self, item: Placement) -> Placement:
+        """Let a thing that is held touch what carries it, where that is less than a centimetre below."""
+        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        near = self.bench.probe(item.asset.id, item.pose, -_NEAR_M)
+        gap = min((c.separation_m for c in near if c.normal[2] > STANDING), default=0.0)
+        return moved_by(item, np.array([0.0, 0.0, TOUCH_GAP_M - gap])) if gap > TOUCH_GAP_M else item
 
     def give_way_to_neighbors(self, item: Placement) -> Placement:
         """Where a thing overlaps its neighbors sideways by less than they are known, cut both shapes, not move it."""
@@ -111,26 +126,23 @@ class Surroundings:
         return item
 
     def cut_clear(self, item: Placement) -> Placement:
-        """Cut off the collision shape of a thing that stays fixed where it still reaches into its neighbors."""
+        """Cut off the collision shape of a thing, where it was seen, that reaches into its neighbors."""
         tolerance_m = self.config.penetration_mm * 1e-3
         whole, removed_m = item, 0.0
         for _ in range(_MAX_CUTS):
             self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
-            contacts = self.bench.probe(item.asset.id, item.pose, tolerance_m)
-            if not contacts:
-                return replace(
-                    item.noted(f"its collision shape was cut off {removed_m * 100:.1f} cm inside a neighbor"),
-                    stands=True,
-                )
-            deepest = min(contacts, key=lambda c: c.separation_m)
-            removed_m = max(removed_m, -deepest.separation_m)
-            # The neighbor ends at the contact; what lies deeper than that, along its normal, goes.
-            level = deepest.normal @ deepest.position - deepest.separation_m + TOUCH_GAP_M
-            inward = item.pose[:3, :3].T @ deepest.normal
-            offset = float(deepest.normal @ item.pose[:3, 3] - level)
-            parts, unflattened = cut(item.parts, inward, offset), cut(item.unflattened, inward, offset)
-            if not parts or not unflattened:
-                break
-            item = replace(item, parts=parts, unflattened=unflattened)
+            met = self.met(item)
+            if not met:
+                said = f"its collision shape was cut off {removed_m * 100:.1f} cm inside a neighbor"
+                return replace(item.noted(said), stands=True)
+            for i in sorted(met):
+                if i in self.base:
+                    item = self.cut_behind(item, self.base[i])
+                    continue
+                other = self.placed[i]
+                parts, depth = cut_out(item.parts, item.pose, other.parts, other.pose, 0.5 * tolerance_m)
+                if not parts:
+                    break
+                item, removed_m = replace(item, parts=parts, unflattened=parts), max(removed_m, depth)
         self.bench.put(object_spec(whole.asset, whole.parts, whole.pose, dynamic=True))
         return whole.noted("still overlaps a neighbor")

@@ -9,7 +9,7 @@ from reconstruction.assets.gltf import written_corners
 from reconstruction.types import ConvexPart, ObjectAsset
 from registry.simulation import TIMESTEP_S, BodySpec, Contact, Physics, pose_change
 
-_STANDING = 0.7  # of the upward part of a contact's normal
+STANDING = 0.7  # of the upward part of a contact's normal
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,9 @@ class Workbench:
             if c.first == body_id:
                 found.append(c)
             elif c.second == body_id:
-                found.append(Contact(body_id, c.first, c.separation_m, -c.normal, c.position, -c.impulse))
+                # The pair was first met when the other one was free: ids are in that order, and yet the normal is
+                # of the one that is free now.
+                found.append(Contact(body_id, c.first, c.separation_m, c.normal, c.position, c.impulse))
         self.freeze(body_id, pose)
         physics.set_gravity(body_id, True)
         return found
@@ -115,7 +117,7 @@ class Workbench:
             if body_id in (c.first, c.second):
                 other, sign = (c.second, 1.0) if c.first == body_id else (c.first, -1.0)
                 push[other] = push.get(other, 0.0) + sign * float(c.impulse[2])
-                if abs(c.normal[2]) > _STANDING:
+                if abs(c.normal[2]) > STANDING:
                     points.append(c.position[:2])
         carriers = tuple(sorted((i for i in push if push[i] > 0), key=lambda i: (-push[i], i)))
         physics.set_damping(body_id, 0.0, 0.0)

@@ -82,6 +82,30 @@ def give_way(
     return (tuple(one), tuple(other), deepest) if deepest > 0 else (first, second, 0.0)
 
 
+def cut_out(
+    first: tuple[ConvexPart, ...],
+    first_pose: np.ndarray,
+    second: tuple[ConvexPart, ...],
+    second_pose: np.ndarray,
+    tolerance_m: float,
+) -> tuple[tuple[ConvexPart, ...], float]:
+    """Cut off all of the first thing's pieces that is in the second one: (what is left, the deepest overlap)."""
+    theirs = [_in_world(part, second_pose) for part in second]
+    left, deepest = [], 0.0
+    for part in first:
+        kept: ConvexPart | None = part
+        for their in theirs:
+            found = overlap_of(_in_world(kept, first_pose), their, sideways_only=False)
+            if found is None or found.depth <= tolerance_m:
+                continue
+            deepest = max(deepest, found.depth)
+            kept = _behind(kept, first_pose, found.normal, found.high + _GAP_M)
+            if kept is None:
+                break
+        left += [] if kept is None else [kept]
+    return tuple(left), deepest
+
+
 def overlap_of(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray], *, sideways_only: bool
 ) -> Overlap | None:

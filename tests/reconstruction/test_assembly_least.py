@@ -11,7 +11,7 @@ from reconstruction.assembly.clear import least_move, make_clear
 from reconstruction.assembly.placement import base_specs
 from reconstruction.assembly.tops import seat
 from reconstruction.assembly.workbench import Workbench, object_spec, support_margin
-from reconstruction.assembly.yielding import give_way
+from reconstruction.assembly.yielding import cut_out, give_way
 from reconstruction.assets.gltf import read_obj, write_obj
 from reconstruction.types import AssetSet, Edge, SceneGraph
 from registry.geometry import rigid
@@ -78,6 +78,60 @@ def test_only_pieces_that_overlap_sideways_give_way():
     # What carries a thing is below it: the way out is up, which is not theirs to cut.
     above = rigid(None, np.array([0.0, 0, 0.09]))
     assert give_way((part,), above, (part,), pose, **options | {"rests_on": True})[2] == 0
+
+
+def test_what_is_cut_out_of_another_ends_at_its_surface():
+    plank, pose = box_part((0.2, 0.03, 0.5)), rigid()
+    inside = rigid(None, np.array([0.05, 0.01, 0.0]))  # 2 cm of 3 are in it
+    (left,), depth = cut_out((plank,), inside, (plank,), pose, 1e-4)
+    assert depth == pytest.approx(0.02, abs=1e-6)
+    assert left.vertices[:, 1].min() + 0.01 == pytest.approx(0.0152, abs=1e-5)
+    assert np.ptp(left.vertices[:, 1]) == pytest.approx(0.0098, abs=1e-5)
+    assert cut_out((plank,), pose, (plank,), pose, 1e-4) == ((), pytest.approx(0.03))
+
+
+def test_a_probe_pushes_out_what_is_free_whoever_was_free_first():
+    lower, upper = box(10, (0.4, 0.4, 0.1), (0, 0, 0.5)), box(11, (0.1, 0.1, 0.1), (0, 0, 0.59))
+    bench = Workbench(base_specs(AssetSet((floor(),), ())))
+    for item in (lower, upper):
+        bench.put(object_spec(item, item.collision, item.world_from_object, dynamic=True))
+    for number, item, up in ((11, upper, 1), (10, lower, -1), (11, upper, 1), (10, lower, -1)):
+        contacts = bench.probe(number, item.world_from_object, 3e-4)
+        assert contacts
+        assert all(c.first == number and c.normal[2] == pytest.approx(up) for c in contacts)
+
+
+def test_furniture_in_a_wall_stays_and_its_shape_ends_there():
+    scene = assemble(
+        room(box(10, (1.0, 0.4, 0.8), (0, 0.815, 0), label="table")), standing_on((10, 1)), AssemblyConfig()
+    )
+    (placed,) = scene.placed
+    assert placed.moved_m < 3e-4
+    assert max(p.vertices[:, 1].max() for p in placed.collision) + 0.815 <= 1.0
+    assert scene.physics_report["spawn_penetration_mm"] < 0.1
+
+
+def test_what_cannot_stand_is_held_where_it_was_seen():
+    """Half of it hangs over the edge of a post, too far for any repair; it touches the post still."""
+    assets = room(box(10, (0.1, 0.1, 0.8), (0, 0, 0)), box(11, (0.3, 0.06, 0.06), (0.12, 0, 0.806)))
+    scene = assemble(assets, standing_on((10, 1), (11, 10)), AssemblyConfig())
+    held = {p.id: p for p in scene.placed}[11]
+    assert not held.dynamic
+    assert held.moved_m < 7e-3
+    assert held.turned_deg < 1e-3
+    assert scene.physics_report["contacts"]["support_edges_real"] == 2
+
+
+def test_what_hangs_on_a_hanging_thing_is_not_moved_off_the_wall():
+    """A head on a panel, both said to hang on the wall, the panel inside the head's back."""
+    panel, head = box(10, (1.0, 0.06, 1.0), (0, 0.97, 0.5)), box(11, (0.3, 0.4, 0.3), (0, 0.8, 0.9))
+    graph = SceneGraph(tuple(Edge(i, "attached_to", 2, 1.0, "seen") for i in (10, 11)))
+    scene = assemble(room(panel, head), graph, AssemblyConfig())
+    placed = {p.id: p for p in scene.placed}
+    assert max(p.moved_m for p in scene.placed) < 1e-3
+    assert {e.child: e.parent for e in scene.graph.edges} == {10: 2, 11: 10}
+    assert "hangs on 10 instead of 2" in placed[11].repair
+    assert scene.physics_report["contacts"]["attached_edges_real"] == 2
 
 
 def test_a_thing_stays_where_it_stood_on_a_top_that_nobody_saw():
