@@ -14,7 +14,7 @@ from reconstruction.assets.edges import with_simple_edges
 from reconstruction.assets.fused import fused_points, without_strays
 from reconstruction.assets.generation.complete import Attempt, SurfaceColors, generated_shape
 from reconstruction.assets.generation.fetch import Fetched, fetch_meshes
-from reconstruction.assets.hanging import hanging_slab
+from reconstruction.assets.hanging import hanging_slab, is_outlined, outlined_slab
 from reconstruction.assets.hanging_relief import mound, relief
 from reconstruction.assets.physics.base import choice_for
 from reconstruction.assets.physics.load import load_physicist
@@ -232,6 +232,10 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     """Return an object's closed shape in its grid frame, that frame, and how the shape was made."""
     config, stands = scene.config, scene.stands
     seen = stands.seen[item.id]
+    if is_outlined(item, seen.points):
+        return Shape(
+            *outlined_slab(item, scene.posed, scene.depth.camera, scene.found, config), "outline+slab"
+        )
     if len(seen.points) < config.min_points:
         return box_fallback(item, seen.points)
     frame = frame_object(item, seen, stands.level(item.id), scene.found)

@@ -13,8 +13,8 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.hanging_front import front_of
 from reconstruction.assets.solid import Solid, box_solid
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.types import Camera, InstanceSet, PosedFrames
-from registry.geometry import transform_points
+from reconstruction.types import Camera, Instance, InstanceSet, PosedFrames
+from registry.geometry import rigid, transform_points
 
 _MAX_THICKNESS_M = 0.10
 _MAX_SPREAD_M, _LAYER_M = 0.025, 0.035
@@ -26,6 +26,7 @@ _EDGE_PX = 6.0
 _BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02
 _MIN_WITNESSES = 2
 _PROBES = 7
+_SEEN_SHARE, _SEEN_PERCENT = 0.5, 2.0  # of its box on the wall
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,38 @@ class Hanging:
 
     body: Solid
     completed: bool  # it goes on where no frame looked
+
+
+def is_outlined(item: Instance, points: np.ndarray) -> bool:
+    """Tell whether the box of a thing on a wall is from its masks' outlines: few points (n, 3) were seen."""
+    if not item.attached_hint:
+        return False
+    if len(points) == 0:
+        return True
+    along = points[:, :2] @ np.array([-np.sin(item.yaw_rad), np.cos(item.yaw_rad)])
+    low, high = np.percentile(
+        np.column_stack([along, points[:, 2]]), [_SEEN_PERCENT, 100 - _SEEN_PERCENT], axis=0
+    )
+    return float(np.prod(high - low)) < _SEEN_SHARE * float(np.prod(item.extents_m[1:]))
+
+
+def outlined_slab(
+    item: Instance, posed: PosedFrames, camera: Camera, found: InstanceSet, config: AssetsConfig
+) -> tuple[Solid, ObjectFrame]:
+    """Return the box of what is known by its outline, its back on the wall, in a grid frame, and that frame.
+
+    How thick a flat one is, views may tell.
+    """
+    c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
+    front, width, height = item.extents_m
+    rotation = np.array([[-s, -c, 0.0], [c, -s, 0.0], [0.0, 0.0, 1.0]])  # +y into the wall
+    back = item.center - 0.5 * np.array([front * c, front * s, height])
+    frame = ObjectFrame(rigid(rotation, back), np.zeros((0, 3)), np.zeros((0, 3)), False, 0.0)
+    low, high = np.array([-0.5 * width, 0.0]), np.array([0.5 * width, height])
+    if front <= config.flat_thickness_m:
+        seen = front_of(frame.world_from_grid, 0.0, low, high, item.id, posed, camera, found)
+        front = max(config.flat_thickness_m, seen or 0.0)
+    return box_solid(np.array([low[0], -front, low[1]]), np.array([high[0], 0.0, high[1]])), frame
 
 
 def hanging_slab(

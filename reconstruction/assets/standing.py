@@ -128,8 +128,8 @@ def without_children(
     """Free the space that children fill, and fill in what they stand on.
 
     Free is what lies above their contact, within their footprint grown by `grow_m` and where their smeared depth
-    raises the carrier (`_smeared`). Solid is a board right below the contact, within the footprint: it was hidden by
-    the child.
+    raises the carrier (`_smeared`). Solid is a board right below the contact, within the footprint and the
+    carrier's own outline: it was hidden by the child.
     """
     if not standing:
         return volume
@@ -145,6 +145,10 @@ def without_children(
     shape = (len(x), len(y))
     filled = [_within(plane, corners[:, :2], grow_m).reshape(shape) for corners in corners_of]
     every = np.any(filled, axis=0)
+    # What stands on it may reach beyond its edges: a plate on a small box.
+    own_plan = np.ones(shape, bool)
+    if len(frame.points):
+        own_plan = _within(plane, _outline(frame.points[:, :2]), volume.voxel_m).reshape(shape)
     for s, corners, own in zip(standing, corners_of, filled):
         near = _within(plane, corners[:, :2], _SMEAR_REACH_M).reshape(shape)
         top = corners[0, 2] + s.top_m - s.level_m
@@ -160,7 +164,7 @@ def without_children(
             known[:, :, k][inside] = True
             free[:, :, k][inside] = True
             seen[:, :, k][inside] = above[k] < volume.trunc_m
-        core = _within(plane, corners[:, :2], -_FOOTPRINT_SHRINK_M).reshape(len(x), len(y))
+        core = _within(plane, corners[:, :2], -_FOOTPRINT_SHRINK_M).reshape(len(x), len(y)) & own_plan
         for k in np.flatnonzero((above <= 0) & (above > -max(_BOARD_M, 2.5 * volume.voxel_m))):
             depth_below = max(float(above[k]), -volume.trunc_m)
             distance[:, :, k][core] = np.minimum(
@@ -227,6 +231,18 @@ def within_walls(volume: ObjectVolume, frame: ObjectFrame, found: InstanceSet) -
     )
     distance[behind], known[behind], free[behind], seen[behind] = volume.trunc_m, True, True, False
     return replace(volume, distance=distance, known=known, free=free, seen=seen)
+
+
+def _outline(points: np.ndarray) -> np.ndarray:
+    """Return the convex outline (k, 2), counter-clockwise, of points (n, 2), the outermost ones left out."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    inner = points[((points >= low) & (points <= high)).all(axis=1)]
+    try:
+        return inner[ConvexHull(inner).vertices]
+    except (QhullError, ValueError):
+        return np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
 
 
 def _within(points: np.ndarray, outline: np.ndarray, grow_m: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from reconstruction.types import Instance, InstanceSet, Surface
 
 IOU_BOUNDS = (0.25, 0.5)
 _TRIMMED_PERCENT = 1.0
+_OUTLINED_SHARE = 0.6  # of the box on the wall; with less surface it is that of an outline
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,32 @@ def instance_boxes(vertices: np.ndarray, instances: InstanceSet, alignment: Alig
     boxes = np.zeros((len(instances.objects), 2, 3))
     for row, item in enumerate(instances.objects):
         own = vertices[instances.vertex_instance == item.id]
+        if _is_outline(own, item):
+            own = _corners(item)
         own = alignment.to_true(_from_wall_to_front(own, item) if item.attached_hint else own)
         boxes[row] = np.percentile(own, [_TRIMMED_PERCENT, 100 - _TRIMMED_PERCENT], axis=0)
         bottom = item.center - [0.0, 0.0, 0.5 * item.extents_m[2]]
         boxes[row, 0, 2] = min(boxes[row, 0, 2], alignment.to_true(bottom[None])[0, 2])
     return boxes
+
+
+def _is_outline(points: np.ndarray, item: Instance) -> bool:
+    """Tell whether a thing on a wall has hardly any surface (k, 3): its box is that of its masks' outlines."""
+    if not item.attached_hint:
+        return False
+    along = np.array([-np.sin(item.yaw_rad), np.cos(item.yaw_rad), 0.0])
+    seen = (
+        [np.ptp(points @ axis) for axis in (along, np.array([0.0, 0.0, 1.0]))] if len(points) else [0.0, 0.0]
+    )
+    return float(np.prod(seen)) < _OUTLINED_SHARE * float(np.prod(item.extents_m[1:]))
+
+
+def _corners(item: Instance) -> np.ndarray:
+    """Return the corners (8, 3) of a thing's box."""
+    c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
+    signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return item.center + (signs * item.extents_m) @ turned.T
 
 
 def _from_wall_to_front(points: np.ndarray, item: Instance) -> np.ndarray:

@@ -1,7 +1,7 @@
 """What a thing stands on, from the surface around its foot."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from reconstruction.surface.mesh_graph import MeshGraph
 
@@ -9,13 +9,17 @@ _REACH_M, _FAR_REACH_M = 0.05, 0.3  # around the foot, in plan
 _RISE_M, _DROP_M = 0.03, 0.06  # the carrier's surface may lie this far above and below the foot
 _UP = 0.5  # z of the normal of what carries
 _ON_FLOOR_M = 0.05
+# A thing that hides the whole top of what carries it: that ends at the foot, and lies below it in plan.
+_TOP_BELOW_M, _TOP_ABOVE_M = 0.03, 0.02
+_COMMON_PLAN, _PLAN_STEPS = 0.5, 24  # of the smaller outline
 
 
 def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
     """Return for each thing the row of the thing that it stands on, -1 for none (it stands on floor or hangs).
 
     A thing is carried by what has most up-facing surface around and below its foot, if that begins lower than the
-    thing itself does. Nothing carries itself, not even by way of others.
+    thing itself does; or by what ends right below it, where that surface is lower (a plate hides the top of the box
+    that it is on, and the table around both shows). Nothing carries itself, not even by way of others.
 
     Args:
         graph: the surface.
@@ -41,7 +45,45 @@ def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
             if area.max(initial=0.0) > 0:
                 out[row] = int(np.argmax(area))
                 break
+        hidden = _hidden_carrier(graph, things, row, bottoms, barred)
+        if hidden >= 0 and (
+            out[row] < 0 or (bottoms[hidden] > bottoms[out[row]] and _stands_on(out, hidden, out[row]))
+        ):
+            out[row] = hidden
     return out
+
+
+def _hidden_carrier(
+    graph: MeshGraph, things: list[np.ndarray], row: int, bottoms: list[float], barred: list[bool]
+) -> int:
+    """Return the thing that ends right below a foot and has most of its outline in common with it, or -1."""
+    best, most = -1, _COMMON_PLAN
+    for other, vertices in enumerate(things):
+        if barred[other] or len(vertices) < 3:
+            continue
+        top = float(np.percentile(graph.points[vertices, 2], 98)) - bottoms[row]
+        if -_TOP_BELOW_M < top < _TOP_ABOVE_M:
+            common = _common_plan(graph.points[things[row], :2], graph.points[vertices, :2])
+            if common > most:
+                best, most = other, common
+    return best
+
+
+def _common_plan(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the area that the convex outlines of points (n, 2) and (m, 2) have in common, of the smaller one."""
+    low, high = np.maximum(first.min(0), second.min(0)), np.minimum(first.max(0), second.max(0))
+    if (low >= high).any():
+        return 0.0
+    try:
+        hulls = [ConvexHull(points) for points in (first, second)]
+    except QhullError:
+        return 0.0
+    axes = [np.linspace(low[k], high[k], _PLAN_STEPS) for k in range(2)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    inside = np.ones(len(grid), bool)
+    for hull in hulls:
+        inside &= (grid @ hull.equations[:, :2].T + hull.equations[:, 2] <= 1e-9).all(axis=1)
+    return float(inside.mean() * np.prod(high - low) / max(min(hull.volume for hull in hulls), 1e-9))
 
 
 def _stands_on(carrier: list[int], upper: int, lower: int) -> bool:

@@ -12,6 +12,7 @@ from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
 from reconstruction.instances.masks.base import FrameMasks
+from reconstruction.instances.outlined import add_outlined
 from reconstruction.instances.refine import refine_by_views
 from reconstruction.instances.rules import cut_by_rules
 from reconstruction.instances.scraps import without_unseen
@@ -60,7 +61,11 @@ def find_instances(
     told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
     drawn = as_drawn(vertex_instance, taken)
     id_maps = render_id_maps(posed, depth, surface, drawn, config, told, progress=progress)
-    return without_unseen(InstanceSet(vertex_instance, shell.base, objects, id_maps), config, progress)
+    found = InstanceSet(vertex_instance, shell.base, objects, id_maps)
+    if told is not None and masks is not None:
+        asked = masks.resized(told.camera.width, told.camera.height)
+        found = add_outlined(found, asked, told, posed, depth, surface, config, progress)
+    return without_unseen(found, config, progress)
 
 
 def _with_numbers(told: FrameMasks, cut: Cut, base: int, vertex_instance: np.ndarray) -> FrameMasks:

@@ -85,8 +85,25 @@ def _renamed(found: InstanceSet, old: int, new: int) -> InstanceSet:
 
 def _refit(item: Instance, found: InstanceSet, surface: Surface) -> Instance:
     chosen = found.vertex_instance == item.id
+    if not chosen.any():
+        return item  # its box is that of its masks' outlines
     box = upright_box(np.asarray(surface.vertices, np.float64)[chosen], np.ones(chosen.sum()))
     return replace(item, center=box.center, yaw_rad=box.yaw_rad, extents_m=box.extents_m)
+
+
+def _surface_of(item: Instance, found: InstanceSet) -> np.ndarray:
+    """Return the vertices of a thing, int (k,).
+
+    Raises:
+        UsageError: it has none: its box is that of its masks' outlines.
+    """
+    chosen = np.flatnonzero(found.vertex_instance == item.id)
+    if len(chosen) == 0:
+        raise UsageError(
+            f"overrides: object {item.id} has no surface, only an outline on its wall; it can be dropped, relabeled "
+            "or merged, not split or made base"
+        )
+    return chosen
 
 
 def _drop(found: InstanceSet, item: Instance) -> InstanceSet:
@@ -117,7 +134,7 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
     found, surface = pointer.found, pointer.surface
     if pointer.footage is None:
         raise ValueError("a split needs the footage: it also cuts the id maps")
-    chosen = np.flatnonzero(found.vertex_instance == item.id)
+    chosen = _surface_of(item, found)
     part = _beyond_plane(pointer, item, how, chosen) if isinstance(how, dict) else None
     if part is None:
         seeds = [[pointer.vertex(a, item) for a in clicks] for clicks in parse_parts(how, "overrides: split")]
@@ -207,7 +224,7 @@ def _make_base(found: InstanceSet, surface: Surface, item: Instance, label: obje
     """Turn a thing into a base entity: the plane through its vertices, its normal towards free space."""
     if label not in BASE_LABELS:
         raise UsageError(f"overrides: make_base of object {item.id} must be one of {', '.join(BASE_LABELS)}")
-    chosen = found.vertex_instance == item.id
+    chosen = _surface_of(item, found)
     points = np.asarray(surface.vertices, np.float64)[chosen]
     center = np.median(points, axis=0)
     if label == "wall":

@@ -5,11 +5,11 @@ import pytest
 from facing import CAMERA, frames
 
 from reconstruction.assets import AssetsConfig
-from reconstruction.assets.hanging import hanging_slab
+from reconstruction.assets.hanging import hanging_slab, is_outlined, outlined_slab
 from reconstruction.assets.hanging_front import front_of
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.types import BaseEntity, InstanceSet, Plane, PosedFrames
-from registry.geometry import rigid
+from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, PosedFrames
+from registry.geometry import rigid, transform_points
 
 TWICE = ((0.0, 0.0, 1.3), (0.1, 0.0, 1.3))
 
@@ -139,3 +139,23 @@ def test_a_plain_middle_taken_for_the_wall_does_not_shrink_the_picture():
     middle = (np.abs(x) < 0.32) & (z > 0.06) & (z < 0.24)
     frame.points[middle, 1] = 0.02
     assert size_of(slab(frame, frames(*TWICE)))[[0, 2]] == pytest.approx([0.8, 0.3], abs=0.02)
+
+
+def test_what_only_its_outline_is_known_of_is_the_box_of_that_with_its_back_on_the_wall():
+    turn = np.radians(30)
+    normal = np.array([np.cos(turn), np.sin(turn), 0.0])
+    center = np.array([1.0, 2.0, 1.4]) + 0.1 * normal
+    shelf = Instance(2, "unknown", 0.0, center, turn, np.array([0.2, 0.8, 0.3]), 1, True)
+    assert is_outlined(shelf, np.zeros((0, 3)))
+    along = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    corners = center + np.array([[a * along[0], a * along[1], b] for a in (-0.4, 0.4) for b in (-0.15, 0.15)])
+    assert is_outlined(shelf, center + 0.6 * (corners - center))
+    assert not is_outlined(shelf, corners)
+    nothing = InstanceSet(np.zeros(0, np.int32), (WALL,), (shelf,), np.zeros((2, 240, 320), np.uint16))
+    body, frame = outlined_slab(shelf, frames(*TWICE), CAMERA, nothing, AssetsConfig())
+    world = transform_points(frame.world_from_grid, body.vertices)
+    assert np.ptp((world - center) @ np.stack([normal, along, [0, 0, 1.0]], axis=1), axis=0) == pytest.approx(
+        [0.2, 0.8, 0.3]
+    )
+    assert world.mean(axis=0) == pytest.approx(center)
+    assert frame.world_from_grid[:3, 1] == pytest.approx(-normal)  # its grid looks into the wall

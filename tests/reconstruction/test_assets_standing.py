@@ -107,6 +107,25 @@ def test_a_rim_that_goes_on_and_a_rim_with_nothing_beyond_it_stay():
         assert raised_columns(stand(rimmed)) == raised_columns(rimmed)
 
 
+def test_what_reaches_beyond_the_edge_of_its_carrier_makes_that_no_larger():
+    # A plate of 32 cm on a box of 12 cm that only one side of was seen, its top hidden.
+    volume = slab_with(lambda r: r < 0)
+    unknown = np.zeros(volume.distance.shape, bool)
+    volume = replace(volume, known=unknown, free=unknown, seen=unknown)
+    x, z = np.meshgrid(np.linspace(-0.06, 0.06, 30), np.linspace(-0.1, 0.0, 20))
+    points = np.concatenate(
+        [np.column_stack([x.ravel(), np.full(x.size, y), z.ravel()]) for y in (-0.06, 0.06)]
+    )
+    frame = ObjectFrame(np.eye(4), points, np.zeros_like(points), True, None)
+    angle = np.arange(24) * np.pi / 12
+    outline = 0.16 * np.column_stack([np.cos(angle), np.sin(angle)])
+    made = without_children(volume, frame, (Standing(5, 4, 0.0, True, outline, 0.02),), 0.01)
+    solid = np.argwhere(made.known & (made.distance < 0))
+    low, high = volume.origin + solid.min(axis=0) * VOXEL_M, volume.origin + (solid.max(axis=0) + 1) * VOXEL_M
+    assert low[:2] == pytest.approx([-0.06, -0.06], abs=0.015)
+    assert high == pytest.approx([0.06, 0.06, 0.0], abs=0.015)
+
+
 def standing_at(*levels: float) -> dict[int, Standing]:
     none = np.zeros((0, 2))
     return {k: Standing(k, 1, level, True, none, level + 0.1) for k, level in enumerate(levels, start=2)}
