@@ -13,6 +13,8 @@ _FLAT_SPREAD_M, _FLAT_REACH_M = 0.015, 0.03  # of a flat thing's surface: its no
 _LEAST_FRONT_M = 0.02
 _HIDDEN_M = 0.05  # of a thing may be hidden by what stands before its foot
 _CONTAINER_FLOOR_M = 0.008  # thickness of the bottom of a bowl or a basket
+_FLAT = 0.5  # height over width of what is flat
+_COVERED, _RIM_M = 0.7, 0.02  # share of what carries a thing, and how far that may reach beyond the outline
 
 
 def describe(
@@ -75,6 +77,12 @@ def _box_on_support(
         floor = _bottom_of(graph, thing.rests_on, base) + _CONTAINER_FLOOR_M
         return with_bottom(box, float(np.clip(floor, bottom - box.extents_m[2], bottom)))
     under = thing.rests_on.vertices
+    flat = box.extents_m[2] < _FLAT * box.extents_m[:2].min()
+    if flat and _covers(
+        box, graph.points[under], graph.areas[under]
+    ):  # then it lies on the top, which it hides
+        top = quantiles(graph.points[under, 2], graph.areas[under], (0.95,))[0]
+        return with_bottom(box, float(np.clip(top, bottom - _HIDDEN_M, bottom)))
     near = (
         np.abs(graph.points[under, :2] - box.center[:2]) < 0.5 * np.linalg.norm(box.extents_m[:2]) + 0.03
     ).all(1)
@@ -84,6 +92,14 @@ def _box_on_support(
     if len(carrying) < 5 or not len(heights):
         return box
     return with_bottom(box, min(float(np.median(heights)), bottom + 0.01))
+
+
+def _covers(box: UprightBox, points: np.ndarray, areas: np.ndarray) -> bool:
+    """Tell whether most of the surface at points (n, 3) is below a box, within its outline."""
+    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+    turned = np.abs((points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]]))
+    inside = (turned < 0.5 * box.extents_m[:2] + _RIM_M).all(axis=1) & (points[:, 2] < box.center[2])
+    return float(np.average(inside, weights=np.maximum(areas, 1e-12))) > _COVERED
 
 
 def _bottom_of(graph: MeshGraph, thing: Thing, base: tuple[BaseEntity, ...]) -> float:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.segmentation import Thing
@@ -53,15 +54,16 @@ def without_doubts(
     return taken
 
 
-def as_drawn(vertex_instance: np.ndarray, taken: list[Taken]) -> np.ndarray:
-    """Return the ids (v,) for drawing, in which things have again what was taken from them.
+def as_drawn(graph: MeshGraph, vertex_instance: np.ndarray, taken: list[Taken]) -> np.ndarray:
+    """Return the ids (v,) for drawing, in which things, or the parts they were cut into, have again what was taken.
 
     What is smeared hangs at outlines, where the edges of the image decide; of a thing that is small in the image the
     rim, seen at a slant, is half of it.
     """
     out = vertex_instance.copy()
     for part in taken:
-        out[part.gone] = vertex_instance[part.kept[0]]
+        nearest = cKDTree(graph.points[part.kept]).query(graph.points[part.gone])[1]
+        out[part.gone] = vertex_instance[part.kept[nearest]]
     return out
 
 

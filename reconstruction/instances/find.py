@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.contact_skirts import cut_cleaned_stacks
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
 from reconstruction.instances.doubts import as_drawn, without_doubts
@@ -52,6 +53,9 @@ def find_instances(
     else:
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     taken = without_doubts(shell, cut.things, frames, progress)
+    if masks is None:
+        again = cut_cleaned_stacks(shell.graph, surface, cut.things, posed, depth, config, progress)
+        cut = replace(cut, things=again)
     progress.advance()
     vertex_instance = cut.owner.copy()
     objects = describe(shell.graph, cut.things, shell.base, vertex_instance)
@@ -59,7 +63,7 @@ def find_instances(
     if not objects:
         progress.note("No separate things were found: the scene is an empty room.")
     told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
-    drawn = as_drawn(vertex_instance, taken)
+    drawn = as_drawn(shell.graph, vertex_instance, taken)
     id_maps = render_id_maps(posed, depth, surface, drawn, config, told, progress=progress)
     found = InstanceSet(vertex_instance, shell.base, objects, id_maps)
     if told is not None and masks is not None:

@@ -51,7 +51,7 @@ def cut_by_rules(
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)
     things = without_smears(shell, things, owner, frames, config, progress)
-    things = cut_side_by_side(graph, surface, things, config, progress)
+    things = cut_side_by_side(graph, surface, things, posed, depth, config, progress)
     things = cut_stacks(graph, surface, things, posed, depth, config, progress)
     things = without_skirts(graph, things, progress)
     things = without_fragments(graph, things, shell.base[0].observed, config, progress)

@@ -3,7 +3,8 @@
 Depth smears over a gap of a centimetre or two, and a thin wall of that has no crease at which the mesh could be cut.
 Seen from above the two still tell: whatever the height at which one looks, the outline has bays on both sides at one
 place, and what lies on either side of it is about as long as wide. One thing has no such waist: handles and spouts are
-slimmer than things, and notches of L-shaped ones are on one side.
+slimmer than things, and notches of L-shaped ones are on one side. Where there is none,
+colors may tell (`two_colors`).
 """
 
 from dataclasses import dataclass
@@ -14,13 +15,14 @@ from scipy import ndimage
 
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.image_colors import SurfaceSamples, surface_samples
+from reconstruction.instances.image_colors import SurfaceSamples, surface_samples, with_colors
 from reconstruction.instances.merging import nearest_of
 from reconstruction.instances.outlines import filled_hull
 from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.two_colors import meeting_line
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import Surface
+from reconstruction.types import DepthMaps, PosedFrames, Surface
 
 _LARGEST_M = 0.6
 _CELL_M = 0.005
@@ -39,14 +41,22 @@ class _Waist:
 
 
 def cut_side_by_side(
-    graph: MeshGraph, surface: Surface, things: list[Thing], config: InstancesConfig, progress: Progress
+    graph: MeshGraph,
+    surface: Surface,
+    things: list[Thing],
+    posed: PosedFrames,
+    depth: DepthMaps,
+    config: InstancesConfig,
+    progress: Progress,
 ) -> list[Thing]:
-    """Cut small things with a waist in two.
+    """Cut small things with a waist, or with a bay and two colors, in two.
 
     Args:
         graph: the surface as a graph.
         surface: the surface in world space.
         things: what was found; theirs are the vertices.
+        posed: keyframes with cameras in world space.
+        depth: their depth in metres.
         config: how large a thing is at least.
         progress: told of how many were cut.
 
@@ -54,11 +64,23 @@ def cut_side_by_side(
         The things, the smaller parts at the end; what rested on a cut one rests on the part that is nearest.
     """
     out = list(things)
-    for thing in things:
-        extents = np.ptp(graph.points[thing.vertices], axis=0)
-        if thing.attached or thing.container or extents.max() > _LARGEST_M:
-            continue
-        parts = _parts(graph, thing.vertices, surface_samples(graph, surface, thing.vertices), config)
+    small = [
+        thing
+        for thing in things
+        if not thing.attached and np.ptp(graph.points[thing.vertices], axis=0).max() <= _LARGEST_M
+    ]
+    if not small:
+        return out
+    chosen = np.concatenate([thing.vertices for thing in small])
+    samples = with_colors(surface_samples(graph, surface, chosen), posed, depth)
+    inside = np.zeros(len(graph.points), bool)
+    for thing in small:
+        inside[:] = False
+        inside[thing.vertices] = True
+        own = samples.of(inside[samples.vertex])
+        parts = None if thing.container else _parts(graph, thing.vertices, own, config)
+        if parts is None:
+            parts = _colored_parts(graph, thing.vertices, own, config)
         if parts is None:
             continue
         thing.vertices = parts[0]
@@ -99,6 +121,22 @@ def _parts(
         parts.append(body[side])
     first, second = sorted(parts, key=lambda part: -graph.areas[part].sum())
     return first, second
+
+
+def _colored_parts(
+    graph: MeshGraph, body: np.ndarray, samples: SurfaceSamples, config: InstancesConfig
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the vertices of two things of different colors that touch, the larger first; None if there is but one."""
+    line = meeting_line(graph.points[body], graph.areas[body], samples)
+    if line is None:
+        return None
+    first = graph.points[body, :2] @ line[0] < line[1]
+    parts = sorted((body[first], body[~first]), key=lambda part: -graph.areas[part].sum())
+    for part in parts:
+        extents = np.ptp(graph.points[part], axis=0)
+        if graph.areas[part].sum() < config.min_object_area_m2 or extents.min() < config.min_object_m:
+            return None
+    return parts[0], parts[1]
 
 
 def _waist(points: np.ndarray, areas: np.ndarray, slim_m: float) -> _Waist | None:

@@ -81,6 +81,9 @@ def test_what_hangs_on_a_wall_stays_whole():
 
 def test_what_was_taken_is_drawn_all_the_same():
     ids = np.array([1, 5, 5, 0, 6, 0], np.int32)
-    drawn = as_drawn(ids, [Taken(np.array([1, 2]), np.array([3])), Taken(np.array([4]), np.array([5]))])
+    shell = Shell.of(surface_from(floor_sheet((120, 100, 80), 0.6, 0.3)), NO_PROGRESS)
+    drawn = as_drawn(
+        shell.graph, ids, [Taken(np.array([1, 2]), np.array([3])), Taken(np.array([4]), np.array([5]))]
+    )
     np.testing.assert_array_equal(drawn, [1, 5, 5, 5, 6, 6])
     np.testing.assert_array_equal(ids, [1, 5, 5, 0, 6, 0])

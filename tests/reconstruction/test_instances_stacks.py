@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 from fused_surfaces import box, can, fused
-from surfaces import frames_of
+from surfaces import floor_sheet, frames_of, surface_from
 
 from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.instances.contact_skirts import cut_cleaned_stacks
+from reconstruction.instances.cut import Shell
+from reconstruction.instances.describe import describe
 from reconstruction.instances.image_colors import surface_samples, with_colors
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.stacks import cut_stacks
@@ -69,6 +72,47 @@ def test_one_thing_stays_whole(solids):
     assert len(things) == 1
 
 
+PACKAGE = box((-0.07, -0.06, 0.0), (0.07, 0.06, 0.07), BLUE)
+BOOK = box((-0.1, -0.1, 0.07), (0.1, 0.1, 0.1), RED, 0.4)
+
+
+@pytest.mark.parametrize(
+    "upper", [can((0.01, 0.0), 0.11, 0.07, 0.09, WHITE), BOOK], ids=["a plate", "a book"]
+)
+def test_a_flat_thing_that_hides_what_it_lies_on_is_a_thing(upper):
+    things, graph = stacked([PACKAGE, upper])
+    assert len(things) == 2
+    low, high = things
+    assert high.rests_on is low
+    assert graph.points[high.vertices, 2].min() > 0.04
+    assert np.percentile(graph.points[low.vertices, 2], 95) < 0.08
+    ids = np.zeros(len(graph.points), np.int32)
+    room = Shell.of(surface_from(floor_sheet(WHITE, 0.6, 0.3)), NO_PROGRESS)
+    boxes = {o.id: o for o in describe(graph, things, room.base, ids)}
+    flat = boxes[ids[high.vertices[0]]]
+    assert flat.extents_m[2] < 0.05  # it does not reach down to what its carrier stands on
+
+
+@pytest.mark.parametrize(
+    "solids",
+    [
+        [can((0, 0), 0.02, 0.0, 0.1, RED), can((0, 0), 0.1, 0.1, 0.13, WHITE)],
+        [PACKAGE, box((-0.1, -0.1, 0.07), (0.1, 0.1, 0.1), BLUE)],
+        [PACKAGE, box((-0.07, -0.06, 0.07), (0.07, 0.06, 0.1), RED)],
+        [can((0, 0), 0.04, 0.0, 0.1, WHITE), can((0, 0), 0.055, 0.1, 0.12, RED)],
+    ],
+    ids=[
+        "a lamp on its stem",
+        "a box with a rim of its color",
+        "a box with a colored band",
+        "a jar with a wide lid",
+    ],
+)
+def test_what_reaches_out_above_its_foot_stays_whole(solids):
+    things, _ = stacked(solids)
+    assert len(things) == 1
+
+
 def test_what_rested_on_the_stack_rests_on_its_part():
     surface = fused([CARTON, can((0.0, 0.0), 0.035, 0.15, 0.25, RED)], half_m=0.25, top_m=0.45)
     posed, depth = frames_of(surface, 480, 360)
@@ -80,6 +124,33 @@ def test_what_rested_on_the_stack_rests_on_its_part():
     assert len(things) == 3
     assert things[1].rests_on is things[2]
     assert things[2].rests_on is things[0]
+
+
+@pytest.mark.parametrize(("top", "kept"), [(0.018, 1), (0.05, 2)], ids=["a skirt", "a box"])
+def test_a_low_part_that_hardly_reaches_out_is_a_skirt(top, kept):
+    foot = box((-0.06, -0.06, 0.0), (0.06, 0.06, top), GREEN)
+    surface = fused([foot, box((-0.05, -0.05, top), (0.05, 0.05, 0.15), RED)], half_m=0.25, top_m=0.3)
+    posed, depth = frames_of(surface, 480, 360)
+    graph = MeshGraph.from_surface(surface)
+    whole = Thing(np.flatnonzero(graph.points[:, 2] > 0.004))
+    things = cut_cleaned_stacks(graph, surface, [whole], posed, depth, InstancesConfig(), NO_PROGRESS)
+    assert len(things) == kept
+    assert things[-1].rests_on is (None if kept == 1 else things[0])
+    assert np.percentile(graph.points[things[-1].vertices, 2], 1) > top - 0.01
+
+
+@pytest.mark.parametrize(("top", "kept"), [(0.19, 1), (0.27, 2)], ids=["a cap", "a can"])
+def test_on_a_second_look_what_is_narrow_and_low_is_a_cap(top, kept):
+    bottle = box((-0.06, -0.05, 0.0), (0.06, 0.05, 0.15), BLUE)
+    surface = fused([bottle, can((0.01, 0.0), 0.035, 0.15, top, RED)], half_m=0.25, top_m=0.45)
+    posed, depth = frames_of(surface, 480, 360)
+    graph = MeshGraph.from_surface(surface)
+    body = np.flatnonzero(graph.points[:, 2] > 0.012)
+    first = cut_stacks(graph, surface, [Thing(body)], posed, depth, InstancesConfig(), NO_PROGRESS)
+    assert len(first) == 2
+    things = cut_cleaned_stacks(graph, surface, [Thing(body)], posed, depth, InstancesConfig(), NO_PROGRESS)
+    assert len(things) == kept
+    assert sum(len(thing.vertices) for thing in things) == len(body)
 
 
 def test_a_stack_on_a_table_is_found_whole():

@@ -1,0 +1,89 @@
+"""Where two touching things of different colors meet, seen from above.
+
+A low thing beside a tall one, or a small one beside a large one, has no waist from both sides. But what is on either
+side of the place where they meet has hardly a color in common, and together they have a bay in their outline that
+neither has alone. One thing of two colors has no such bay, and handles and spouts are of the thing's own colors.
+"""
+
+import numpy as np
+from scipy import ndimage
+
+from reconstruction.instances.boxes import quantiles
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
+from reconstruction.instances.image_colors import SurfaceSamples
+from reconstruction.instances.outlines import filled_hull
+from reconstruction.instances.patches import palette
+
+_CELL_M = 0.01
+_STEP_M, _AXES = 0.01, np.radians(np.arange(0.0, 180.0, 15.0))
+_CLEAR = 0.3  # of the height: below it are skirts, and the colors of the ground
+_COLORS, _COLOR_GAP = 16, 6.0
+_MOST_COMMON = 0.3  # share of either side's area whose color the other side has, too
+_LEAST_SHARE = 0.12  # of the whole on either side
+_SOLID, _BAY = 0.93, 0.025  # of the hull of each side; and more than of the hull of both
+_MIN_SAMPLES, _MOST_SAMPLES = 200, 3000
+_GROUND_M = 0.025  # both stand on the same
+
+
+def meeting_line(
+    points: np.ndarray, areas: np.ndarray, samples: SurfaceSamples
+) -> tuple[np.ndarray, float] | None:
+    """Return the line across which two things touch: a unit axis (2,) and the place along it in metres.
+
+    Args:
+        points: float64 (n, 3) vertices of what may be two things.
+        areas: float64 (n,) theirs.
+        samples: of the same, with colors.
+
+    Returns:
+        None where there is one thing.
+    """
+    bottom, top = quantiles(points[:, 2], areas, (0.01, 0.99))
+    clear = bottom + _CLEAR * (top - bottom)
+    line = _least_common(samples.of(np.isfinite(samples.lab[:, 0]) & (samples.points[:, 2] > clear)))
+    if line is None:
+        return None
+    axis, at = line
+    first, high = points[:, :2] @ axis < at, points[:, 2] > clear
+    for side in (first, ~first):
+        if not (side & high).any() or points[side, 2].min() > bottom + _GROUND_M:
+            return None
+    solid = min(_solidity(points[side & high, :2]) for side in (first, ~first))
+    if solid < _SOLID or solid - _solidity(points[high, :2]) < _BAY:
+        return None
+    return axis, at
+
+
+def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
+    """Return the line whose sides have least color in common, None where that is too much."""
+    if len(samples.points) < _MIN_SAMPLES:
+        return None
+    lab = samples.lab * LIGHTNESS_WEIGHT
+    means = palette(lab[:: max(1, len(lab) // _MOST_SAMPLES)], _COLORS, _COLOR_GAP)[1]
+    color = np.argmin(((lab[:, None] - means[None]) ** 2).sum(axis=2), axis=1)
+    whole = np.bincount(color, weights=samples.areas, minlength=len(means))
+    best, line = _MOST_COMMON, None
+    for angle in _AXES:
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        along = samples.points[:, :2] @ axis
+        low, high = np.percentile(along, [1, 99])
+        for at in np.arange(low + 3 * _STEP_M, high - 3 * _STEP_M, _STEP_M):
+            side = along < at
+            one = np.bincount(color[side], weights=samples.areas[side], minlength=len(means))
+            two = whole - one
+            share = one.sum() / whole.sum()
+            if min(share, 1.0 - share) < _LEAST_SHARE:
+                continue
+            common = float(np.minimum(one / one.sum(), two / two.sum()).sum())
+            if common < best:
+                best, line = common, (axis, float(at))
+    return line
+
+
+def _solidity(flat: np.ndarray) -> float:
+    """Return how much of the convex hull of points (n, 2) they cover."""
+    cells = np.floor((flat - flat.min(axis=0)) / _CELL_M).astype(int) + 2
+    mask = np.zeros(cells.max(axis=0) + 3, bool)
+    mask[tuple(cells.T)] = True
+    mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, np.ones((3, 3))))
+    return float(mask.sum() / max(filled_hull(mask).sum(), 1))
