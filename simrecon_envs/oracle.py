@@ -113,6 +113,10 @@ class Hand:
             above = np.array([*self.tip()[:2], height_m])
             yield from self.go(lambda: above, within_m=0.02, base=False, patience=25)
 
+    def close(self) -> None:
+        """Close the fingers on the way of what comes next: a closed hand needs less room."""
+        self._open, self._opening = False, None
+
     def grip(self, key: int) -> Iterator[np.ndarray]:
         """Reach over a thing, go down where it can be gripped and close the fingers; try another grasp if it slips."""
         for grasp in (self._env.facts.targets[key].grasps or (self._across(key),))[:_GRIPS]:

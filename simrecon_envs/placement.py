@@ -70,16 +70,21 @@ class Placement:
 
     def reaches(self, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
         """Return which world points (n, 3) are within the hand's reach (n,)."""
-        return within_reach(self.position, points, traits)
+        return within_reach(self.position, np.array(self.yaw_rad), points, traits)
 
 
-def within_reach(root: np.ndarray, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
-    """Return which points (..., 3) a robot whose root is at (..., 3) reaches: in a ring, at heights it works at."""
+def within_reach(root: np.ndarray, yaw: np.ndarray, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
+    """Return which points (..., 3) a robot reaches whose root is at (..., 3), turned by yaw (...).
+
+    They are in a ring about it, before it, and at heights that it works at.
+    """
     away = np.linalg.norm(points[..., :2] - root[..., :2], axis=-1)
     height = points[..., 2] - root[..., 2]
     low, high = traits.work_height_m
     least, _, most = traits.reach_m
-    return (away >= least) & (away <= most) & (height >= low) & (height <= high)
+    way = points[..., :2] - root[..., :2]
+    ahead = np.cos(yaw) * way[..., 0] + np.sin(yaw) * way[..., 1] >= np.cos(traits.aside_rad) * away - 1e-9
+    return (away >= least) & (away <= most) & (height >= low) & (height <= high) & ahead
 
 
 def describe_target(bundle: SceneBundle, item: BundleObject, solids: list[ConvexSolid]) -> Target:

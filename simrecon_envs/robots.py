@@ -42,6 +42,8 @@ class RobotTraits:
     hand: HandShape
     payload_kg: float
     footprint_radius_m: float
+    aside_rad: float = np.pi
+    """How far aside of where the root faces it carries things: an arm turns on its foot, Fetch does not."""
 
 
 _PANDA_HAND = HandShape(0.08, (0.022, 0.016), 0.0095, 0.037, (0.104, 0.032))
@@ -52,7 +54,7 @@ _SMALL_ARM = RobotTraits(False, (0.15, 0.22, 0.32), (-0.10, 0.20), _SMALL_HAND, 
 TRAITS = {
     "panda": _ARM,
     "panda_wristcam": _ARM,
-    "fetch": RobotTraits(True, (0.50, 0.62, 0.85), (0.30, 1.20), _FETCH_HAND, 3.0, 0.30),
+    "fetch": RobotTraits(True, (0.50, 0.62, 0.85), (0.30, 1.20), _FETCH_HAND, 3.0, 0.30, 1.1),
     "so100": _SMALL_ARM,
     "koch-v1.1": _SMALL_ARM,
 }

@@ -69,7 +69,7 @@ class Places:
             for positions, yaws in self._tries(target, interests):
                 within = np.ones(len(positions), bool)
                 for goals in wanted:
-                    within &= within_reach(positions[:, None], goals, self._traits).any(axis=1)
+                    within &= within_reach(positions[:, None], yaws[:, None], goals, self._traits).any(axis=1)
                 for position, yaw in zip(positions[within], yaws[within], strict=True):
                     placement = Placement(position, float(yaw), 0.0, target, "")
                     pedestal = self._stands(target, placement)

@@ -9,6 +9,7 @@ import numpy as np
 
 from registry import SceneBundle
 from registry.welding import moving_ids, welded_to
+from simrecon_envs.hovering import Hover, most_room
 from simrecon_envs.occupancy import ConvexSolid, scene_solids
 from simrecon_envs.placement import PlacementConfig, Target, candidate_targets
 from simrecon_envs.robots import RobotTraits, robot_shape, traits_of
@@ -44,6 +45,7 @@ class SceneFacts:
         self.listed: dict[str, list] = {}  # what `catalog` found, by kind
         self._containers: dict[int, Container | None] = {}
         self._spots: dict[tuple, np.ndarray] = {}
+        self._hovers: dict[tuple[int, float], Hover] = {}
 
     @functools.cached_property
     def places(self) -> Places:
@@ -95,6 +97,14 @@ class SceneFacts:
         target = self.targets[key]
         lift = target.grasps[0].offset[2] if target.grasps else 0.0
         return bottoms + np.array([0, 0, self.height_m(key) / 2 + lift])
+
+    def hover(self, key: int, above_m: float) -> Hover:
+        """Return how a closed hand fits so far above a movable object's top."""
+        if (key, above_m) not in self._hovers:
+            target = self.targets[key]
+            tip = np.array([*target.center[:2], target.top_m + above_m])
+            self._hovers[key, above_m] = most_room(self.solids, tip, self.traits.hand)
+        return self._hovers[key, above_m]
 
     def spots(self, support: int, subject: int) -> np.ndarray:
         """Return where on a support the subject can stand (k, 3), the roomiest first."""

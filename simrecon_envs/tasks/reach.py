@@ -14,6 +14,7 @@ ABOVE_M = 0.05  # over the object's top
 WITHIN_M = 0.025
 _OVER_M = 0.04  # from where a script comes down
 STILL_RAD_S = 0.3
+_ROOM_M = -0.015  # between the hand and what is below it: it may stop a little higher
 TOUCHED_M = 0.03  # an object that was moved by more was knocked over, not reached
 
 
@@ -26,8 +27,14 @@ class Reach(Task):
 
     @classmethod
     def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
-        """Reaching needs no grip: only that the object is there."""
-        return [] if subject in facts.targets else super().problems(facts, subject, place)
+        """Reaching needs no grip: only room for the hand."""
+        if subject not in facts.targets:
+            return super().problems(facts, subject, place)
+        return (
+            []
+            if facts.hover(subject, ABOVE_M).room_m > _ROOM_M
+            else ["there is no room for the hand over it"]
+        )
 
     @classmethod
     def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
@@ -65,8 +72,10 @@ class Reach(Task):
         }
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
+        hand.close()
+        turned = self.facts.hover(self.subject, ABOVE_M).yaw_rad
         yield from hand.rise(float(numpy(self._goal())[0, 2]) + _OVER_M)
         over = numpy(self._goal())[0] + [0, 0, _OVER_M]
-        yield from hand.go(lambda: over, within_m=0.02, patience=40)
-        yield from hand.go(lambda: numpy(self._goal())[0], within_m=0.008)
+        yield from hand.go(lambda: over, within_m=0.02, yaw=lambda: turned, patience=50)
+        yield from hand.go(lambda: numpy(self._goal())[0], within_m=0.008, yaw=lambda: turned)
         yield from hand.wait(20)

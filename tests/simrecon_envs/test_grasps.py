@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from simrecon_envs.grasps import Grasp, find_grasps
+from simrecon_envs.hovering import most_room
 from simrecon_envs.occupancy import ConvexSolid, convex_solid
 from simrecon_envs.robots import TRAITS
 
@@ -72,3 +73,13 @@ def test_fingers_and_palm_need_room() -> None:
     for grasp in _grasps([box, tall]):
         assert abs(np.cos(grasp.yaw_rad)) < 0.5
     assert _grasps([box, _box(2, (0.3, 0.3, 0.02), (0, 0, 0.10))]) == []  # under a shelf board
+
+
+def test_a_closed_hand_turns_to_where_there_is_room_or_says_how_much_is_missing() -> None:
+    tip = np.array([0.0, 0.0, 0.10])
+    gate = [_box(2, (0.02, 0.4, 0.3), (x, 0, 0)) for x in (-0.06, 0.06)]  # 10 cm wide; the palm is 21 by 6 cm
+    hover = most_room([_box(1, (0.05, 0.05, 0.05), (0, 0, 0)), *gate], tip, HAND)
+    assert hover.yaw_rad == pytest.approx(np.pi / 2)
+    assert hover.room_m == pytest.approx(0.05 - HAND.tip_below_m, abs=1e-6)
+    shut = [*gate, *(_box(3, (0.4, 0.02, 0.3), (0, y, 0)) for y in (-0.06, 0.06))]
+    assert most_room(shut, tip, HAND).room_m == pytest.approx(0.10 + HAND.palm_above_m - 0.3, abs=1e-6)

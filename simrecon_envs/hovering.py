@@ -1,0 +1,46 @@
+"""How a closed hand that points down fits between what stands about: convex parts + hand -> turn, room. NumPy only."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from simrecon_envs.occupancy import ConvexSolid
+from simrecon_envs.robots import HandShape
+from simrecon_envs.surfaces import height_map
+
+_CELL_M = 0.005
+_TURNS = 12
+
+
+@dataclass(frozen=True)
+class Hover:
+    """A hand over a place."""
+
+    yaw_rad: float  # along which its fingers close
+    room_m: float  # how far it is above what is below it; negative where it would be in something
+
+
+def most_room(solids: list[ConvexSolid], tip: np.ndarray, hand: HandShape) -> Hover:
+    """Return how to turn a closed hand whose point between the fingers is at `tip` (3,), world."""
+    edge = float(np.hypot(*hand.palm_half_m)) + _CELL_M
+    window = tip[:2] - edge, tip[:2] + edge
+    near = [s for s in solids if (s.lower[:2] <= window[1]).all() and (s.upper[:2] >= window[0]).all()]
+    heights = height_map(near, *window, _CELL_M)
+    fingers = (hand.finger_m[1], hand.finger_m[0] / 2)  # two of them, side by side
+    boxes = ((fingers, -hand.tip_below_m), (hand.palm_half_m, hand.palm_above_m))
+    found = []
+    for yaw in np.arange(_TURNS) * np.pi / _TURNS:
+        room = min(tip[2] + above - _highest(heights, tip, yaw, half) for half, above in boxes)
+        found.append(Hover(float(yaw), float(room)))
+    return max(found, key=lambda hover: round(hover.room_m, 6))
+
+
+def _highest(heights: object, tip: np.ndarray, yaw: float, half: tuple[float, float]) -> float:
+    c, s = np.cos(yaw), np.sin(yaw)
+    along, across = np.meshgrid(
+        *(np.linspace(-size, size, int(2 * size / _CELL_M) + 2) for size in half), indexing="ij"
+    )
+    points = tip[:2] + np.stack([c * along - s * across, s * along + c * across], axis=-1)
+    cell = np.floor((points - heights.lower) / _CELL_M).astype(int)
+    cell = cell.clip(0, np.array(heights.top.shape) - 1)
+    return float(heights.top[cell[..., 0], cell[..., 1]].max())
