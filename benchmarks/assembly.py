@@ -47,6 +47,7 @@ def measure(
     graph: SceneGraph,
     true_centers: dict[int, np.ndarray],
     methods: Sequence[str] = METHODS,
+    true_from_scene: float = 1.0,
 ) -> dict[str, Any]:
     """Assemble one scene with some methods.
 
@@ -57,6 +58,7 @@ def measure(
         graph: What carries what.
         true_centers: By object, where the middle (3,) of its box truly is, in the scene's world.
         methods: Of `assembly.method`.
+        true_from_scene: True metres a metre of the scene: how far things are off is said in true ones.
     """
     record = {"scene": name, "group": group, "objects": len(assets.objects), "methods": {}}
     record |= {"machine": describe_machine(), **describe_code()}
@@ -64,7 +66,7 @@ def measure(
         wall, cpu = time.perf_counter(), time.process_time()
         scene = assemble(assets, graph, replace(AssemblyConfig(), method=method))
         cost = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
-        figures = record["methods"][method] = cost | _figures(scene, assets, true_centers)
+        figures = record["methods"][method] = cost | _figures(scene, assets, true_centers, true_from_scene)
         print(
             f"{name} {method}: {len(assets.objects)} objects, stable {figures['stable_rate']:.2f}, overlap "
             f"{figures['spawn_penetration_mm']:.1f} mm, floating {figures['floating_rate']:.2f}, "
@@ -74,13 +76,16 @@ def measure(
     return record
 
 
-def _figures(scene: AssembledScene, assets: AssetSet, true_centers: dict[int, np.ndarray]) -> dict[str, Any]:
+def _figures(
+    scene: AssembledScene, assets: AssetSet, true_centers: dict[int, np.ndarray], true_from_scene: float
+) -> dict[str, Any]:
     report = scene.physics_report
     keys = ("stable_rate", "floating_rate", "spawn_penetration_mm", "dynamic_objects", "energy_at_rest_j")
     contacts = report["contacts"]
     objects = {item.id: item for item in assets.objects}
     off = [
-        float(np.linalg.norm(_center(objects[p.id], p.world_from_object) - true_centers[p.id]))
+        true_from_scene
+        * float(np.linalg.norm(_center(objects[p.id], p.world_from_object) - true_centers[p.id]))
         for p in scene.placed
         if p.id in true_centers
     ]
@@ -117,13 +122,16 @@ def measure_capture(capture: Capture, out: Path, methods: Sequence[str] = METHOD
     run = stage_run(capture.source, work_of(out, capture), [])
     run.execute("scene_graph")
     assets, graph = run.results["assets"], run.results["scene_graph"].plain()
-    centers = _true_centers(capture, run, assets) if capture.truth == "scene" else {}
+    centers, scale = _true_centers(capture, run, assets) if capture.truth == "scene" else ({}, 1.0)
     group = "captures with truth" if capture.truth == "scene" else "captures without objects in their truth"
-    return measure(capture.name, group, assets, graph, centers, methods)
+    return measure(capture.name, group, assets, graph, centers, methods, scale)
 
 
-def _true_centers(capture: Capture, run: Any, assets: AssetSet) -> dict[int, np.ndarray]:
-    """Return where the middles of the true things' boxes are in the reconstruction's world, by matched object."""
+def _true_centers(capture: Capture, run: Any, assets: AssetSet) -> tuple[dict[int, np.ndarray], float]:
+    """Return where the middles of the true things' boxes are in the reconstruction's world, by matched object.
+
+    And how many true metres a metre of it is: the evaluation aligns by a similarity, too.
+    """
     from reconstruction.evaluation.alignment import align
     from reconstruction.evaluation.ground_truth import GroundTruth
     from reconstruction.evaluation.matching import box_iou, match
@@ -148,7 +156,7 @@ def _true_centers(capture: Capture, run: Any, assets: AssetSet) -> dict[int, np.
         item = assets.objects[column]
         away = np.linalg.solve(turn, true_boxes[row].mean(axis=0) - estimated[column])
         centers[item.id] = _center(item, item.world_from_object) + away
-    return centers
+    return centers, alignment.scale
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -23,8 +23,8 @@ movable objects together, undamped, 10 s.
 - *supports real*, *attached real*: relations of the scene graph that are contacts at rest. Where the video shows
   nothing that carries a thing, the graph attaches it to a floor or wall, and it is fixed where it was seen.
 - *unknown*: objects of which half or more rests on something that is not their parent in the graph.
-- *off*: median distance from where the object's middle truly is; *moved*: median distance from where it was
-  reconstructed.
+- *off*: median distance from where the object's middle truly is, in true metres after the alignment that
+  [evaluation](evaluation.md) uses; *moved*: median distance from where it was reconstructed.
 - *s an object*: CPU time of the whole method, its report card included."""
 _HEADINGS = {
     "generated rooms": "True shapes and relations, 5 to 40 objects with stacks and things in containers; poses off by "

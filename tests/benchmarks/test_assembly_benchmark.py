@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.assembly import RESULTS, main, measure_room, objects_of
+from benchmarks.assembly import RESULTS, main, measure, measure_room, objects_of
 from benchmarks.assembly_page import write_assembly_page
 from benchmarks.assembly_rooms import SHIFT_M, room_task
 from benchmarks.results import load_results
@@ -54,6 +54,18 @@ def test_assembly_brings_rest_and_the_others_are_measured_alike(record):
     assert methods["in-situ"]["failures"]
     assert max(methods["in-situ"]["moved_m"]) == 0
     assert methods["mcmc"]["spawn_penetration_mm"] < methods["in-situ"]["spawn_penetration_mm"]
+
+
+def test_how_far_things_are_off_is_said_in_true_metres():
+    task = room_task(0, 5)
+    centers = {item.id: item.world_from_object[:3, 3] for item in task.assets.objects}
+
+    def off(scale: float) -> np.ndarray:
+        made = measure("a", "captures with truth", task.assets, task.graph, centers, ["in-situ"], scale)
+        return np.array(made["methods"]["in-situ"]["off_m"])
+
+    assert off(1.0).min() > 0
+    assert off(0.8) == pytest.approx(0.8 * off(1.0))
 
 
 def test_the_page_is_written_from_what_is_kept(record, tmp_path):
