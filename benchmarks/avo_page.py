@@ -125,7 +125,7 @@ def _facts(records: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) ->
         f"- By any difference, however small, four views of `avo` see more than {more} of {len(records)} objects.",
         "- Pose gradient beside central differences, at the input camera nearest to each object: median "
         f"{100 * np.median(errors):.1f} %, {100 * (errors <= 0.03).mean():.0f} % of the objects within 3 %, worst "
-        f"{100 * errors.max():.1f} %, with differences over 0.01 to 0.1 mm and mrad; over 0.3 to 1 mm, in which "
+        f"{100 * errors.max():.1f} %, with differences over 0.1 to 1 µm and µrad; over 0.3 to 1 mm, in which "
         f"Gaussians change their order, median {100 * np.median(wide):.1f} %, worst {100 * wide.max():.0f} %.",
         f"- Cameras of `avo` inside a thing, behind a wall or below the floor: {inside} of "
         f"{sum(entry['views'] for entry in ours)}.",
