@@ -60,11 +60,15 @@ def write_video(
         stream = None
         for number, image in enumerate(images):
             if stream is None:
-                # One thread, so that the same frames always give the same file.
-                settings = {"crf": str(crf), "preset": preset, "threads": "1", "g": str(keyframe_every)}
-                if any(side % 16 for side in image.shape[:2]):
-                    # x264's macroblock tree reads memory that it never wrote below such frames.
-                    settings["x264-params"] = "mbtree=0"
+                # One thread, so that the same frames always give the same file. x264's macroblock tree is off
+                # for the same reason: it reads memory that it never wrote.
+                settings = {
+                    "crf": str(crf),
+                    "preset": preset,
+                    "threads": "1",
+                    "g": str(keyframe_every),
+                    "x264-params": "mbtree=0",
+                }
                 stream = container.add_stream(
                     "libx264", rate=Fraction(fps).limit_denominator(1001), options=settings
                 )
