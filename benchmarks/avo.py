@@ -32,7 +32,11 @@ DEFAULT_PAGE = ROOT / "docs" / "avo_benchmark.md"
 STRATEGY_ORDER = ("avo", "max-visibility", "canonical", "avo-no-depth")
 _HIDDEN_POSES, _FILM_POSES = 20, 40
 _PICTURE_PX = 160
-_STEPS = (1e-7, 3e-7, 1e-6)  # meters and radians, of the differences: over longer steps the objective has jumps
+_STEPS = (
+    1e-7,
+    3e-7,
+    1e-6,
+)  # meters and radians, of the differences: over longer steps the objective has jumps
 _WIDE_STEPS = (3e-4, 6e-4, 1e-3)  # over these, splats change their order
 
 
