@@ -1,7 +1,7 @@
 """Measure environments: import, make, reset, step rate, memory, and which tasks the scripts do.
 
 Usage:
-    python -m benchmarks.envs SCENE... [--registry DIR] [--robot panda] [--task pick] [--tasks] [--seeds 2]
+    python -m benchmarks.envs SCENE... [--registry DIR] [--robot panda] [--task pick] [--each-kind] [--tasks]
 
 CPU time stands beside wall time, because a shared machine stretches only the latter. "Bare" is SAPIEN alone with the
 same scene, robot and drive targets, so that the same happens: setting the targets, 12 time steps, reading the joints.
@@ -23,11 +23,12 @@ import psutil
 
 from benchmarks.command import guarded
 from benchmarks.machine import describe_machine, machine_line
-from registry import SceneRegistry
+from registry import SceneRegistry, UsageError
 
 _IMPORT = "import time, gymnasium; t, c = time.perf_counter(), time.process_time(); import simrecon_envs; " \
     "print(time.perf_counter() - t, time.process_time() - c)"  # fmt: skip
-_STEPS, _ROUNDS, _RESETS = 300, 3, 500
+_STEPS, _ROUNDS, _RESETS = 300, 6, 500
+_MODES = ("pd_joint_delta_pos", "pd_ee_delta_pose")
 
 
 def main() -> int:
@@ -41,6 +42,11 @@ def main() -> int:
     parser.add_argument("--registry", type=Path, default=None, help="the registry's folder")
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--task", default="pick", help="what is stepped")
+    parser.add_argument(
+        "--each-kind",
+        action="store_true",
+        help="step one task of every kind, with joint and with hand control",
+    )
     parser.add_argument(
         "--tasks", action="store_true", help="let the script do every task that is listed, too"
     )
@@ -60,6 +66,8 @@ def _run(arguments: argparse.Namespace) -> int:
     for scene in arguments.scenes:
         out[scene] = measure(scene, arguments.registry, arguments.robot, arguments.task)
         print(f"{scene}: " + ", ".join(f"{key} {value}" for key, value in out[scene].items()))
+        if arguments.each_kind:
+            out[scene]["kinds"] = kinds(scene, arguments.registry, arguments.robot)
         if arguments.tasks:
             out[scene]["tasks"] = tasks(scene, arguments.registry, arguments.robot, arguments.seeds)
             done = sum(sum(runs) for runs in out[scene]["tasks"].values())
@@ -104,12 +112,7 @@ def measure(scene: str, registry: Path | None, robot: str, task: str = "pick") -
     env = made[0]
     env.reset(seed=0)
     out["reset"] = _timed(lambda: env.reset(seed=1), 20)
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(_STEPS)]
-    targets = _targets(env, actions)
-    rounds = [(_steps(env, actions), _bare_steps(env, targets)) for _ in range(_ROUNDS)]
-    ours, bare = (min(pair[k] for pair in rounds) for k in range(2))
-    out |= {"steps_per_cpu_s": round(_STEPS / ours), "share_of_bare": round(bare / ours, 3)}
+    out |= _rate(env)
     process = psutil.Process()
     for number in range(50):
         env.reset(seed=number)
@@ -119,6 +122,43 @@ def measure(scene: str, registry: Path | None, robot: str, task: str = "pick") -
     out["growth_mb_500_resets"] = round((process.memory_info().rss - before) / 2**20, 2)
     env.close()
     return out
+
+
+def kinds(scene: str, registry: Path | None, robot: str) -> dict[str, dict]:
+    """Return the step rates of the easiest task of every kind that the scene has, by control mode."""
+    import simrecon_envs
+    from simrecon_envs.tasks import KINDS
+
+    print(f"  steps a CPU second, and share of bare: {'joints':>18} {'hand':>14}")
+    out = {}
+    for kind in ("none", *KINDS):
+        out[kind] = {}
+        for mode in _MODES:
+            try:
+                env = simrecon_envs.make(
+                    scene, registry=registry, task=kind, robot_uids=robot, control_mode=mode,
+                    max_episode_steps=10**9,
+                )  # fmt: skip
+            except UsageError as error:
+                print(f"  {kind}: {error}")
+                break
+            out[kind][mode] = {"task": env.unwrapped.task, **_rate(env)}
+            env.close()
+        else:
+            rates = [f"{one['steps_per_cpu_s']:6} {one['share_of_bare']:.3f}" for one in out[kind].values()]
+            print(f"  {env.unwrapped.task:44} {'   '.join(rates)}", flush=True)
+    return out
+
+
+def _rate(env: object) -> dict[str, float]:
+    """Return how fast an environment steps; rounds of it and of SAPIEN alone take turns, the best of each counts."""
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(_STEPS)]
+    targets = _targets(env, actions)
+    rounds = [(_steps(env, actions), _bare_steps(env, targets)) for _ in range(_ROUNDS)]
+    ours, bare = (min(pair[k] for pair in rounds) for k in range(2))
+    return {"steps_per_cpu_s": round(_STEPS / ours), "share_of_bare": round(bare / ours, 3)}
 
 
 def tasks(scene: str, registry: Path | None, robot: str, seeds: int) -> dict[str, list[bool]]:

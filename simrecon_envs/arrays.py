@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 Array = np.ndarray | np.generic | torch.Tensor
+_NUMBERS = frozenset({np.float32, np.bool_, np.int64})
 
 
 def tensor(x: Array) -> torch.Tensor:
@@ -22,6 +23,12 @@ def tensor(x: Array) -> torch.Tensor:
         x = np.array([x])
         return torch.from_numpy(x if x.dtype != np.float64 else x.astype(np.float32))
     return torch.from_numpy(x.astype(np.float32) if x.dtype == np.float64 else x.copy())
+
+
+def tensors(named: dict[str, Array]) -> dict[str, torch.Tensor]:
+    """Return arrays as tensors, as `tensor` does."""
+    array, wrap = np.array, torch.from_numpy
+    return {key: wrap(array([x])) if type(x) in _NUMBERS else tensor(x) for key, x in named.items()}
 
 
 def numpy(x: Array) -> np.ndarray:
@@ -38,6 +45,11 @@ def norm(x: Array) -> Array:
     return np.sqrt((x * x).sum(-1))
 
 
+def surely_not(x: Array) -> bool:
+    """Return whether a condition (b,) is known to hold nowhere, without asking a GPU: of one environment on the CPU."""
+    return isinstance(x, np.bool_) and not x
+
+
 def real(x: Array) -> Array:
     """Return an array of bool or integers as float32."""
     if isinstance(x, np.generic):
@@ -47,6 +59,8 @@ def real(x: Array) -> Array:
 
 def whole(x: Array) -> Array:
     """Return an array as integers."""
+    if isinstance(x, np.generic):
+        return np.int64(x)
     return x.long() if isinstance(x, torch.Tensor) else x.astype(np.int64)
 
 
@@ -120,6 +134,13 @@ def largest(x: Array) -> Array:
 def smallest(x: Array) -> Array:
     """Return the smallest of the last axis."""
     return x.min(-1) if isinstance(x, np.ndarray) else x.amin(dim=-1)
+
+
+def larger(x: Array, y: Array) -> Array:
+    """Return the larger one of every two values."""
+    if isinstance(x, np.generic) and isinstance(y, np.generic):
+        return x if x >= y else y
+    return torch.maximum(x, y) if isinstance(x, torch.Tensor) else np.maximum(x, y)
 
 
 def pick(x: Array, index: Array) -> Array:

@@ -38,21 +38,45 @@ class DirectReads:
         self._bodies = [actor._bodies[0] for actor in actors]
         self._centers = [sapien.Pose(center) for center in centers]
         self._links = set() if env.agent is None else {id(link._objs[0]) for link in env.agent.robot.links}
+        self.poses = np.zeros((1, len(actors), 7), np.float32)
+        """The actors' poses: position (m), quaternion wxyz; world; as of the last `refresh`."""
+        self._tip = env.agent.tcp._objs[0].entity if hasattr(env.agent, "tcp") else None
+        self.tcp = np.zeros((1, 7), np.float32)
+        """The pose of the point between the fingers, as of the last `refresh`."""
+        self._size, self._places = 0, np.zeros((0, 7), np.int64)
         self._touching: dict[int, list] = {}
+        self._all_contacts: list | None = None
+        self._boxes: dict[int, list] = {}
         self._fingers, self._opening = None, ()
         for known, opening in ((Panda, (1, -1)), (Fetch, (-1, 1))):
             if env.agent is not None and type(env.agent).is_grasping is known.is_grasping:
                 self._fingers = [env.agent.finger1_link._objs[0], env.agent.finger2_link._objs[0]]
                 self._opening = opening
 
-    def refresh(self) -> None:
-        """Forget the contacts: the simulator has moved on."""
-        self._touching = {}
+    def find(self) -> None:
+        """Look where the bodies are among the scene's entities: an environment that starts anew has others."""
+        entities = list(self._env.scene.sub_scenes[0].entities)
+        number = {id(entity): k for k, entity in enumerate(entities)}
+        wanted = [*self._entities, *([] if self._tip is None else [self._tip])]
+        # SAPIEN packs quaternion and position of every entity in their order.
+        starts = np.array([7 * number[id(entity)] for entity in wanted], np.int64).reshape(-1, 1)
+        self._places = starts + np.array([4, 5, 6, 0, 1, 2, 3])
+        self._size = 28 * len(entities)
 
-    def poses(self) -> np.ndarray:
-        """Return the actors' poses (1, n, 7): position (m), quaternion wxyz; world."""
-        rows = [entity.pose.__getstate__() for entity in self._entities]
-        return np.array(rows, np.float32).reshape(1, len(rows), 7)
+    def refresh(self) -> list[int]:
+        """Read the poses and forget the contacts: the simulator has moved on. Return the rows of what moved."""
+        self._touching, self._all_contacts, self._boxes = {}, None, {}
+        packed = self._env.scene.sub_scenes[0].pack_poses()
+        if len(packed) != self._size:
+            self.find()
+        rows = np.frombuffer(packed, np.float32).take(self._places)
+        self.tcp = rows[-1:]  # of a robot without a hand nobody asks it
+        count = len(self._entities)
+        poses, before = rows[:count], self.poses[0]
+        if poses.tobytes() == before.tobytes():
+            return []
+        self.poses = poses[None]
+        return np.flatnonzero((poses != before).any(1)).tolist()
 
     def pose(self, row: int) -> np.ndarray:
         """Return the pose (1, 7) of a thing's box centre, with the orientation of its actor."""
@@ -95,12 +119,16 @@ class DirectReads:
         """Return whether the box around the thing meets those around both fingers: asking for contacts is slow."""
         return all(self._meet(self._bodies[row], finger) for finger in self._fingers)
 
-    @staticmethod
-    def _meet(one: Any, other: Any) -> bool:
+    def _meet(self, one: Any, other: Any) -> bool:
         """Return whether the boxes around two bodies meet."""
-        low, high = one.get_global_aabb_fast().tolist()
-        least, most = other.get_global_aabb_fast().tolist()
+        (low, high), (least, most) = self._box(one), self._box(other)
         return all(least[k] <= high[k] + _MARGIN_M and most[k] >= low[k] - _MARGIN_M for k in (0, 1, 2))
+
+    def _box(self, body: Any) -> list[list[float]]:
+        """Return the least and the largest corner of the box around a body."""
+        if id(body) not in self._boxes:
+            self._boxes[id(body)] = body.get_global_aabb_fast().tolist()
+        return self._boxes[id(body)]
 
     def _pressed(self, row: int) -> bool:
         """Return what `is_grasping` of the Panda and Fetch does: both fingers press on it, from where they close."""
@@ -116,10 +144,10 @@ class DirectReads:
         return True
 
     def force(self, row: int, others: list) -> np.ndarray:
-        """Return the force (1, 3) (N) of other actors on a thing."""
+        """Return the force (3,) (N) of other actors on a thing."""
         bodies = [other._bodies[0] for other in others]
         near = {id(body) for body in bodies if self._meet(self._bodies[row], body)}
-        return self._force(row, near)[None] if near else np.zeros((1, 3), np.float32)
+        return self._force(row, near) if near else np.zeros(3, np.float32)
 
     def _force(self, row: int, wanted: set[int]) -> np.ndarray:
         """Return the force (3,) (N) on a thing of the bodies with these ids."""
@@ -135,13 +163,13 @@ class DirectReads:
         SAPIEN gives one and the same object for a body as long as somebody holds it, as ManiSkill's structs do.
         """
         if row not in self._touching:
+            if self._all_contacts is None:
+                self._all_contacts = self._env.scene.px.get_contacts()
             self._touching[row], mine = [], self._bodies[row]
-            for contact in self._env.scene.px.get_contacts():
+            # There may be a hundred, of all pairs of shapes: most are only asked whether they are this thing's.
+            for contact in [each for each in self._all_contacts if mine in each.bodies]:
                 first, second = contact.bodies
-                if first is mine:
-                    self._touching[row].append((contact, second, 1))
-                elif second is mine:
-                    self._touching[row].append((contact, first, -1))
+                self._touching[row].append((contact, second, 1) if first is mine else (contact, first, -1))
         return self._touching[row]
 
 
@@ -151,6 +179,7 @@ class DirectDrive:
     def __init__(self, agent: BaseAgent) -> None:
         """Look at the controllers that the agent has now."""
         self.controller = agent.controller
+        self._robot = agent.robot._objs[0]
         self.foreign: list[tuple[slice, BaseController]] = []
         """Those that ManiSkill drives itself, with their share of the action."""
         self._tips: list[tuple[slice, _Tip]] = []
@@ -182,10 +211,11 @@ class DirectDrive:
         if self._joints is None and not self._tips:
             self.controller.set_action(action)
             return
+        qpos = self._robot.qpos
         if self._joints is not None:
-            self._joints.drive(numbers)
+            self._joints.drive(qpos, numbers)
         for share, tip in self._tips:
-            tip.drive(numbers[share])
+            tip.drive(qpos, numbers[share])
         for share, child in self.foreign:
             child.set_action(action[:, share])
 
@@ -201,7 +231,6 @@ class _Joints:
 
     def __init__(self, parts: list[tuple[slice, PDJointPosController]]) -> None:
         controllers = [controller for _, controller in parts]
-        self._robot = controllers[0].articulation._objs[0]
         self._targets = _Targets(controllers)
         # Of every joint: which it is, whose angle and which number of the action its target comes from, and how:
         # target = (angle * delta + middle + half * action) * factor + offset, the last two where joints are mimicked.
@@ -210,20 +239,21 @@ class _Joints:
         self._low, self._high, self._delta, self._middle, self._half, self._factor, self._offset = (
             row.astype(np.float32) for row in rows[3:]
         )
+        self._changes = bool(self._delta.any())
         self._mimics = bool((self._factor != 1).any() or self._offset.any())
 
-    def drive(self, action: np.ndarray) -> None:
-        """Set the joints' targets from the whole action (k,)."""
-        qpos = self._robot.qpos
-        target = action[self._number]
+    def drive(self, qpos: np.ndarray, action: np.ndarray) -> None:
+        """Set the targets of joints of a robot at `qpos` (d,) from the whole action (k,)."""
+        target = action.take(self._number)
         np.maximum(target, self._low, out=target)
         np.minimum(target, self._high, out=target)
         target *= self._half
         target += self._middle
-        target += qpos[self._source] * self._delta
+        if self._changes:
+            target += qpos.take(self._source) * self._delta
         if self._mimics:
             target = target * self._factor + self._offset
-        self._targets.set(qpos[self._indices], target)
+        self._targets.set(qpos.take(self._indices), target)
 
 
 def _columns(share: slice, controller: PDJointPosController) -> list[np.ndarray]:
@@ -269,34 +299,37 @@ class _Tip:
 
     def __init__(self, controller: PDEEPosController) -> None:
         self._controller = controller
-        self._robot = controller.articulation._objs[0]
         self._targets = _Targets([controller])
         self._indices = controller.active_joint_indices.numpy()
         self._root, self._tip = controller.root_link._objs[0], controller.ee_link._objs[0]
         low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
-        self._scale = 0.5 * (high + low), 0.5 * (high - low)
+        self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
+        self._least, self._most = -np.ones(3, np.float32), np.ones(3, np.float32)
         self._turn = controller.config.rot_lower if type(controller) is PDEEPoseController else None
         kinematics = controller.kinematics
         self._known = kinematics.pmodel_active_joint_indices.numpy()
         self._solved = kinematics.pmodel_controlled_joint_indices.numpy()
         self._mask = kinematics.qmask.numpy()
 
-    def drive(self, action: np.ndarray) -> None:
-        """Set the joints' targets to where the hand is moved and turned by an action (3,) or (6,)."""
-        here = self._root.entity_pose.inv() * self._tip.entity_pose
-        move = self._scale[0] + self._scale[1] * np.minimum(np.maximum(action[:3], -1), 1)
-        quat = here.q
+    def drive(self, qpos: np.ndarray, action: np.ndarray) -> None:
+        """Set the targets of a robot at `qpos` (d,) to where the hand is moved and turned by an action (3,) or (6,)."""
+        goal = self._root.entity_pose.inv() * self._tip.entity_pose
+        place = np.maximum(action[:3], self._least)
+        np.minimum(place, self._most, out=place)
+        place *= self._half
+        place += self._middle
+        place += goal.p
         if self._turn is not None:
-            angles = action[3:].tolist()
-            scale = self._turn / max(math.hypot(*angles), 1.0)
-            quat = (sapien.Pose(q=_turned(*(scale * angle / 2 for angle in angles))) * sapien.Pose(q=quat)).q
-        qpos, goal = self._robot.qpos, sapien.Pose(here.p + move, quat)
-        known = qpos[self._known]
+            x, y, z = action[3:].tolist()
+            scale = self._turn / max(math.hypot(x, y, z), 1.0)
+            goal = sapien.Pose(q=_turned(scale * x / 2, scale * y / 2, scale * z / 2)) * goal
+        goal.p = place
+        known = qpos.take(self._known)
         solution, found, _ = self._solve(known, goal, eps=_POSE_TOLERANCE, dt=_BOLD, max_iterations=30)
         if not found:
             solution, found, _ = self._solve(known, goal, max_iterations=100)
-        start = qpos[self._indices]
-        target = solution[self._solved].astype(np.float32) if found else start
+        start = qpos.take(self._indices)
+        target = solution.take(self._solved).astype(np.float32) if found else start
         self._targets.set(start, target)
 
     def _solve(self, qpos: np.ndarray, goal: sapien.Pose, **options: float) -> tuple[np.ndarray, bool, Any]:

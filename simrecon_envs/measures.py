@@ -47,10 +47,13 @@ class Measures:
             self._nominal_n[placed.id] = item.mass_kg * _GRAVITY_M_S2
         self._direct = DirectReads(env, self._actors, centers) if direct else None
         for key, weight in self._nominal_n.items():
-            self._weight_n[key] = self.array(np.full(env.num_envs, weight))
+            self._weight_n[key] = self.array(np.full((env.num_envs, 1), weight))
         self._centers = self.array(centers)[None]
         self._supported: dict[tuple[int, int], Array] = {}
         self._cache: dict[Any, Array] = {}
+        self._placed: dict[Any, tuple[int, Any]] = {}
+        self._keys = list(self._row)
+        self._moves = dict.fromkeys(self._row, 0)  # how often each thing was found elsewhere
         self._axes: dict[tuple[int, int], np.ndarray] = {}
 
     def array(self, numbers: np.ndarray) -> Array:
@@ -62,24 +65,35 @@ class Measures:
     def refresh(self) -> None:
         """Forget what was read: the simulator has moved on."""
         self._cache = {}
-        if self._direct is not None:
-            self._direct.refresh()
+        moved = range(len(self._actors)) if self._direct is None else self._direct.refresh()
+        for row in moved:
+            self._moves[self._keys[row]] += 1
 
-    def once(self, name: Hashable, compute: Callable[[], Array]) -> Array:
-        """Return what `compute` does, computed once until the simulator moves on."""
-        if name not in self._cache:
-            self._cache[name] = compute()
-        return self._cache[name]
+    def while_still(self, name: Hashable, keys: tuple[int, ...], compute: Callable[[], Any]) -> Any:
+        """Return what `compute` makes of where things are, computed once until one of them moves.
+
+        Most things stand still most of the time. What else `compute` depends on must not change in an episode.
+        """
+        moves = self._moves
+        stamp = sum([moves[key] for key in keys])
+        known = self._placed.get(name)
+        if known is None or known[0] != stamp:
+            known = self._placed[name] = stamp, compute()
+        return known[1]
 
     def forget(self, env_idx: torch.Tensor) -> None:
-        """Forget what carried what in the environments that start anew."""
+        """Forget what carried what in the environments that start anew, and all that was computed."""
+        if self._direct is not None:
+            self._direct.find()
+            self._supported = {}
         self.refresh()
+        self._placed = {}
         for known in self._supported.values():
             known[env_idx] = False
 
     def scale_weight(self, key: int, env_idx: torch.Tensor, factor: torch.Tensor) -> None:
         """Say that a thing is heavier by a factor (len(env_idx),) than the bundle says."""
-        self._weight_n[key][env_idx] = self._nominal_n[key] * factor
+        self._weight_n[key][env_idx, 0] = self._nominal_n[key] * factor
 
     # ---- Things.
 
@@ -88,7 +102,7 @@ class Measures:
         """Return the actors' poses (b, n, 7): position, quaternion wxyz; world."""
         if "poses" not in self._cache:
             if self._direct is not None:
-                self._cache["poses"] = self._direct.poses()
+                self._cache["poses"] = self._direct.poses
             else:
                 self._cache["poses"] = torch.stack([a.pose.raw_pose for a in self._actors], dim=1)
         return self._cache["poses"]
@@ -99,28 +113,26 @@ class Measures:
 
     def pose(self, key: int) -> Array:
         """Return the pose (b, 7) of a thing's box centre, with the orientation of its actor."""
-        name = ("pose", key)
-        if name not in self._cache:
-            row = self._row[key]
-            if self._direct is not None:
-                self._cache[name] = self._direct.pose(row)
-            else:
-                pose = self.poses[:, row]
-                center = pose[:, :3] + rotate(pose[:, 3:], self._centers[:, row])
-                self._cache[name] = torch.cat([center, pose[:, 3:]], dim=1)
-        return self._cache[name]
+        return self.while_still(("pose", key), (key,), lambda: self._pose(self._row[key]))
+
+    def _pose(self, row: int) -> Array:
+        if self._direct is not None:
+            return self._direct.pose(row)
+        pose = self.poses[:, row]
+        center = pose[:, :3] + rotate(pose[:, 3:], self._centers[:, row])
+        return torch.cat([center, pose[:, 3:]], dim=1)
 
     def up(self, key: int) -> Array:
         """Return by which cosine (b,) a thing's upright axis still points up, as in the bundle."""
-        return component(self._turned(key, 2), 2)
+        return self.while_still(("up", key), (key,), lambda: component(self._turned(key, 2), 2))
 
     def yaw(self, key: int) -> Array:
         """Return by which angle (b,) a thing is turned about +z from how it was captured."""
-        name = ("yaw", key)
-        if name not in self._cache:
-            side = self._turned(key, 0)
-            self._cache[name] = atan2(component(side, 1), component(side, 0))
-        return self._cache[name]
+        return self.while_still(("yaw", key), (key,), lambda: self._yaw(key))
+
+    def _yaw(self, key: int) -> Array:
+        side = self._turned(key, 0)
+        return atan2(component(side, 1), component(side, 0))
 
     def speeds(self, key: int) -> tuple[Array, Array]:
         """Return the linear (m/s) and angular (rad/s) speed (b,) of a thing."""
@@ -143,6 +155,8 @@ class Measures:
     @property
     def tcp(self) -> Array:
         """Return the pose (b, 7) of the point between the fingers."""
+        if self._direct is not None:
+            return self._direct.tcp
         if "tcp" not in self._cache:
             self._cache["tcp"] = self.link_pose(self._env.agent.tcp)
         return self._cache["tcp"]
@@ -198,10 +212,9 @@ class Measures:
         if name not in self._cache:
             linear, angular = self.speeds(key)
             asleep = (linear == 0) & (angular == 0)
-            known = self._supported.get((key, support))
-            known = self.array(np.zeros(self._env.num_envs)) > 0 if known is None else known
+            known = self._supported.get((key, support), asleep & ~asleep)
             if not bool(asleep.all()):
-                enough = self._force_on(key, support)[:, 2] >= 0.25 * self._weight_n[key]
+                enough = self._force_on(key, support) >= 0.25 * component(self._weight_n[key], 0)
                 known = asleep & known | ~asleep & enough
             self._supported[key, support] = known
             self._cache[name] = known
@@ -218,14 +231,15 @@ class Measures:
         return rest & self.supported(key, support)
 
     def _force_on(self, key: int, support: int) -> Array:
+        """Return with which force (b,) (N) a support pushes a thing up."""
         others = self._env.builder.carrying_actors(support)
         if self._direct is not None:
-            return self._direct.force(self._row[key], others)
+            return self._direct.force(self._row[key], others)[2]
         scene, actor = self._env.scene, self._actors[self._row[key]]
         total = torch.zeros((self._env.num_envs, 3), device=self._env.device)
         for other in others:
             total = total + scene.get_pairwise_contact_forces(actor, other)
-        return total
+        return total[:, 2]
 
     def _turned(self, key: int, axis: int) -> Array:
         """Return where (b, 3) what was the world's x or z (axis 0 or 2) when a thing was captured points now."""

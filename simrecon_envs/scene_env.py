@@ -17,7 +17,7 @@ from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from registry import BundleError, SceneBundle, SceneNotFound, SceneRegistry, UsageError, default_registry_root
-from simrecon_envs.arrays import Array, tensor
+from simrecon_envs.arrays import Array, tensor, tensors
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
 from simrecon_envs.errors import SceneAssetsMissing
@@ -256,7 +256,7 @@ class SceneEnv(BaseEnv):
         Raises:
             UsageError: the action has another shape than the action space, or is not finite.
         """
-        numbers = isinstance(action, np.ndarray | torch.Tensor)
+        numbers = isinstance(action, (np.ndarray, torch.Tensor))
         if self.gpu_sim_enabled:
             if numbers:
                 check_action(self, action)
@@ -297,11 +297,21 @@ class SceneEnv(BaseEnv):
         """Return where the target's box centre is (num_envs, 3), world, metres."""
         return tensor(self.measures.position(self.target_id))
 
+    def get_info(self) -> dict:
+        """Return how many steps were taken and what `evaluate` says."""
+        if self._stepper is None:
+            return super().get_info()
+        return {"elapsed_steps": self._elapsed_steps, **self.evaluate()}
+
+    def steps_done(self) -> int:
+        """Return how many steps the episode of the first environment has had."""
+        return int(self._elapsed_steps[0]) if self._stepper is None else self._stepper.steps
+
     def evaluate(self) -> dict:
         """Return whether the task is done, and what that depends on."""
         self.measures.refresh()
         self._info = self.task_object.evaluate() if self.task_object is not None else {}
-        return {key: tensor(value) for key, value in self._info.items()}
+        return tensors(self._info)
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (num_envs,) between 0 and the task's `max_reward`; 0 without a task."""
@@ -365,7 +375,7 @@ class SceneEnv(BaseEnv):
         return out
 
     def _get_obs_extra(self, info: dict) -> dict:
-        return {key: tensor(value) for key, value in self.known().items()}
+        return tensors(self.known())
 
 
 def _load(scene_id: str, revision: str | None, registry: str | None, strict: bool) -> tuple[SceneBundle, str]:

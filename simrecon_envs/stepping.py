@@ -52,6 +52,11 @@ class DirectStep:
             and self._elapsed is env._elapsed_steps
         )
 
+    @property
+    def steps(self) -> int:
+        """Return how many steps the episode has had."""
+        return self._count.item()
+
     def simulate(self, action: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Simulate one control step with an action (k,) or (1, k); return it as (1, k), valid until the next step.
 
@@ -88,7 +93,7 @@ class DirectStep:
         obs = env.get_obs(info, unflattened=True) if flat is None else flat
         reward = env.get_reward(obs=obs, action=action, info=info)
         env._last_obs = obs = env._flatten_raw_obs(obs) if flat is None else flat
-        ended = any([bool(env._info[reason]) for reason in ("success", "fail") if reason in env._info])
+        ended = bool(env._info.get("success", False)) or bool(env._info.get("fail", False))
         return obs, reward, torch.from_numpy(np.array([ended])), torch.from_numpy(np.array([False])), info
 
     def _observe(self) -> torch.Tensor | None:

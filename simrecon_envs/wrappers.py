@@ -41,11 +41,10 @@ class BatchedTimeLimit(gym.Wrapper, RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
         """Step; `truncated` (num_envs,) is set where the limit is reached."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        if self._max_episode_steps is not None:
-            steps = self._base.elapsed_steps
-            # Of one environment no tensor is made unless it must: that takes longer than the rest of it.
-            if self._base.num_envs > 1 or steps.item() >= self._max_episode_steps:
-                truncated = truncated | (steps >= self._max_episode_steps)
+        limit, base = self._max_episode_steps, self._base
+        # Of one environment no tensor is made unless it must: that takes longer than the rest of it.
+        if limit is not None and (base.num_envs > 1 or base.steps_done() >= limit):
+            truncated = truncated | (base.elapsed_steps >= limit)
         return obs, reward, terminated, truncated, info
 
 

@@ -1,6 +1,6 @@
 """What a kind of task is. A kind is one class in one module; `simrecon_envs.tasks.KINDS` lists them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -51,6 +51,7 @@ class Task:
         """Plan for a robot at a place; nothing is built yet, so only the scene's facts may be read."""
         self.env, self.spec, self.placement = env, spec, placement
         self.facts: SceneFacts = env.facts
+        self._concerned = tuple(key for key in (spec.subject, spec.place) if key in self.facts.targets)
 
     @property
     def subject(self) -> int:
@@ -86,6 +87,13 @@ class Task:
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:
         """Yield actions that do the task, one a control step."""
         raise NotImplementedError
+
+    def _while_still(self, name: str, compute: Callable[[], Any]) -> Any:
+        """Return what `compute` makes of where subject and place are, computed once until one of them moves.
+
+        What else it depends on must be settled in `start`.
+        """
+        return self.env.measures.while_still((id(self), name), self._concerned, compute)
 
     def _zeros(self, width: int) -> Array:
         return self.env.measures.array(np.zeros((self.env.num_envs, width)))

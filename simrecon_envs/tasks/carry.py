@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from simrecon_envs.arrays import Array, column, norm, numpy, real, where
+from simrecon_envs.arrays import Array, column, norm, numpy, real, surely_not, where
 from simrecon_envs.tasks.base import Info, Task, draw, nearness, subject_problems
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
@@ -72,7 +72,6 @@ class Carry(Task):
 
     def evaluate(self) -> Info:
         measures = self.env.measures
-        position = measures.position(self.subject)
         held = measures.held(self.subject)
         rest = measures.at_rest(self.subject)
         there = self._arrived()
@@ -82,21 +81,31 @@ class Carry(Task):
             "is_grasped": held,
             "is_at_rest": rest,
             "tcp_to_target_m": measures.tcp_distance(self.subject),
-            "target_to_goal_m": norm(position - self.live_goal()),
+            "target_to_goal_m": self._while_still("away", self._to_goal_m),
         }
 
     def reward(self, info: Info) -> Array:
-        measures = self.env.measures
-        position, goal = measures.position(self.subject), self.live_goal()
-        aside = norm(position[:, :2] - goal[:, :2])
-        # First over it, then down to it: a straight line leads through what stands in between.
-        height = goal[:, 2] + where(aside > _NEAR_GOAL_M, OVER_THINGS_M, ABOVE_GOAL_M / 2)
-        way = aside + abs(position[:, 2] - height)
         held = real(info["is_grasped"])
-        reward = nearness(info["tcp_to_target_m"]) * (1 - held) + held * (2 + 2 * nearness(way))
+        reward = nearness(info["tcp_to_target_m"]) * (1 - held)
+        if not surely_not(info["is_grasped"]):
+            reward = reward + held * (2 + 2 * nearness(self._way()))
         near = (info["target_to_goal_m"] <= _NEAR_GOAL_M) | info["is_there"]
-        reward = where(near, 4.0 + (1 - held) * (0.5 + 0.5 * real(info["is_at_rest"])), reward)
+        if not surely_not(near):
+            reward = where(near, 4.0 + (1 - held) * (0.5 + 0.5 * real(info["is_at_rest"])), reward)
         return where(info["success"], self.max_reward, reward)
+
+    def _way(self) -> Array:
+        """Return how far (b,) the object has to be carried: first over the goal, then down to it.
+
+        A straight line leads through what stands in between.
+        """
+        position, goal = self.env.measures.position(self.subject), self.live_goal()
+        aside = norm(position[:, :2] - goal[:, :2])
+        height = goal[:, 2] + where(aside > _NEAR_GOAL_M, OVER_THINGS_M, ABOVE_GOAL_M / 2)
+        return aside + abs(position[:, 2] - height)
+
+    def _to_goal_m(self) -> Array:
+        return norm(self.env.measures.position(self.subject) - self.live_goal())
 
     def observe(self, info: Info) -> dict[str, Array]:
         measures = self.env.measures
@@ -106,7 +115,7 @@ class Carry(Task):
             "target_pose": pose,
             "tcp_to_target": pose[:, :3] - measures.tcp[:, :3],
             "goal_position": goal,
-            "target_to_goal": goal - pose[:, :3],
+            "target_to_goal": self._while_still("way", lambda: goal - pose[:, :3]),
         }
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821

@@ -47,7 +47,7 @@ class Pick(Task):
 
     def evaluate(self) -> Info:
         measures, config = self.env.measures, self.config
-        lift = component(measures.position(self.subject), 2) - component(self._home, 2)
+        lift = self._while_still("lift", self._lift_m)
         held = measures.held(self.subject)
         lifted = lift >= config.lift_m
         speed = measures.speeds(self.subject)[0]
@@ -60,6 +60,9 @@ class Pick(Task):
             "lift_m": lift,
             "tcp_to_target_m": measures.tcp_distance(self.subject),
         }
+
+    def _lift_m(self) -> Array:
+        return component(self.env.measures.position(self.subject), 2) - component(self._home, 2)
 
     def reward(self, info: Info) -> Array:
         held = real(info["is_grasped"])

@@ -73,6 +73,7 @@ class Push(Task):
 
     def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
         super().__init__(env, spec, placement)
+        self._support = self.facts.parent[spec.subject]
         goals = self._goals(self.facts, spec.subject)
         traits = self.facts.traits
         mask = placement.reaches(goals, traits)
@@ -101,13 +102,10 @@ class Push(Task):
         self.goal[env_idx] = goal
 
     def evaluate(self) -> Info:
-        measures, support = self.env.measures, self.facts.parent[self.subject]
-        position = measures.position(self.subject)
-        away = norm((position - self.goal)[:, :2])
-        upright = measures.up(self.subject) >= _UPRIGHT
-        carried = measures.rests_on(self.subject, support)
+        measures = self.env.measures
+        away, near, upright = self._while_still("place", self._place)
+        carried = measures.rests_on(self.subject, self._support)
         rest, held = measures.at_rest(self.subject), measures.held(self.subject)
-        near = away <= WITHIN_M
         return {
             "success": near & upright & carried & ~held,
             "is_near": near,
@@ -118,13 +116,21 @@ class Push(Task):
             "tcp_to_target_m": measures.tcp_distance(self.subject),
         }
 
+    def _place(self) -> tuple[Array, Array, Array]:
+        measures = self.env.measures
+        away = norm((measures.position(self.subject) - self.goal)[:, :2])
+        return away, away <= WITHIN_M, measures.up(self.subject) >= _UPRIGHT
+
     def reward(self, info: Info) -> Array:
-        start = clamp(norm((self._home - self.goal)[:, :2]), 1e-3)
-        progress = clamp(1 - info["target_to_goal_m"] / start, -1.0, 1.0)
         upright = real(info["is_upright"])
+        progress = self._while_still("progress", lambda: self._progress(info))
         reward = clamp(0.5 * nearness(info["tcp_to_target_m"]) + 2.0 * progress * upright, 0.0)
         reward = reward + real(info["is_near"] & info["is_upright"])
         return where(info["success"], self.max_reward, reward)
+
+    def _progress(self, info: Info) -> Array:
+        start = clamp(norm((self._home - self.goal)[:, :2]), 1e-3)
+        return clamp(1 - info["target_to_goal_m"] / start, -1.0, 1.0)
 
     def observe(self, info: Info) -> dict[str, Array]:
         measures = self.env.measures
@@ -133,7 +139,7 @@ class Push(Task):
             "target_pose": pose,
             "tcp_to_target": pose[:, :3] - measures.tcp[:, :3],
             "goal_position": self.goal,
-            "target_to_goal": self.goal - pose[:, :3],
+            "target_to_goal": self._while_still("way", lambda: self.goal - pose[:, :3]),
         }
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821

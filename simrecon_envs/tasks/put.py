@@ -72,7 +72,7 @@ class Put(Carry):
 
     def live_goal(self) -> Array:
         """Return the goal inside the container, where that is now."""
-        return self.env.measures.once(("live_goal", id(self)), lambda: self._from_captured(self.goal))
+        return self._while_still("live_goal", lambda: self._from_captured(self.goal))
 
     def _within_walls(self, local: Array) -> Array:
         """Return whether points (b, 3), where the container was captured, are over its inside."""
@@ -83,6 +83,9 @@ class Put(Carry):
         return smallest(largest(abs(local[:, None, :2] - self._cells[None]))) <= _CELL_REACH_M
 
     def _arrived(self) -> Info:
+        return self._while_still("arrived", self._inside)
+
+    def _inside(self) -> Info:
         inside = self.facts.container(self.spec.place)
         local = self._from_captured(self.env.measures.position(self.subject), back=True)
         within = self._within_walls(local)

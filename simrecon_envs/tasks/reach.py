@@ -47,14 +47,16 @@ class Reach(Task):
         self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
 
     def _goal(self) -> Array:
-        return self.env.measures.position(self.subject) + self._lift
+        return self._while_still("goal", lambda: self.env.measures.position(self.subject) + self._lift)
+
+    def _unmoved(self) -> Array:
+        return norm(self.env.measures.position(self.subject) - self._home) <= TOUCHED_M
 
     def evaluate(self) -> Info:
         measures = self.env.measures
         distance = norm(self._goal() - measures.tcp[:, :3])
-        moved = norm(measures.position(self.subject) - self._home)
         still = measures.joint_speed <= STILL_RAD_S
-        near, unmoved = distance <= WITHIN_M, moved <= TOUCHED_M
+        near, unmoved = distance <= WITHIN_M, self._while_still("unmoved", self._unmoved)
         return {"success": near & still & unmoved, "is_near": near, "is_still": still, "is_unmoved": unmoved,
                 "tcp_to_goal_m": distance}  # fmt: skip
 

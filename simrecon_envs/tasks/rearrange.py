@@ -1,11 +1,13 @@
 """Rearrange: things were moved about on their support; bring them back to where the video shows them."""
 
+import functools
+import operator
 from collections.abc import Iterator
 
 import numpy as np
 import torch
 
-from simrecon_envs.arrays import Array, largest, norm, real, stack, where
+from simrecon_envs.arrays import Array, larger, norm, real, where, whole
 from simrecon_envs.tasks.base import Info, Task, draw
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
@@ -56,11 +58,13 @@ class Restore(Carry):
         return f"Bring the {facts.thing(spec.subject)} back to where it was filmed."
 
     def _arrived(self) -> Info:
-        measures = self.env.measures
-        away = norm((measures.position(self.subject) - self.goal)[:, :2])
-        near, upright = away <= WITHIN_M, measures.up(self.subject) >= _UPRIGHT
-        carried = measures.rests_on(self.subject, self.facts.parent[self.subject])
+        near, upright = self._while_still("at home", self._at_home)
+        carried = self.env.measures.rests_on(self.subject, self.facts.parent[self.subject])
         return {"is_there": near & upright & carried, "is_near": near, "is_upright": upright}
+
+    def _at_home(self) -> tuple[Array, Array]:
+        away = norm((self.env.measures.position(self.subject) - self.goal)[:, :2])
+        return away <= WITHIN_M, self.env.measures.up(self.subject) >= _UPRIGHT
 
 
 class Rearrange(Task):
@@ -128,17 +132,17 @@ class Rearrange(Task):
 
     def evaluate(self) -> Info:
         self._infos = [stage.evaluate() for stage in self.stages]
-        done = stack([info["success"] for info in self._infos])
-        return {"success": done.all(1), "things_done": done.sum(1)}
+        done = [info["success"] for info in self._infos]
+        return {"success": functools.reduce(operator.and_, done), "things_done": sum(map(whole, done))}
 
     def reward(self, info: Info) -> Array:
-        rewards = stack([s.reward(one) for s, one in zip(self.stages, self._infos, strict=True)])
-        shares = rewards / Carry.max_reward
-        done = stack([one["success"] for one in self._infos])
-        # What is done counts whole, of the rest only what is farthest along: one hand does one thing.
-        best = largest(where(done, 0.0, shares))
-        reward = real(done).sum(1) + 0.98 * best
-        return where(info["success"], self.max_reward, reward)
+        reward, best = 0.0, None
+        for stage, one in zip(self.stages, self._infos, strict=True):
+            # What is done counts whole, of the rest only what is farthest along: one hand does one thing.
+            share = where(one["success"], 0.0, stage.reward(one) / Carry.max_reward)
+            best = share if best is None else larger(best, share)
+            reward = reward + real(one["success"])
+        return where(info["success"], self.max_reward, reward + 0.98 * best)
 
     def observe(self, info: Info) -> dict[str, Array]:
         out = {}

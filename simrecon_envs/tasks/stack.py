@@ -51,8 +51,10 @@ class Stack(Carry):
         return f"Stack the {facts.thing(spec.subject)} on the {facts.thing(spec.place)}."
 
     def live_goal(self) -> Array:
-        moved = self.env.measures.position(self.spec.place) - self._lower_home
-        return self.goal + moved
+        return self._while_still("live_goal", lambda: self.goal + self._moved())
+
+    def _moved(self) -> Array:
+        return self.env.measures.position(self.spec.place) - self._lower_home
 
     def start(self, env_idx: torch.Tensor, rng: object) -> None:
         super().start(env_idx, rng)

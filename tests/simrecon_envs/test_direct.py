@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sapien
 import torch
 
 import simrecon_envs
@@ -71,6 +72,40 @@ def _compare(ours: torch.Tensor, theirs: torch.Tensor) -> None:
     assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
     # Heights of what is lifted are differences of nearly equal numbers.
     torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=2e-5)
+
+
+def test_what_moved_is_read_and_computed_anew(scenes_root: Path) -> None:
+    env = simrecon_envs.make(
+        "things", registry=scenes_root, task="put_cube_in_crate", max_episode_steps=10_000
+    )
+    scene, shift = env.unwrapped, np.array([0.02, 0.03, 0.0])
+    for seed in range(2):  # the second reset has moved everything to another PhysX scene
+        env.reset(seed=seed)
+        for _ in range(30):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+        _read_as_sapien_has_them(scene)
+        before = {key: value.clone() for key, value in scene.evaluate().items()}
+        here = scene.measures.position(scene.target_id).copy()
+        entity = scene.builder.objects[scene.target_id].actor._objs[0]
+        entity.set_pose(sapien.Pose(shift) * entity.pose)
+        assert (scene.measures.position(scene.target_id) == here).all()  # until the next evaluation
+        after = scene.evaluate()
+        _read_as_sapien_has_them(scene)
+        np.testing.assert_allclose(scene.measures.position(scene.target_id) - here, shift[None], atol=1e-6)
+        assert float(after["target_to_goal_m"]) != float(before["target_to_goal_m"])
+    extra = sapien.Entity()
+    scene.scene.sub_scenes[0].add_entity(extra)  # not where it was among the entities that are packed
+    scene.evaluate()
+    _read_as_sapien_has_them(scene)
+    env.close()
+
+
+def _read_as_sapien_has_them(scene: object) -> None:
+    actors = [placed.actor._objs[0] for placed in scene.builder.movable_actors]
+    poses = np.array([actor.pose.__getstate__() for actor in actors], np.float32)
+    np.testing.assert_array_equal(scene.measures.poses[0], poses)
+    tip = scene.agent.tcp._objs[0].entity_pose.__getstate__()
+    np.testing.assert_array_equal(scene.measures.tcp[0], np.array(tip, np.float32))
 
 
 @pytest.mark.parametrize(
