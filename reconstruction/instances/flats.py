@@ -29,6 +29,8 @@ _LEAST_RISE_M, _MOST_RISE_M = 0.004, 0.035  # of the level part above its suppor
 _NOISE = 3.0  # times the support's noise
 _MIN_RADIUS_M = 0.04  # of a disc that fits into it: skirts are slim
 _LEVEL_M, _LEVEL_SHARE = 0.003, 0.6  # of its cells are this near to its own height: skirts slope
+_RIM_FROM, _RIM_TO = 1, 4  # cells inside its outline, of the rim of a dish
+_LEAST_DISH_M = 0.002
 _MIN_SOLIDITY = 0.75
 _BESIDE = 8  # cells across its outline, and a rim along it, within which colors are compared
 _EDGE_COLOR, _EDGE_SHARE = 5.0, 0.5
@@ -172,13 +174,27 @@ def _is_flat_thing(plan: _Plan, area: np.ndarray, least: float) -> bool:
         return False
     if area.sum() < _MIN_SOLIDITY * filled_hull(area).sum():
         return False
-    rise = plan.rise[area & plan.own]
-    rise = rise[np.isfinite(rise)]
-    if (np.abs(rise - np.median(rise)) < _LEVEL_M).mean() < _LEVEL_SHARE:
+    if not (_is_level(plan.rise[area & plan.own]) or _is_dished(plan, area)):
         return False
     around = ndimage.binary_dilation(area, iterations=_AROUND) & ~area
     with np.errstate(invalid="ignore"):
         return bool((plan.rise[around] > -least).mean() >= _AROUND_SHARE)
+
+
+def _is_level(rise: np.ndarray) -> bool:
+    rise = rise[np.isfinite(rise)]
+    return bool((np.abs(rise - np.median(rise)) < _LEVEL_M).mean() >= _LEVEL_SHARE) if len(rise) else False
+
+
+def _is_dished(plan: _Plan, area: np.ndarray) -> bool:
+    """Return whether an area has a level rim that is higher than its middle: skirts fall off outwards."""
+    inside = ndimage.distance_transform_edt(np.pad(area, 1))[1:-1, 1:-1]
+    own = plan.own & np.isfinite(plan.rise)
+    rim = plan.rise[own & (inside > _RIM_FROM) & (inside <= _RIM_TO)]
+    middle = plan.rise[own & (inside > _RIM_TO)]
+    if not len(middle) or not _is_level(rim):
+        return False
+    return bool(np.median(rim) > np.median(middle) + _LEAST_DISH_M)
 
 
 def _edge_share(plan: _Plan, area: np.ndarray, least: float, posed: PosedFrames, depth: DepthMaps) -> float:

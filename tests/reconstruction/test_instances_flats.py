@@ -37,6 +37,16 @@ def swollen(surface, height_m, radius_m):
     return replace(surface, vertices=points.astype(surface.vertices.dtype))
 
 
+def round_relief(surface, heights_mm):
+    """Return the surface with a darker disc of 12 cm radius on its top, as high as told at 0, 6, 10 and 12 cm."""
+    points, colors = np.array(surface.vertices), np.array(surface.colors)
+    radius = np.linalg.norm(points[:, :2], axis=1)
+    top = points[:, 2] > 0.29
+    points[top, 2] += 1e-3 * np.interp(radius[top], [0.0, 0.06, 0.1, 0.12, 0.13], [*heights_mm, 0.0])
+    colors[top & (radius < 0.12)] = DARKER
+    return replace(surface, vertices=points.astype(surface.vertices.dtype), colors=colors)
+
+
 def painted(surface):
     """Return the surface with a rectangle of another color on its top."""
     colors = np.array(surface.colors)
@@ -78,8 +88,22 @@ def test_a_tray_of_the_tables_color_is_whole_and_holds_what_stands_in_it():
     np.testing.assert_allclose(np.ptp(graph.points[found.vertices, :2], axis=0), [0.34, 0.26], atol=0.04)
 
 
+def test_a_plate_with_a_raised_rim_is_found():
+    things, graph = flats_of(round_relief(fused([TABLE], top_m=0.5), (7.0, 7.0, 15.0, 15.0)))
+    assert len(things) == 2
+    table, plate = things
+    assert plate.rests_on is table
+    np.testing.assert_allclose(np.ptp(graph.points[plate.vertices, :2], axis=0), 0.24, atol=0.03)
+
+
 @pytest.mark.parametrize(
-    "change", [painted, lambda s: swollen(s, 0.012, 0.08)], ids=["paint", "a swelling of the top"]
+    "change",
+    [
+        painted,
+        lambda s: swollen(s, 0.012, 0.08),
+        lambda s: round_relief(s, (22.0, 18.0, 8.0, 5.0)),
+    ],
+    ids=["paint", "a swelling of the top", "a skirt that falls off outwards, of another color"],
 )
 def test_what_is_no_flat_thing_stays(change):
     things, _ = flats_of(change(fused([TABLE], top_m=0.5)))
