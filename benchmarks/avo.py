@@ -32,11 +32,8 @@ DEFAULT_PAGE = ROOT / "docs" / "avo_benchmark.md"
 STRATEGY_ORDER = ("avo", "max-visibility", "canonical", "avo-no-depth")
 _HIDDEN_POSES, _FILM_POSES = 20, 40
 _PICTURE_PX = 160
-_STEPS = (
-    1e-7,
-    3e-7,
-    1e-6,
-)  # meters and radians, of the differences: over longer steps the objective has jumps
+_SEEABLE_PX = 480
+_STEPS = (1e-8, 3e-8, 1e-7, 3e-7, 1e-6)  # meters and radians: over longer ones the objective has jumps
 _WIDE_STEPS = (3e-4, 6e-4, 1e-3)  # over these, splats change their order
 
 
@@ -98,7 +95,11 @@ def measure_capture(
             wall, cpu = time.perf_counter(), time.process_time()
             (views,) = find_views(scene, [numbers[entity.id]], replace(config, strategy=name))
             cost = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
-            record["strategies"][name] = cost | _figures(views.views, points, filmed, true_views, alignment)
+            places = [scene.clearance.at(view.world_from_camera[:3, 3]) for view in views.views]
+            free = np.array(places) >= config.min_clearance_m
+            record["strategies"][name] = cost | _figures(
+                views.views, points, filmed, free, true_views, alignment
+            )
             row.append(views.views)
         objects.append(record)
         drawn.append((record["hidden"], entity.name, row))
@@ -134,9 +135,14 @@ def instance_of(truth: Any, alignment: Any, surface: Any, found: Any) -> dict[in
 
 
 def _figures(
-    views: Sequence[Any], points: np.ndarray, filmed: np.ndarray, true_views: Any, alignment: Any
+    views: Sequence[Any],
+    points: np.ndarray,
+    filmed: np.ndarray,
+    free: np.ndarray,
+    true_views: Any,
+    alignment: Any,
 ) -> dict:
-    """Return what views see of the true surface, and whose cameras stand where none can."""
+    """Return what views see of the true surface, also those of `free` cameras alone, and which stand where none can."""
     poses = [alignment.pose_to_true(view.world_from_camera) for view in views]
     seen = np.array([true_views.seen(points, view.camera, pose) for view, pose in zip(views, poses)])
     seen = seen.reshape(-1, len(points))
@@ -145,6 +151,8 @@ def _figures(
         "first": float(seen[0].mean()) if len(seen) else 0.0,
         "mean": float(seen.mean()) if len(seen) else 0.0,
         "union": float(seen.any(axis=0).mean()),
+        "union_free": float(seen[free.astype(bool)].any(axis=0).mean()),
+        "free": int(free.sum()),
         "union_filmed": float((seen.any(axis=0) & filmed).sum() / max(filmed.sum(), 1)),
         "in_wall": [inside for inside in (true_views.inside(pose[:3, 3]) for pose in poses) if inside],
     }
@@ -156,11 +164,13 @@ def _seeable(
     """Return the share of the true surface that cameras in free space all around the target see together."""
     from reconstruction.avo.cameras import square_camera
     from reconstruction.avo.starts import input_starts, starts_around
+    from reconstruction.evaluation.visibility import seen_points
 
     poses = np.concatenate([starts_around(scene, target, config), input_starts(scene, target, config)[::4]])
     camera = square_camera(config.picture_side_px, config.fov_deg)
-    seen = [true_views.seen(points, camera, alignment.pose_to_true(pose)) for pose in poses]
-    return float(np.any(seen, axis=0).mean())
+    there = [alignment.pose_to_true(pose) for pose in poses]
+    seen = seen_points(points, true_views.vertices, true_views.faces, camera, there, side_px=_SEEABLE_PX)
+    return float(seen.mean())
 
 
 def gradient_error(scene: Any, target: Any, config: Any, steps: Sequence[float]) -> float:

@@ -13,14 +13,18 @@ import numpy as np
 from reconstruction.avo.scene import Target, ViewScene
 from reconstruction.gaussians.threads import run_over
 from reconstruction.types import Camera
+from registry.geometry import matrix_from_quat
 
 _FREE, _SURFACE = 1, 2
 _CELLS, _LEAST_CELL_M = 28, 0.006  # along the longest side
 _OPAQUE = 0.3
+_LEAST_POINTS = 20
 _STRAYS = (0.5, 99.5)  # percentiles
 _SMOOTH = 1.2  # cells
 _LEAST_SIDE = 0.05  # of a cell's side, however steep to the shape it is
 _OWN_CELLS = 2  # cells of the surface so near to the target's are its own, where nothing else has Gaussians
+_NEAR_M, _NEAR_SHARE = 0.12, 0.4  # around the target's box; of a cell of the scene's grid
+_MOST_RINGS = 6  # of points on a disk
 _STANDS_M = 0.01  # what lies lower than this above the bottom carries the target: no camera is below it
 
 
@@ -31,6 +35,9 @@ class ClosedShape:
     solid: np.ndarray  # bool (nx, ny, nz)
     origin: np.ndarray  # float64 (3,) corner of cell (0, 0, 0)
     cell_m: float
+    near: np.ndarray  # bool, finer cells around the target in which anything else is
+    near_origin: np.ndarray  # float64 (3,)
+    near_cell_m: float
     occupied: np.ndarray  # bool, cells of the scene's grid in which anything else is
     space_origin: np.ndarray  # float64 (3,)
     space_cell_m: float
@@ -40,17 +47,21 @@ class ClosedShape:
     areas: np.ndarray  # float64 (n,) shares of the surface
 
     def seen(self, poses: np.ndarray, camera: Camera) -> np.ndarray:
-        """Tell which points cameras at these poses (k, 4, 4) see: bool (k, n)."""
-        out = np.zeros((len(poses), len(self.points)), bool)
+        """Return how well cameras at these poses (k, 4, 4) see the points, float32 (k, n).
+
+        0 where they do not see them; 1 where they look at them squarely, or up to 60 degrees askew.
+        """
+        out = np.zeros((len(poses), len(self.points)), np.float32)
         run_over(
             len(poses), _kernel(), np.ascontiguousarray(poses[:, :3, 3]), self.points, self.sides, self.normals,
-            self.solid, self.origin, self.cell_m, self.occupied, self.space_origin, self.space_cell_m, out,
+            self.solid, self.origin, self.cell_m, self.near, self.near_origin, self.near_cell_m, self.occupied,
+            self.space_origin, self.space_cell_m, out,
         )  # fmt: skip
         for row, pose in zip(out, poses):
             x, y, z = ((self.points - pose[:3, 3]) @ pose[:3, :3]).T
             z = np.maximum(z, 1e-6)
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            row &= (z > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+            row *= (z > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         return out
 
 
@@ -72,8 +83,8 @@ def close_shape(scene: ViewScene, target: Target) -> ClosedShape:
     points, sides, normals, areas = _border(solid, origin, cell)
     space = scene.space
     return ClosedShape(
-        solid, origin, cell, _occupied(scene, target, every), np.asarray(space.origin, np.float64),
-        float(space.voxel_size_m), points, sides, normals, areas,
+        solid, origin, cell, *_occupied_near(scene, target, low, high), _occupied(scene, target, every),
+        np.asarray(space.origin, np.float64), float(space.voxel_size_m), points, sides, normals, areas,
     )  # fmt: skip
 
 
@@ -84,16 +95,17 @@ def _kernel():
 
 
 def _cloud(scene: ViewScene, target: Target, number: int) -> np.ndarray:
-    """Return the centers (n, 3) of one thing's Gaussians that can be seen, without strays."""
-    rows = target.rows[scene.instance[target.rows] == number]
-    packed = scene.packed[rows].astype(np.float64)
-    opaque = _opaque(packed)
-    means = packed[opaque if opaque.sum() > 3 else slice(None), :3]
-    if not len(means):
-        return means
-    low, high = np.percentile(means, _STRAYS, axis=0)
-    near = ((means >= low - 0.01) & (means <= high + 0.01)).all(axis=1)
-    return means[near] if near.any() else means
+    """Return the surface (n, 3) of one thing, without strays; its Gaussians that can be seen, where it has none."""
+    points = scene.points[scene.point_instance == number]
+    if len(points) < _LEAST_POINTS:
+        packed = scene.packed[target.rows[scene.instance[target.rows] == number]].astype(np.float64)
+        opaque = _opaque(packed)
+        points = packed[opaque if opaque.sum() > 3 else slice(None), :3]
+    if not len(points):
+        return points
+    low, high = np.percentile(points, _STRAYS, axis=0)
+    near = ((points >= low - 0.01) & (points <= high + 0.01)).all(axis=1)
+    return points[near] if near.any() else points
 
 
 def _opaque(packed: np.ndarray) -> np.ndarray:
@@ -139,6 +151,40 @@ def _border(
     normal = np.where((along > _LEAST_SIDE)[:, None], normal, side)
     area = np.maximum(along, _LEAST_SIDE)
     return np.concatenate(points), side, normal, area / area.sum()
+
+
+def _occupied_near(
+    scene: ViewScene, target: Target, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the fine cells around the target's box in which anything but it is, their corner and their size.
+
+    The scene's grid closes the gaps between things that stand close together. A Gaussian is the disk of its first
+    standard deviation; what lies below the target carries it.
+    """
+    cell = _NEAR_SHARE * float(scene.space.voxel_size_m)
+    origin = low - _NEAR_M
+    shape = np.ceil((high + _NEAR_M - origin) / cell).astype(int)
+    out = np.zeros(shape, bool)
+    others = _opaque(scene.packed)
+    others[target.rows] = False
+    means = scene.packed[:, :3]
+    others &= ((means > origin - 0.1) & (means < high + _NEAR_M + 0.1)).all(axis=1)
+    packed = scene.packed[others].astype(np.float64)
+    if len(packed):
+        sizes, turn = np.exp(packed[:, 7:9]), matrix_from_quat(packed[:, 3:7])
+        counts = np.minimum(np.ceil(sizes.max(axis=1) / cell), _MOST_RINGS).astype(int)
+        for count in np.unique(counts):
+            rows = counts == count
+            steps = np.linspace(-1.0, 1.0, 2 * count + 1)
+            a, b = (grid.ravel() for grid in np.meshgrid(steps, steps))
+            inside = a**2 + b**2 <= 1.01
+            across = turn[rows][:, :, :2] * sizes[rows][:, None, :]  # (r, 3, 2)
+            disk = np.stack([a[inside], b[inside]])
+            points = packed[rows, None, :3] + np.einsum("rcs,sp->rpc", across, disk)
+            cells = np.floor((points.reshape(-1, 3) - origin) / cell).astype(np.int64)
+            out[tuple(cells[((cells >= 0) & (cells < shape)).all(axis=1)].T)] = True
+    out[:, :, : int(np.floor((low[2] + _STANDS_M - origin[2]) / cell)) + 1] = False
+    return out, origin, cell
 
 
 def _occupied(scene: ViewScene, target: Target, cloud: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ class AvoConfig:
     """Side of the square picture that is optimized."""
 
     scan_side_px: int = 64
-    """Side of the pictures with which starts are compared."""
+    """Side of the pictures in which input cameras, zoomed in, tell fronts from backs, and of those of large targets."""
 
     fov_deg: float = 50.0
     """Field of view of optimized and canonical views."""

@@ -1,5 +1,6 @@
 """What views have shown of a target so far: of its Gaussians, and of the closed shape that it probably has."""
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -7,7 +8,8 @@ import numpy as np
 
 LEAST_PX = 0.05  # of a Gaussian; less is never a good view of it
 _SEEN_AT, _CLEAR_SHARE = 0.1, 0.2
-_CLOSED = 0.5  # of what is left to see is the closed shape's, the rest the Gaussians'
+_CLOSED = 0.4  # of what is left to see is the closed shape's, the rest the Gaussians'
+_REVISIONS, _LEAST_REVISION = 2, 1e-4
 
 
 class Coverage:
@@ -55,10 +57,19 @@ class Coverage:
     def after(self, contributions: np.ndarray) -> "Coverage":
         """Return what is left after a view with these contributions (2, m)."""
         out = copy(self)
-        share = contributions / self._most
-        out._unseen = self._unseen * (1.0 - np.clip(share / _SEEN_AT, 0.0, 1.0))
-        out._unclear = self._unclear * (1.0 - np.clip(share, 0.0, 1.0))
+        unseen, unclear = self.decays(contributions)
+        out._unseen, out._unclear = self._unseen * unseen, self._unclear * unclear
         return out
+
+    def decays(self, contributions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what views with these contributions (..., 2, m) leave unseen of each side, and unclear."""
+        share = contributions / self._most
+        return 1.0 - np.clip(share / _SEEN_AT, 0.0, 1.0), 1.0 - np.clip(share, 0.0, 1.0)
+
+    @property
+    def shares(self) -> np.ndarray:
+        """What each side (2, m) is of the opacity."""
+        return self._opacities / self._total
 
 
 @dataclass(frozen=True)
@@ -79,9 +90,9 @@ class Unseen:
         Args:
             coverage: Of the Gaussians.
             areas: (n,) of the closed shape's points.
-            sights: bool (k, n) which of them every start sees.
+            sights: (k, n) how well every start sees them, in [0, 1].
         """
-        points = areas * sights.any(axis=0)
+        points = areas * (sights > 0.0).any(axis=0)
         return cls(coverage, points / max(float(points.sum()), 1e-12))
 
     @property
@@ -90,17 +101,41 @@ class Unseen:
         return (1.0 - _CLOSED) * self.coverage.remaining + _CLOSED * float(self.points.sum())
 
     def gain(self, contributions: np.ndarray, sight: np.ndarray) -> float:
-        """Return the share that a view with these contributions (2, m) and this sight (n,) shows anew."""
+        """Return the share that a view with these contributions (2, m) and these sights (n,) shows anew."""
         return self.remaining - self.after(contributions, sight).remaining
 
-    def worth_of(self, shown: np.ndarray, sights: np.ndarray, closed_share: float = _CLOSED) -> np.ndarray:
+    def worth_of(self, shown: np.ndarray, sights: np.ndarray) -> np.ndarray:
         """Return what each of some views (k,) shows anew, beside the most that any of them does."""
         gains = np.array([self.coverage.gain(contributions) for contributions in shown])
-        closed = sights @ self.points
-        return (1.0 - closed_share) * gains / max(gains.max(), 1e-9) + closed_share * closed / max(
-            closed.max(), 1e-9
-        )
+        closed = np.einsum("kn,n->k", sights, self.points)
+        return (1.0 - _CLOSED) * gains / max(gains.max(), 1e-9) + _CLOSED * closed / max(closed.max(), 1e-9)
+
+    def revised(self, chosen: Sequence[int], shown: np.ndarray, sights: np.ndarray) -> list[int]:
+        """Return views that leave less to see together: one after the other is changed for the best beside the rest.
+
+        Args:
+            chosen: rows of the views that were found one by one.
+            shown: (k, 2, m) contributions of all that could be chosen.
+            sights: (k, n) of the closed shape's points, alike.
+        """
+        out = list(chosen)
+        unseen, unclear = self.coverage.decays(shown)
+        hidden, weights = 1.0 - sights, self.coverage.shares
+        for _ in range(_REVISIONS):
+            before = list(out)
+            for place in range(len(out)):
+                rest = out[:place] + out[place + 1 :]
+                seen, clear = weights * unseen[rest].prod(axis=0), weights * unclear[rest].prod(axis=0)
+                gaussians = np.einsum("ksm,sm->k", unseen, seen) + np.einsum("ksm,sm->k", unclear, clear)
+                closed = np.einsum("kn,n->k", hidden, self.points * hidden[rest].prod(axis=0))
+                left = 0.5 * (1.0 - _CLOSED) * gaussians + _CLOSED * closed
+                best = int(np.argmin(left))
+                if left[best] < left[out[place]] - _LEAST_REVISION:
+                    out[place] = best
+            if out == before:
+                break
+        return out
 
     def after(self, contributions: np.ndarray, sight: np.ndarray) -> "Unseen":
         """Return what is left after a view."""
-        return replace(self, coverage=self.coverage.after(contributions), points=self.points * ~sight)
+        return replace(self, coverage=self.coverage.after(contributions), points=self.points * (1.0 - sight))

@@ -110,14 +110,18 @@ class Objective:
         found, by_image = self._loss(blended, target_distance_m, depth_weight)
         return replace(found, gradient=self._backward(blended, by_image)) if gradient else found
 
-    def scan(self, world_from_camera: np.ndarray) -> tuple[np.ndarray, float]:
+    def scan(self, world_from_camera: np.ndarray, camera: Camera | None = None) -> tuple[np.ndarray, float]:
         """Return what each Gaussian of the target gives to the picture at a pose, and the target's depth there.
+
+        Args:
+            world_from_camera: (4, 4) rigid.
+            camera: another one than that of the views.
 
         Returns:
             (2, m) sum over pixels of alpha T of fronts and of backs; mean depth in metres, 0 where nothing is seen.
         """
         out = np.zeros((2, len(self.own_rows)))
-        blended = self._blend(world_from_camera, out)
+        blended = self._blend(world_from_camera, out, camera)
         if blended is None:
             return out, 0.0
         first, positions = blended.bins[2:]
@@ -154,10 +158,12 @@ class Objective:
             return np.ones(len(self.own_rows), bool)
         return np.einsum("mc,mc->m", self.fronts, eye - self._own[:, :3]) > 0
 
-    def _blend(self, world_from_camera: np.ndarray, worth: np.ndarray) -> "_Blended | None":
+    def _blend(
+        self, world_from_camera: np.ndarray, worth: np.ndarray, camera: Camera | None = None
+    ) -> "_Blended | None":
         camera_from_world = invert_rigid(world_from_camera)
         rotation, translation = camera_from_world[:3, :3].copy(), camera_from_world[:3, 3].copy()
-        crop = self._crop(rotation, translation)
+        crop = self._crop(rotation, translation, camera or self.camera)
         if crop is None:
             return None
         camera, chosen = crop
@@ -218,12 +224,14 @@ class Objective:
         )  # fmt: skip
         return splats, boxes
 
-    def _crop(self, rotation: np.ndarray, translation: np.ndarray) -> tuple[Camera, np.ndarray] | None:
+    def _crop(
+        self, rotation: np.ndarray, translation: np.ndarray, camera: Camera
+    ) -> tuple[Camera, np.ndarray] | None:
         """Return the part of the picture that the target reaches, and the Gaussians (k,) that matter there.
 
         None where the target is out of view.
         """
-        camera, settings = self.camera, self.settings
+        settings = self.settings
         splats, boxes = self._project(self._own, camera, rotation, translation)
         seen = boxes[:, 2] > 0
         if not seen.any():

@@ -23,6 +23,8 @@ class ViewScene:
     gaussians: Gaussians
     packed: np.ndarray  # float32 (g, 13)
     instance: np.ndarray  # int32 (g,) id of the thing that each Gaussian belongs to; 0 = none
+    points: np.ndarray  # float64 (v, 3) of the surface
+    point_instance: np.ndarray  # int32 (v,) alike
     base: tuple[int, ...]  # ids of floor, walls and ceiling
     clearance: Clearance
     space: SpaceGrid  # what is known of space, where things are closed
@@ -68,6 +70,8 @@ def prepare_scene(
         gaussians=gaussians,
         packed=gaussians.packed(),
         instance=gaussian_instances(gaussians.means, surface.vertices, instances.vertex_instance),
+        points=np.asarray(surface.vertices, np.float64),
+        point_instance=np.asarray(instances.vertex_instance, np.int32),
         base=tuple(b.id for b in instances.base),
         clearance=measure_clearance(surface.space, poses[:, :3, 3]),
         space=surface.space,

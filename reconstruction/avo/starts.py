@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 
-from reconstruction.avo.cameras import look_at
+from reconstruction.avo.cameras import look_at, square_camera
 from reconstruction.avo.config import AvoConfig
 from reconstruction.avo.scene import Target, ViewScene
+from reconstruction.types import Camera
 
+_ZOOM, _WIDEST = 1.1, 0.8  # of the target's sphere; sine of half a field of view
 _AZIMUTHS, _PITCHES_DEG = 12, (6.0, 25.0, 45.0, 65.0)
 _SHARES = (1.0, 1.2, 0.8, 0.62, 0.48)  # of the target distance, tried until a place is free
 
@@ -15,6 +17,13 @@ _SHARES = (1.0, 1.2, 0.8, 0.62, 0.48)  # of the target distance, tried until a p
 def input_starts(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
     """Return the input cameras (n, 4, 4), turned so that they look at the target, upright."""
     return np.stack([look_at(p[:3, 3], target.center, config.max_pitch_deg) for p in scene.inputs])
+
+
+def zoomed_camera(pose: np.ndarray, target: Target, side_px: int) -> Camera:
+    """Return the camera at a pose (4, 4) that looks at the target and holds all of it."""
+    away = max(float(np.linalg.norm(pose[:3, 3] - target.center)), 1e-6)
+    half = math.asin(min(_ZOOM * target.radius_m / away, _WIDEST))
+    return square_camera(side_px, 2.0 * math.degrees(half))
 
 
 def starts_around(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:

@@ -1,6 +1,7 @@
 """How viewpoints are chosen: the strategies that the paper compares, behind one interface."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -12,7 +13,7 @@ from reconstruction.avo.config import AvoConfig
 from reconstruction.avo.coverage import LEAST_PX, Coverage, Unseen
 from reconstruction.avo.scene import Target, ViewScene, reach_of
 from reconstruction.avo.search import Search
-from reconstruction.avo.starts import input_starts, starts_around
+from reconstruction.avo.starts import input_starts, starts_around, zoomed_camera
 from reconstruction.types import Camera
 from registry.errors import UsageError
 from registry.geometry import matrix_from_quat
@@ -22,10 +23,8 @@ if TYPE_CHECKING:
 
 _APART_DEG = 25.0  # starts that are optimized look from directions at least this far apart
 _CANONICAL_PITCH_DEG = 25.0
-_BY_PIXELS = 0.15  # of the ranking of starts; the rest is by what is seen anew
+_BY_PIXELS = 0.15  # beside what is seen anew, which counts as 1
 _FRONTS_FROM = 2  # every second input camera tells fronts from backs
-_BETTER = 1.03  # by this factor a start must show more than what the search made of it, to stay
-_CLOSED_AT_LAST = 0.3  # of that comparison is the closed shape's: it knows nothing of undersides
 _LARGE_STEPS = 2 / 3  # of the steps are taken for large targets
 
 
@@ -73,24 +72,22 @@ class ActiveViews:
         """See `Strategy.choose`."""
         weight = config.depth_weight if self._with_depth else 0.0
         config = _affordable(config, target)
-        coarse = _objective(scene, target, square_camera(config.scan_side_px, config.fov_deg), config)
         fine = _objective(scene, target, square_camera(config.side_px, config.fov_deg), config)
         search = Search(fine, scene.clearance, target.distance_m, weight, config)
         starts = input_starts(scene, target, config)
-        filmed = [coarse.scan(start)[0][0] for start in starts[::_FRONTS_FROM]]
-        fine.fronts = coarse.fronts = _fronts(scene, target, np.array(filmed))
+        fine.fronts = _fronts(scene, target, fine, config)
         if config.starts == "around":
             starts = np.concatenate([starts, starts_around(scene, target, config)])
-        scanned = [_scan(coarse, start, target, fine.camera) for start in starts]
-        shown = np.array([contributions for contributions, _ in scanned])
         if self._with_depth:
-            starts = _at_target_distance(starts, np.array([z for _, z in scanned]), scene, target, config)
+            starts = _at_target_distance(starts, scene, target, config)
+        shown = np.array([_scan(fine, start, target)[0] for start in starts])
         closed = close_shape(scene, target)
         sights = closed.seen(starts, fine.camera)
         fixed = np.array([search.loss_of_place(start[:3, 3])[0] for start in starts])
         unseen = Unseen.of(_coverage(scene, target, shown.max(axis=0), config), closed.areas, sights)
-        out: list[Viewpoint] = []
-        while len(out) < config.views:
+        pool = _Pool(starts[fixed == 0.0], shown[fixed == 0.0], sights[fixed == 0.0])
+        free, first, chosen = len(pool.poses), unseen, []
+        while len(chosen) < config.views:
             coverage = unseen.coverage
             information = np.einsum("ksm,sm->k", shown, coverage.worth)
             fine.reference_px = max(float(information.max()), LEAST_PX)
@@ -99,22 +96,44 @@ class ActiveViews:
             found = search.best_of(starts[rows], coverage.worth)
             if found is None:
                 break
+            drawn = _scan(fine, found.pose, target)[0]
+            pool = pool.with_one(found.pose, drawn, closed.seen(found.pose[None], fine.camera)[0])
             # What counts is what is seen anew: more pixels of less are no progress.
-            poses = np.array([found.pose, *(starts[row] for row in rows if fixed[row] == 0.0)])
-            drawn = np.array([_scan(fine, pose, target, fine.camera)[0] for pose in poses])
-            seen = closed.seen(poses, fine.camera)
-            worth = unseen.worth_of(drawn, seen, _CLOSED_AT_LAST)
-            worth[0] *= _BETTER
-            best = int(np.argmax(worth))
-            gain = unseen.gain(drawn[best], seen[best])
-            if gain < config.min_gain:
+            pixels = np.einsum("ksm,sm->k", pool.shown, coverage.worth) / fine.reference_px
+            best = int(np.argmax(unseen.worth_of(pool.shown, pool.sights) + _BY_PIXELS * pixels))
+            if unseen.gain(pool.shown[best], pool.sights[best]) < config.min_gain:
                 break
-            fronts = float(drawn[best, 0].sum() / max(drawn[best].sum(), 1e-9))
-            origin, anew = "start" if best else "optimized", coverage.gain(drawn[best])
-            out.append(Viewpoint(poses[best], fine.camera, origin, anew, fronts))
-            unseen = unseen.after(drawn[best], seen[best])
+            chosen.append(best)
+            unseen = unseen.after(pool.shown[best], pool.sights[best])
             if unseen.remaining < config.remaining_share:
                 break
+        return pool.viewpoints(first.revised(chosen, pool.shown, pool.sights), first, fine.camera, free)
+
+
+@dataclass(frozen=True)
+class _Pool:
+    """Poses that can be chosen: the starts in free space, then what searches made of them."""
+
+    poses: np.ndarray  # (k, 4, 4)
+    shown: np.ndarray  # (k, 2, m) of the target's Gaussians
+    sights: np.ndarray  # (k, n) of the closed shape's points
+
+    def with_one(self, pose: np.ndarray, shown: np.ndarray, sight: np.ndarray) -> "_Pool":
+        """Return the pool with one more, the last."""
+        added = ((self.poses, pose), (self.shown, shown), (self.sights, sight))
+        return _Pool(*(np.concatenate([many, one[None]]) for many, one in added))
+
+    def viewpoints(self, rows: Sequence[int], unseen: Unseen, camera: Camera, starts: int) -> list[Viewpoint]:
+        """Return the viewpoints of rows, each next one that which shows most of what is left; starts come first."""
+        left, out = list(dict.fromkeys(rows)), []
+        while left:
+            row = max(left, key=lambda one: unseen.gain(self.shown[one], self.sights[one]))
+            left.remove(row)
+            drawn, anew = self.shown[row], unseen.coverage.gain(self.shown[row])
+            fronts = float(drawn[0].sum() / max(drawn.sum(), 1e-9))
+            origin = "start" if row < starts else "optimized"
+            out.append(Viewpoint(self.poses[row], camera, origin, anew, fronts))
+            unseen = unseen.after(drawn, self.sights[row])
         return out
 
 
@@ -126,24 +145,22 @@ def _affordable(config: AvoConfig, target: Target) -> AvoConfig:
     return replace(config, side_px=side, steps=steps)
 
 
-def _scan(
-    objective: "Objective", pose: np.ndarray, target: Target, camera: Camera
-) -> tuple[np.ndarray, float]:
+def _scan(objective: "Objective", pose: np.ndarray, target: Target) -> tuple[np.ndarray, float]:
     """Return what a pose shows of each side of the target's Gaussians (2, m), and at which depth.
 
-    In pixels of `camera`, from the target distance: so they say how well a side is seen, not how close the camera is.
+    In pixels from the target distance: so they say how well a side is seen, not how close the camera is.
     """
     contributions, depth = objective.scan(pose)
-    return contributions * (depth / target.distance_m * camera.fx / objective.camera.fx) ** 2, depth
+    return contributions * (depth / target.distance_m) ** 2, depth
 
 
 def _at_target_distance(
-    starts: np.ndarray, depths: np.ndarray, scene: ViewScene, target: Target, config: AvoConfig
+    starts: np.ndarray, scene: ViewScene, target: Target, config: AvoConfig
 ) -> np.ndarray:
     """Return the starts (n, 4, 4) moved along their view to the target distance, as far as is free."""
     out = starts.copy()
-    for row in np.flatnonzero(depths > 0):
-        forward = depths[row] - target.distance_m
+    away = np.linalg.norm(starts[:, :3, 3] - target.center, axis=1)
+    for row, forward in enumerate(away - target.distance_m - target.radius_m):
         for share in (1.0, 0.8, 0.6, 0.4, 0.2):
             eye = starts[row, :3, 3] + share * forward * starts[row, :3, 2]
             if scene.clearance.at(eye) >= config.clearance_m:
@@ -152,19 +169,16 @@ def _at_target_distance(
     return out
 
 
-def _fronts(scene: ViewScene, target: Target, shown: np.ndarray) -> np.ndarray:
-    """Return the normals (m, 3) of the target's Gaussians towards the input cameras that saw them.
-
-    Args:
-        scene: with the input cameras.
-        target: its Gaussians.
-        shown: what each Gaussian (m,) gives to every second of them.
-    """
+def _fronts(scene: ViewScene, target: Target, objective: "Objective", config: AvoConfig) -> np.ndarray:
+    """Return the normals (m, 3) of the target's Gaussians towards the input cameras that see them, zoomed in."""
     packed = scene.packed[target.rows].astype(np.float64)
     normals = matrix_from_quat(packed[:, 3:7])[:, :, 2]
-    toward = scene.inputs[::_FRONTS_FROM, None, :3, 3] - packed[None, :, :3]
-    facing = np.einsum("kmc,mc->km", toward, normals) / np.linalg.norm(toward, axis=2)
-    side = ((shown + 1e-9) * facing).sum(axis=0)
+    side = np.zeros(len(packed))
+    for pose in input_starts(scene, target, config)[::_FRONTS_FROM]:
+        shown = objective.scan(pose, zoomed_camera(pose, target, config.scan_side_px))[0].sum(axis=0)
+        toward = pose[:3, 3] - packed[:, :3]
+        facing = np.einsum("mc,mc->m", toward, normals) / np.linalg.norm(toward, axis=1)
+        side += (shown + 1e-9) * facing
     return normals * np.where(side < 0, -1.0, 1.0)[:, None]
 
 
@@ -190,7 +204,7 @@ class InputFrames:
         scale = config.side_px / max(scene.camera.width, scene.camera.height)
         camera = scene.camera.resized(round(scene.camera.width * scale), round(scene.camera.height * scale))
         objective = _objective(scene, target, camera, config)
-        shown = np.array([_scan(objective, pose, target, camera)[0] for pose in scene.inputs])
+        shown = np.array([_scan(objective, pose, target)[0] for pose in scene.inputs])
         coverage, out = _coverage(scene, target, shown.max(axis=0), config), []
         while len(out) < config.views:
             row = int(np.argmax(np.einsum("ksm,sm->k", shown, coverage.worth)))
@@ -221,7 +235,7 @@ class Orbit:
             away = np.append(flat, math.sin(pitch))
             eye = target.center + (target.distance_m + target.radius_m) * away
             poses.append(look_at(eye, target.center, config.max_pitch_deg))
-        shown = np.array([_scan(objective, pose, target, camera)[0] for pose in poses])
+        shown = np.array([_scan(objective, pose, target)[0] for pose in poses])
         coverage, out = _coverage(scene, target, shown.max(axis=0), config), []
         for number, pose in enumerate(poses):
             gain, coverage = coverage.gain(shown[number]), coverage.after(shown[number])

@@ -58,6 +58,7 @@ def seen_points(
     camera: Camera,
     world_from_camera: Sequence[np.ndarray],
     max_distance_m: float = MAX_DISTANCE_M,
+    side_px: int = _SIDE_PX,
 ) -> np.ndarray:
     """Tell which points on a mesh some camera sees.
 
@@ -65,14 +66,15 @@ def seen_points(
         points: (n, 3) on the mesh, world space, metres.
         vertices: (v, 3) of everything that can hide them.
         faces: (f, 3).
-        camera: of all poses; what they see is drawn 960 pixels wide.
+        camera: of all poses.
         world_from_camera: poses (4, 4), OpenCV.
         max_distance_m: from the camera's center.
+        side_px: longer side of the pictures in which what the cameras see is drawn.
 
     Returns:
         bool (n,).
     """
-    scale = _SIDE_PX / max(camera.width, camera.height)
+    scale = side_px / max(camera.width, camera.height)
     small = camera.resized(round(camera.width * scale), round(camera.height * scale))
     corners = np.asarray(vertices, np.float64)[np.asarray(faces)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

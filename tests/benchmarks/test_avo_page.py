@@ -9,7 +9,7 @@ def record(hidden, avo, other):
     def figures(union):
         return {
             "wall_s": 2.0, "cpu_s": 1.0, "views": 4, "first": 0.3, "mean": 0.3, "union": union, "union_filmed": 0.9,
-            "in_wall": [],
+            "union_free": union - 0.05, "free": 3, "in_wall": [],
         }  # fmt: skip
 
     strategies = {"avo": figures(avo)} | {
@@ -35,4 +35,6 @@ def test_wins_ties_and_hidden_objects_are_told_apart(tmp_path):
     left = "four views, of the 1 objects of which it leaves more than a tie"
     assert f"| `canonical` | {left} | 100 % | 0 % | 0 % |" in hidden
     assert "0 of 16" in page
+    assert "12 of 16 stand in free space" in page
+    assert "`avo` sees more of 3 of 4 objects, of 3 by more than a tie" in page
     assert "## Pictures" not in page

@@ -30,7 +30,8 @@ def half():
     centers = scene.space.origin + (np.stack(np.indices(state.shape), -1) + 0.5) * room.CELL
     state[((centers > low) & (centers < high + 0.5 * room.CELL)).all(axis=-1)] = 0
     space = replace(scene.space, state=state)
-    return replace(scene, packed=scene.packed[seen], instance=scene.instance[seen], space=space)
+    kept = {name: getattr(scene, name)[seen] for name in ("packed", "instance", "points", "point_instance")}
+    return replace(scene, **kept, space=space)
 
 
 def closed(scene, *ids):
@@ -38,7 +39,40 @@ def closed(scene, *ids):
 
 
 def sees(shape, eye, toward=room.BOX_CENTER):
-    return shape.seen(look_at(eye, toward, 80.0)[None], CAMERA)[0]
+    return shape.seen(look_at(eye, toward, 80.0)[None], CAMERA)[0] > 0.0
+
+
+def test_what_is_seen_askew_waits_for_a_better_view(half):
+    shape = closed(half)
+    back = shape.normals[:, 1] > 0.99
+    squarely, askew = (
+        shape.seen(look_at(room.BOX_CENTER + np.array(away), room.BOX_CENTER, 80.0)[None], CAMERA)[0][back]
+        for away in ([0.0, 0.9, 0.0], [0.9, 0.35, 0.0])
+    )
+    assert squarely.mean() > 0.9
+    assert 0.1 < askew[askew > 0].mean() < 0.7
+
+
+def test_a_gap_beside_a_neighbor_stays_open(half):
+    """A wall stands 5 cm behind the box, nearer than a cell of the scene's grid: from above one sees past it."""
+    back = room.BOX_CENTER[1] + 0.5 * room.BOX_SIDE + 0.05
+    wall = room.plate([0, back, 0.15], [0.3, 0, 0], [0, 0, 0.15], [0, -1, 0], [0.5, 0.5, 0.5])
+    wall[:, 7:9] += np.log(1.5)  # without holes
+    scene = replace(
+        half,
+        packed=np.concatenate([half.packed, wall]),
+        instance=np.append(half.instance, np.zeros(len(wall), int)),
+    )
+    above = room.BOX_CENTER + np.array([0.0, 0.4, 0.9])
+    upper = {}
+    for name, one in (("open", half), ("walled", scene)):
+        shape = closed(one)
+        back = (shape.normals[:, 1] > 0.9) & (shape.points[:, 2] > 0.27)
+        upper[name] = sees(shape, above)[back].mean()
+    assert upper["open"] > 0.9
+    assert upper["walled"] > 0.5
+    low = (closed(scene).normals[:, 1] > 0.9) & (closed(scene).points[:, 2] < 0.2)
+    assert not sees(closed(scene), BEHIND)[low].any()
 
 
 def test_a_half_seen_box_is_closed(half):
@@ -95,13 +129,24 @@ def test_a_flat_thing_is_what_was_seen_of_it():
 def test_the_unseen_half_is_left_when_all_gaussians_were_shown():
     most = np.full((2, 4), 10.0)
     coverage = Coverage(np.ones(4), most, 0.5)
-    sights = np.array([[True] * 3 + [False] * 3, [False] * 3 + [True] * 2 + [False]])
+    sights = np.array([[1.0] * 3 + [0.0] * 3, [0.0] * 3 + [1.0] * 2 + [0.0]])
     start = Unseen.of(coverage, np.full(6, 1 / 6), sights)
     assert start.remaining == pytest.approx(1.0)
     front = start.after(most, sights[0])
     assert front.coverage.remaining == pytest.approx(0.0)
-    assert front.remaining == pytest.approx(0.5 * 2 / 5)  # what no start sees does not count
+    assert front.remaining == pytest.approx(0.4 * 2 / 5)  # what no start sees does not count
     assert front.gain(0 * most, sights[1]) == pytest.approx(front.remaining)
     scores = start.worth_of(np.stack([most, 0.5 * most]), sights)
     assert scores[0] == pytest.approx(1.0)
     assert 0.0 < scores[1] < 1.0
+
+
+def test_views_are_revised_where_others_show_more_together():
+    shown = np.zeros((3, 2, 6))
+    for row, seen in enumerate(([0, 1, 2, 3], [0, 1, 4], [2, 3, 5])):
+        shown[row, 0, seen] = 10.0
+    sights = np.zeros((3, 2))
+    start = Unseen.of(Coverage(np.ones(6), shown.max(axis=0), 0.5), np.full(2, 0.5), sights)
+    assert np.argmax(start.worth_of(shown, sights)) == 0
+    assert sorted(start.revised([0, 1], shown, sights)) == [1, 2]
+    assert start.revised([1, 2], shown, sights) == [1, 2]
