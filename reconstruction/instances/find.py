@@ -9,6 +9,7 @@ from reconstruction.instances.contact_skirts import cut_cleaned_stacks
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
 from reconstruction.instances.doubts import as_drawn, without_doubts
+from reconstruction.instances.hung import add_hung
 from reconstruction.instances.id_maps import render_id_maps
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
@@ -69,6 +70,8 @@ def find_instances(
     if told is not None and masks is not None:
         asked = masks.resized(told.camera.width, told.camera.height)
         found = add_outlined(found, asked, told, posed, depth, surface, config, progress)
+    elif masks is None:
+        found = add_hung(found, posed, depth, surface, config, progress)
     return without_unseen(found, config, progress)
 
 
