@@ -27,6 +27,7 @@ _BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02
 _MIN_WITNESSES = 2
 _PROBES = 7
 _SEEN_SHARE, _SEEN_PERCENT = 0.5, 2.0  # of its box on the wall
+_BEHIND_SHARE = 0.35  # of how far it stands out
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,18 @@ class Hanging:
 
 
 def is_outlined(item: Instance, points: np.ndarray) -> bool:
-    """Tell whether the box of a thing on a wall is from its masks' outlines: few points (n, 3) were seen."""
+    """Tell whether the box of a thing on a wall is from its outlines.
+
+    Few points (n, 3) were seen, or they are those of the wall behind it.
+    """
     if not item.attached_hint:
         return False
     if len(points) == 0:
+        return True
+    depth_m = float(item.extents_m[0])
+    out = np.array([np.cos(item.yaw_rad), np.sin(item.yaw_rad)])
+    away = (points[:, :2] - item.center[:2]) @ out + 0.5 * depth_m
+    if depth_m > _MAX_THICKNESS_M and np.percentile(away, 100 - _SEEN_PERCENT) < _BEHIND_SHARE * depth_m:
         return True
     along = points[:, :2] @ np.array([-np.sin(item.yaw_rad), np.cos(item.yaw_rad)])
     low, high = np.percentile(

@@ -18,8 +18,8 @@ _MAX_VIEWS = 24
 _MIN_VIEWS = 4
 _MIN_SEEN = 0.25  # of the rectangle, for a view to count
 _SMOOTH_CELLS = 6.0  # coarser than this is light, not a pattern
+_NEARLY = 0.25  # of the rise from the least to the ends
 _MIN_CONTRAST = 0.9  # the best plane's variance over that of the wall's or the farthest one
-
 _MIN_RISE = 1.0  # squared gray levels: below it, no view differs from any other
 
 
@@ -58,12 +58,20 @@ def front_of(
     scores = np.array(
         [_disagreement(transform_points(world_from_grid, wall - [0, t, 0]), posed, views) for t in away]
     )
-    best = int(np.argmin(scores))
-    ends = min(scores[0], scores[-1])
+    best, ends = _first_minimum(scores), min(scores[0], scores[-1])
     if not 0 < best < len(away) - 1 or scores[best] > min(_MIN_CONTRAST * ends, ends - _MIN_RISE):
         return None
     before, here, after = scores[best - 1 : best + 2]
     return float(away[best] + 0.5 * _STEP_M * (before - after) / max(before - 2 * here + after, 1e-12))
+
+
+def _first_minimum(scores: np.ndarray) -> int:
+    """Return the minimum nearest to the wall of those that hardly differ from the least: few views agree on several."""
+    least = float(scores.min())
+    inner = np.arange(1, len(scores) - 1)
+    low = (scores[inner] <= scores[inner - 1]) & (scores[inner] <= scores[inner + 1])
+    near = inner[low & (scores[inner] < least + _NEARLY * (min(scores[0], scores[-1]) - least))]
+    return int(near[0]) if len(near) else int(np.argmin(scores))
 
 
 def _project(

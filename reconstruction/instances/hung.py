@@ -25,6 +25,7 @@ _WHOLE = 0.7  # of its place must be in a frame's view to judge
 _LIKE_OUTLINES = 0.6  # mean IoU
 _DEEP_M, _SHELF = 0.1, 2.0  # what stands out farther is a shelf: so much wider than high
 _SAME, _ENOUGH = 0.4, 0.6  # of the smaller rectangle on the wall; of the outline's area
+_THROUGH, _NEAR_M = 0.6, 0.03  # of a piece's width; between a board and what carries it
 _MANY, _ALIKE = 5, 0.15  # regions of one size: a pattern
 
 
@@ -51,7 +52,10 @@ def add_hung(
         boxes = [
             box for region in regions if (box := _box(region, ground, picture, posed, depth)) is not None
         ]
-        for box in _without_patterns(boxes):
+        boxes = _without_patterns(boxes) + [
+            box for region in regions if region.slim and (box := _joined(region, picture, found)) is not None
+        ]
+        for box in boxes:
             renewed = _with_box(found, box, wall, posed, depth, surface)
             count += renewed is not found
             found = renewed
@@ -100,6 +104,31 @@ def _box(
     if box.front > _DEEP_M and box.size[0] < _SHELF * box.size[1]:
         return None  # it stands before the wall
     return box if min(box.size) >= MIN_SIDE_M and max(box.size) <= _MAX_SIDE_M else None
+
+
+def _joined(region: Region, picture: WallPicture, found: InstanceSet) -> WallBox | None:
+    """Return the box of pieces that a board goes through, None where it goes through none or one."""
+    rows, columns = np.nonzero(region.mask)
+    along = picture.low + picture.cell_m * np.array([columns.min(), columns.max() + 1])
+    height = picture.top - picture.cell_m * np.array([rows.max() + 1, rows.min()])
+    pieces = []
+    for item in found.objects:
+        if not item.attached_hint or item.support_hint != picture.wall.id:
+            continue
+        low, high = _rectangle(item, picture.wall)
+        within = min(high[0], along[1]) - max(low[0], along[0])
+        if (
+            within > _THROUGH * (high[0] - low[0])
+            and low[1] < height[1] + _NEAR_M
+            and high[1] > height[0] - _NEAR_M
+        ):
+            pieces.append((low, high, float(item.extents_m[0])))
+    if len(pieces) < 2:
+        return None
+    low, high = np.min([p[0] for p in pieces], axis=0), np.max([p[1] for p in pieces], axis=0)
+    if high[1] - low[1] > (high[0] - low[0]) / _SHELF:
+        return None
+    return WallBox(low, high, max(p[2] for p in pieces))
 
 
 def _shown(
@@ -157,7 +186,7 @@ def _with_box(
 ) -> InstanceSet:
     """Return the instances with a thing of this box; its pieces, if there are any, become one."""
     same = sorted((o for o in found.objects if _overlap(o, box, wall) > _SAME), key=lambda o: -_area(o))
-    if same and _area(same[0]) > _ENOUGH * float(np.prod(box.size)):
+    if len(same) == 1 and _area(same[0]) > _ENOUGH * float(np.prod(box.size)):
         return found
     own = same[0] if same else None
     number = own.id if own is not None else max([*(o.id for o in found.objects), len(found.base)]) + 1
@@ -181,10 +210,14 @@ def _overlap(item: Instance, box: WallBox, wall: Wall) -> float:
     """Return the common area of a thing on this wall and a box, of the smaller one; 0 for what hangs elsewhere."""
     if not item.attached_hint or item.support_hint != wall.id:
         return 0.0
-    middle = np.array([item.center @ wall.along, item.center[2]])
-    low, high = middle - 0.5 * item.extents_m[1:], middle + 0.5 * item.extents_m[1:]
+    low, high = _rectangle(item, wall)
     common = np.maximum(np.minimum(high, box.high) - np.maximum(low, box.low), 0.0)
     return float(np.prod(common)) / max(min(_area(item), float(np.prod(box.size))), 1e-9)
+
+
+def _rectangle(item: Instance, wall: Wall) -> tuple[np.ndarray, np.ndarray]:
+    middle = np.array([item.center @ wall.along, item.center[2]])
+    return middle - 0.5 * item.extents_m[1:], middle + 0.5 * item.extents_m[1:]
 
 
 def _area(item: Instance) -> float:

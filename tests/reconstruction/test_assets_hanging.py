@@ -6,7 +6,7 @@ from facing import CAMERA, frames
 
 from reconstruction.assets import AssetsConfig
 from reconstruction.assets.hanging import hanging_slab, is_outlined, outlined_slab
-from reconstruction.assets.hanging_front import front_of
+from reconstruction.assets.hanging_front import _first_minimum, front_of
 from reconstruction.assets.volume import ObjectFrame
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, PosedFrames
 from registry.geometry import rigid, transform_points
@@ -127,6 +127,14 @@ def test_the_images_tell_how_far_a_picture_stands_out(thickness):
     assert front(filmed(waves, thickness, EYES)) == pytest.approx(thickness, abs=0.004)
 
 
+def test_where_views_nearly_agree_on_several_planes_the_nearest_is_the_front():
+    near = np.linspace(5, 9, 13)
+    curve = np.concatenate([near[::-1], [5.2, 6, 5.4, 4.9, 5.6, 6.5, 8, 9, 10, 11, 12, 13]])
+    assert _first_minimum(curve) == 12
+    curve[:14] += 2.0
+    assert _first_minimum(curve) == int(np.argmin(curve))
+
+
 def test_a_plain_picture_or_a_still_camera_tell_nothing():
     assert front(filmed(lambda x, z: 180.0, 0.03, EYES)) is None
     assert front(filmed(lambda x, z: 120 + 60 * np.sin(x * 90), 0.03, ((0.0, 0.0, 1.3),) * 6)) is None
@@ -151,6 +159,7 @@ def test_what_only_its_outline_is_known_of_is_the_box_of_that_with_its_back_on_t
     corners = center + np.array([[a * along[0], a * along[1], b] for a in (-0.4, 0.4) for b in (-0.15, 0.15)])
     assert is_outlined(shelf, center + 0.6 * (corners - center))
     assert not is_outlined(shelf, corners)
+    assert is_outlined(shelf, corners - 0.08 * normal)  # depth saw through it
     nothing = InstanceSet(np.zeros(0, np.int32), (WALL,), (shelf,), np.zeros((2, 240, 320), np.uint16))
     body, frame = outlined_slab(shelf, frames(*TWICE), CAMERA, nothing, AssetsConfig())
     world = transform_points(frame.world_from_grid, body.vertices)
