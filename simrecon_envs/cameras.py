@@ -3,6 +3,7 @@
 SAPIEN's camera looks along +x, with +y left and +z up; OpenCV's along +z, with +x right and +y down.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,33 +90,45 @@ def workspace_view(
 def room_view(
     bundle: SceneBundle, solids: list[ConvexSolid], placement: Placement | None, robot_points: np.ndarray
 ) -> Viewpoint:
-    """Return a view of the robot, its target and much of the scene: from a frame's camera, or a better
-    place.
+    """Return a view of the robot, its target and much of the scene: from a frame's camera, or a better place.
+
+    The robot at rest (points (n, 3) in its root space) hides what is behind it.
     """
     boxes: dict[int, list[np.ndarray]] = {item.id: [] for item in bundle.objects}
     for solid in solids:
         if solid.owner in boxes:
             boxes[solid.owner].append((solid.lower + solid.upper) / 2)
     centers = np.array([np.mean(parts, axis=0) for parts in boxes.values() if parts]).reshape(-1, 3)
-    groups = [(centers, 1.0)]
+    groups = [(centers, 1.0)] if len(centers) else []
+    robot = np.zeros((0, 3))
     if placement is not None and len(robot_points):
-        step = max(len(robot_points) // 40, 1)
-        groups.append((placement.to_world(robot_points)[::step], 1.5))
+        robot = placement.to_world(robot_points)
         if placement.target is not None:
             groups.append((placement.target.center[None], 1.0))
-    groups = [(points, weight) for points, weight in groups if len(points)]
+        groups.append((robot[:: max(len(robot) // 40, 1)], 1.5))
     focus = np.mean([points.mean(axis=0) for points, _ in groups], axis=0) if groups else np.zeros(3)
     grid = _grid_around(solids, focus, 5.0, cell_m=0.05)
+    hiding = copy.deepcopy(grid)
+    hiding.add_points(robot)
+    # The robot, which is the last group, hides the others and not itself.
+    seen = [(points, weight, hiding) for points, weight in groups]
+    if len(robot):
+        seen[-1] = (*groups[-1], grid)
     best, best_score = None, -np.inf
     everything = np.concatenate([points for points, _ in groups]) if groups else focus[None]
     for view, bonus in _room_candidates(bundle, focus, everything):
-        if grid.occupied(view.eye):
+        if hiding.occupied(view.eye):
             continue
-        score = bonus + sum(weight * view.seen_share(points, grid) for points, weight in groups)
+        score = bonus + sum(weight * view.seen_share(points, by) for points, weight, by in seen)
         if groups and placement is not None:
             # The workspace should fill a good part of the picture.
-            distance = np.linalg.norm(groups[-1][0].mean(axis=0) - view.eye)
+            middle = groups[-1][0] if placement.target is None else placement.target.center[None]
+            distance = np.linalg.norm(middle.mean(axis=0) - view.eye)
             score -= 0.5 * abs(np.log(max(distance, 0.1) / 1.8))
+            # From behind, its body hides what the hand does.
+            ahead = np.array([np.cos(placement.yaw_rad), np.sin(placement.yaw_rad)])
+            aside = view.eye[:2] - placement.position[:2]
+            score += 0.6 * min(float(ahead @ aside) / max(float(np.linalg.norm(aside)), 0.1), 0.3)
         if score > best_score + 1e-9:
             best, best_score = view, score
     return best if best is not None else look_at(focus + np.array([2.0, -2.0, 1.8]), focus, 1.0)

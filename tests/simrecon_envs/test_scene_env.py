@@ -1,5 +1,6 @@
 """The environment on the hand-made room: API, physics at rest, determinism, the pick task, errors."""
 
+import dataclasses
 import functools
 import itertools
 import os
@@ -21,6 +22,7 @@ import simrecon_envs
 from registry import EnvironmentMissing, SceneNotFound, SceneRegistry, UsageError
 from registry.geometry import matrix_from_quat
 from simrecon_envs import SceneAssetsMissing
+from simrecon_envs.cameras import room_view
 from simrecon_envs.oracle import CONTROL_MODE, Oracle
 
 ROBOTS = ("panda", "fetch")
@@ -143,6 +145,19 @@ def _rigid() -> type:
     from sapien.physx import PhysxRigidDynamicComponent
 
     return PhysxRigidDynamicComponent
+
+
+def test_the_room_is_seen_from_before_or_beside_the_robot(env: gym.Env) -> None:
+    scene = env.unwrapped
+    there = scene.placement
+    away = float(np.linalg.norm((there.position - there.target.center)[:2]))
+    for angle in np.arange(4) * np.pi / 2:  # around the target, facing it
+        ahead = np.array([np.cos(angle), np.sin(angle)])
+        position = np.array([*(there.target.center[:2] - away * ahead), there.position[2]])
+        placement = dataclasses.replace(there, position=position, yaw_rad=float(angle))
+        view = room_view(scene.bundle, scene.facts.solids, placement, scene.robot_points)
+        aside = (view.eye - position)[:2]
+        assert ahead @ aside > -0.3 * np.linalg.norm(aside)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
