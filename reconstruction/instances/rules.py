@@ -8,6 +8,7 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.feet import merge_feet
 from reconstruction.instances.flats import cut_flats
+from reconstruction.instances.foreign import cut_foreign
 from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.scraps import without_fragments, without_skirts
@@ -50,6 +51,7 @@ def cut_by_rules(
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)
+    things = cut_foreign(shell, things, owner, frames, config, progress)
     things = without_smears(shell, things, owner, frames, config, progress)
     things = cut_side_by_side(graph, surface, things, posed, depth, config, progress)
     things = cut_stacks(graph, surface, things, posed, depth, config, progress)

@@ -51,7 +51,11 @@ def without_skirts(graph: MeshGraph, things: list[Thing], progress: Progress) ->
     kept = [
         thing
         for thing in things
-        if thing.attached or thing.container or thing.rests_on is None or not _is_skirt(graph, thing, things)
+        if thing.attached
+        or thing.container
+        or thing.foreign
+        or thing.rests_on is None
+        or not _is_skirt(graph, thing, things)
     ]
     left = {id(thing) for thing in kept}
     for thing in kept:  # what was thought to lie on a skirt rests on what that lies on

@@ -32,6 +32,7 @@ class Thing:
     container: bool = (
         False  # an open one, whole by its rim: slats and rims of other colors are no things on it
     )
+    foreign: bool = False  # told from what carries it by its color: no skirt of it, however low
     notes: list[str] = field(default_factory=list)
 
 

@@ -55,7 +55,7 @@ def without_smears(
         near = [thing for thing in things if wall.label == "wall" and _reaches(graph, thing, wall)]
         if not near:
             continue
-        picture = _WallPicture(graph, wall, frames)
+        picture = WallPicture(graph, wall, frames)
         for thing in near:
             smear = _smear(graph, thing.vertices, wall, picture, frames)
             smear = _with_scraps(graph, thing.vertices, smear)
@@ -77,10 +77,11 @@ def _reaches(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
     return bool(quantiles(wall.distance(points), areas, (0.02,))[0] < _REACHES_M)
 
 
-class _WallPicture:
+class WallPicture:
     """The colors of a wall where frames see it."""
 
     def __init__(self, graph: MeshGraph, wall: FittedPlane, frames: list[Sighting]) -> None:
+        self.wall = wall
         self.axes = np.stack(plane_axes(wall.plane), axis=1)
         flat = graph.points[wall.members] @ self.axes
         low, high = np.percentile(flat, 0.2, axis=0), np.percentile(flat, 99.8, axis=0)
@@ -106,9 +107,17 @@ class _WallPicture:
             out[np.isfinite(gap)] = self.lab[nearest[np.isfinite(gap)]]
         return out
 
+    def behind(self, points: np.ndarray, frame: Sighting) -> np.ndarray:
+        """Return the color (n, 3) of the wall behind points as a frame sees them, nan where it is not behind them."""
+        rays = points - frame.eye
+        toward = rays @ self.wall.plane[:3]
+        there = (toward < 0) & (self.wall.distance(points) > 0)
+        reach = -self.wall.distance(frame.eye[None]) / np.where(there, toward, -1.0)
+        return np.where(there[:, None], self.at(frame.eye + reach[:, None] * rays), np.nan)
+
 
 def _smear(
-    graph: MeshGraph, body: np.ndarray, wall: FittedPlane, picture: _WallPicture, frames: list[Sighting]
+    graph: MeshGraph, body: np.ndarray, wall: FittedPlane, picture: WallPicture, frames: list[Sighting]
 ) -> np.ndarray:  # fmt: skip
     """Return the vertices of a body that show the wall and go on to it."""
     points = graph.points[body]
@@ -116,12 +125,8 @@ def _smear(
     for frame in frames:
         row, column, z = frame.seen_at(points)
         shown = frame.shown(row, column, z)
-        rays = points - frame.eye
-        toward = rays @ wall.plane[:3]
-        behind = shown & (toward < 0) & (wall.distance(points) > 0)
-        hit = frame.eye + (-wall.distance(frame.eye[None]) / np.where(behind, toward, -1.0))[:, None] * rays
-        gap = np.linalg.norm(frame.lab[row, column] - picture.at(hit), axis=1)
-        like += behind & (gap < _ALIKE)
+        gap = np.linalg.norm(frame.lab[row, column] - picture.behind(points, frame), axis=1)
+        like += shown & (gap < _ALIKE)
         seen += shown
     shows = body[(seen >= _MIN_SEEN) & (like >= _SURE_SHARE * seen)]
     reaching = [

@@ -119,3 +119,19 @@ def frames_of(surface: Surface, width: int = 120, height: int = 90) -> tuple[Pos
         np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros((0, 2), np.int32), n, True, 0.3,
     )  # fmt: skip
     return posed, DepthMaps(camera, depth, np.where(depth > 0, 2, 0).astype(np.uint8))
+
+
+def filmed(
+    truth: Patchwork, paint: np.ndarray, surface: Surface, poses: np.ndarray, camera: Camera
+) -> tuple[PosedFrames, DepthMaps]:
+    """Film what is there, of colors `paint` (n, 3); depth is that of a surface fused from it."""
+    images = []
+    for pose in poses:
+        raster = rasterize_mesh(truth.vertices.astype(np.float32), truth.faces.astype(np.int32), camera, pose)
+        images.append(raster.interpolate(truth.faces, paint).round().astype(np.uint8))
+    depth = np.stack([rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth for pose in poses])
+    posed = replace(
+        frames_of(surface)[0], camera=camera, images=np.stack(images), indices=np.arange(len(poses), dtype=np.int32),
+        times_s=np.arange(len(poses)) / 10, world_from_camera=poses, sharpness=np.ones(len(poses), np.float32),
+    )  # fmt: skip
+    return posed, DepthMaps(camera, depth, np.where(depth > 0, 2, 0).astype(np.uint8))

@@ -1,9 +1,7 @@
 """Surface that is smeared from a thing to the wall behind it goes to the wall; a thing of the wall's color stays."""
 
-from dataclasses import replace
-
 import numpy as np
-from surfaces import frames_of, looking_at, merged, sheet, solid_box, surface_from
+from surfaces import filmed, looking_at, merged, sheet, solid_box, surface_from
 
 from reconstruction.instances import InstancesConfig
 from reconstruction.instances.cut import Shell
@@ -11,14 +9,13 @@ from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import sightings
 from reconstruction.instances.smears import without_smears
 from reconstruction.progress import NO_PROGRESS
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera, DepthMaps
+from reconstruction.types import Camera
 
 LOW, HIGH = (-0.08, 0.3, 0.0), (0.08, 0.42, 0.25)
 WALL_Y = 0.6
 
 
-def filmed(color, striped):
+def carton_before_wall(color, striped):
     """A carton before a wall, as fused with smears from its sides to the wall, and films of the truth."""
     room = (
         sheet((-1.0, -1.0, 0.0), (2.0, 0, 0), (0, 1.0 + WALL_Y, 0), (120, 100, 80), 0.025),
@@ -41,22 +38,12 @@ def filmed(color, striped):
     places = [(x, -1.0, z) for z in (0.5, 0.8) for x in (-0.6, -0.3, 0.0, 0.3, 0.6)]
     poses = np.stack([looking_at(middle + place, middle) for place in places])
     camera = Camera(240, 180, 220.0, 220.0, 120.0, 90.0)
-    images = []
-    for pose in poses:
-        raster = rasterize_mesh(truth.vertices.astype(np.float32), truth.faces.astype(np.int32), camera, pose)
-        images.append(raster.interpolate(truth.faces, paint).round().astype(np.uint8))
-    drawn = [rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth for pose in poses]
-    posed = replace(
-        frames_of(surface)[0], camera=camera, images=np.stack(images), indices=np.arange(len(poses), dtype=np.int32),
-        times_s=np.arange(len(poses)) / 10, world_from_camera=poses, sharpness=np.ones(len(poses), np.float32),
-    )  # fmt: skip
-    depth = np.stack(drawn)
-    return surface, posed, DepthMaps(camera, depth, np.where(depth > 0, 2, 0).astype(np.uint8))
+    return surface, *filmed(truth, paint, surface, poses, camera)
 
 
 def cleaned(color, striped=True):
     """Return the shell, the thing's vertices before and after, who owns what, and what of it is smear."""
-    surface, posed, depth = filmed(color, striped)
+    surface, posed, depth = carton_before_wall(color, striped)
     shell = Shell.of(surface, NO_PROGRESS)
     points = shell.graph.points
     thing = Thing(np.flatnonzero((shell.owner == 0) & (points[:, 2] > 0.02)))

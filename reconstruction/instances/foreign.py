@@ -1,0 +1,211 @@
+"""What lies on furniture and has colors that the furniture has nowhere else: small things across the room.
+
+Three metres away a book is a few dozen points of the fused surface, hardly higher than the noise of the cabinet that it
+lies on and without an edge of its own; shape alone takes it for the cabinet. Its color tells it from the cabinet in
+every frame that sees it. Of other color are also smears, which show the wall behind them, and shaded corners: what
+confirms no frame, what shows the wall, and what does not bulge, is no thing.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from reconstruction.instances.boxes import quantiles
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.convexity import bulge
+from reconstruction.instances.cut import Shell
+from reconstruction.instances.patches import palette
+from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.sightings import Sighting, unconfirmed
+from reconstruction.instances.smears import WallPicture
+from reconstruction.instances.supports import SupportRegion, find_supports
+from reconstruction.progress import Progress
+from reconstruction.surface.mesh_graph import MeshGraph, pieces
+
+_LEAST_CARRIER_M, _MIN_SUPPORT_M2, _LEAST_HEIGHT_M = 0.45, 0.02, 0.05
+_MOST_SAMPLES = 4000  # vertices that tell a carrier's colors
+_COLORS, _COLOR_GAP = 24, 4.0
+_MOST_FOREIGN = 0.08  # of a carrier's area: a color with more than that is its own
+_FOREIGN, _LIKE_WALL = 12.0, 8.0  # CIELAB, lightness at half weight
+_MIN_SEEN, _SURE_SHARE, _WALL_SHARE = 3, 0.6, 0.4  # frames, and of them
+_UP = 0.7  # of a normal's z: smears are steeper than tops
+_ABOVE_M, _REACH_M = 0.004, 0.4  # over a support
+_BOARD_M, _CLEAR_M = 0.12, 0.03  # the next board is as far above, and what is on this one ends below it
+_BRIDGE_M = 0.025
+_MIN_VERTICES = 15
+_MIN_BULGE = 0.12
+_LOW_M, _RISE_M, _SLIM_M, _MOST_M = 0.025, 0.02, 0.025, 0.45
+_BESIDE_M, _BESIDE_SHARE = 0.05, 0.35  # of a larger one: its own fringe
+
+
+@dataclass(frozen=True)
+class _View:
+    """What all carriers are looked at with."""
+
+    graph: MeshGraph
+    frames: list[Sighting]
+    walls: list[WallPicture]
+
+    def shows_wall(self, frame: Sighting, points: np.ndarray, lab: np.ndarray) -> np.ndarray:
+        """Return which points, of colors (n, 3) in a frame, have there the color of the wall behind them."""
+        out = np.zeros(len(points), bool)
+        for wall in self.walls:
+            out |= np.linalg.norm(lab - wall.behind(points, frame), axis=1) < _LIKE_WALL
+        return out
+
+    def of_wall(self, vertices: np.ndarray) -> np.ndarray:
+        """Return which vertices no frame sees, or many see in the color of the wall behind."""
+        points = self.graph.points[vertices]
+        seen, like = np.zeros(len(vertices)), np.zeros(len(vertices))
+        for frame in self.frames:
+            row, column, z = frame.seen_at(points)
+            rows = np.flatnonzero(frame.shown(row, column, z))
+            seen[rows] += 1
+            like[rows] += self.shows_wall(frame, points[rows], frame.lab[row[rows], column[rows]])
+        return like >= np.where(seen > 0, _WALL_SHARE * seen, 0.0)
+
+    def foreign(self, vertices: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """Return which vertices most frames see in none of some colors (k, 3), nor in that of the wall behind."""
+        points, up = self.graph.points[vertices], self.graph.normals[vertices, 2] > _UP
+        seen, other = np.zeros(len(vertices)), np.zeros(len(vertices))
+        for frame in self.frames:
+            row, column, z = frame.seen_at(points)
+            shown = frame.shown(row, column, z)
+            lab = frame.lab[row, column]
+            gap = np.linalg.norm(lab[:, None] - own[None], axis=2).min(axis=1)
+            odd = shown & (gap > _FOREIGN)
+            asked = np.flatnonzero(odd & ~up)
+            odd[asked] = ~self.shows_wall(frame, points[asked], lab[asked])
+            seen += shown
+            other += odd
+        return (seen >= _MIN_SEEN) & (other >= _SURE_SHARE * seen)
+
+
+def cut_foreign(
+    shell: Shell,
+    things: list[Thing],
+    owner: np.ndarray,
+    frames: list[Sighting],
+    config: InstancesConfig,
+    progress: Progress,
+) -> list[Thing]:
+    """Cut things off the furniture that they lie on where color alone tells them from it.
+
+    Args:
+        shell: the surface and its base.
+        things: what was found; theirs are the vertices.
+        owner: int32 (v,) base entity of each vertex.
+        frames: keyframes, the surface drawn into them.
+        config: what a support and a thing are.
+        progress: told of how many were cut off.
+
+    Returns:
+        The things, those cut off at the end.
+    """
+    graph = shell.graph
+    walls = [WallPicture(graph, plane, frames) for plane in shell.planes if plane.label == "wall"]
+    view = _View(graph, frames, walls)
+    free = (owner == 0) & ~shell.behind
+    for thing in things:
+        free[thing.vertices] = False
+    found: list[Thing] = []
+    for carrier in things:
+        if carrier.attached or np.ptp(graph.points[carrier.vertices], axis=0).max() < _LEAST_CARRIER_M:
+            continue
+        for vertices in _foreign_on(view, carrier, free, config):
+            free[vertices] = False
+            carrier.vertices = np.setdiff1d(carrier.vertices, vertices, assume_unique=True)
+            found.append(Thing(vertices, carrier, carrier.depth + 1, foreign=True))
+    if found:
+        progress.note(f"{len(found)} things are cut off what carries them by their color")
+    return [*things, *found]
+
+
+def _foreign_on(view: _View, carrier: Thing, free: np.ndarray, config: InstancesConfig) -> list[np.ndarray]:
+    """Return sorted vertices of each thing on a carrier, its own or `free` ones (v,) bool."""
+    graph, found = view.graph, []
+    supports = [
+        support
+        for support in find_supports(graph, carrier.vertices, config)
+        if support.footprint.area_m2 > _MIN_SUPPORT_M2 and support.height_m > _LEAST_HEIGHT_M
+    ]
+    pools = [(support, _above(graph, carrier, support, supports, free)) for support in supports]
+    pools = [(support, pool) for support, pool in pools if len(pool) >= _MIN_VERTICES]
+    if not pools:
+        return []
+    colors = _own_colors(view, carrier.vertices)
+    used = np.zeros(len(graph.points), bool)
+    for support, pool in pools:
+        own = np.concatenate([colors, _main_colors(graph, support.vertices)])
+        pool = pool[~used[pool]]
+        odd = pool[view.foreign(pool, own)]
+        odd = odd[~unconfirmed(graph.points[odd], graph.normals[odd], view.frames)]
+        parts = [part for part in pieces(graph, odd, _BRIDGE_M) if _is_thing(graph, part, support, config)]
+        for part in _without_fringes(graph, parts):
+            used[part] = True
+            found.append(np.sort(part))
+    return found
+
+
+def _above(
+    graph: MeshGraph, carrier: Thing, support: SupportRegion, supports: list[SupportRegion], free: np.ndarray
+) -> np.ndarray:
+    """Return the vertices over a support and below the next board, those of the carrier and free ones."""
+    higher = [other.height_m - support.height_m for other in supports]
+    reach = min([_REACH_M, *(rise - _CLEAR_M for rise in higher if rise > _BOARD_M)])
+    rise = graph.points[:, 2] - support.height_m
+    chosen = free.copy()
+    chosen[carrier.vertices] = True
+    rows = np.flatnonzero(chosen & (rise > _ABOVE_M) & (rise < reach))
+    return rows[support.footprint.contains(graph.points[rows, :2], 2)]
+
+
+def _own_colors(view: _View, vertices: np.ndarray) -> np.ndarray:
+    """Return the colors (k, 3) of furniture without the smears on it."""
+    graph = view.graph
+    some = vertices[:: max(1, len(vertices) // _MOST_SAMPLES)]
+    doubtful = unconfirmed(graph.points[some], graph.normals[some], view.frames) | view.of_wall(some)
+    sure = some[~doubtful]
+    if graph.areas[sure].sum() < _WALL_SHARE * graph.areas[some].sum():
+        sure = some  # furniture of the wall's color
+    return _main_colors(graph, sure)
+
+
+def _main_colors(graph: MeshGraph, vertices: np.ndarray) -> np.ndarray:
+    nearest, means = palette(graph.lab[vertices] * LIGHTNESS_WEIGHT, _COLORS, _COLOR_GAP)
+    area = np.bincount(nearest, weights=graph.areas[vertices], minlength=len(means))
+    return means[area > _MOST_FOREIGN * area.sum()]
+
+
+def _is_thing(graph: MeshGraph, part: np.ndarray, support: SupportRegion, config: InstancesConfig) -> bool:
+    """Tell a thing on a support from a strip along its edge, a corner of it and a scrap in mid-air."""
+    points, areas = graph.points[part], graph.areas[part]
+    if len(part) < _MIN_VERTICES or areas.sum() < config.min_object_area_m2:
+        return False
+    low, high = np.stack([quantiles(points[:, k], areas, (0.02, 0.98)) for k in range(3)], axis=1)
+    size = high - low
+    slim = min(size[:2]) < _SLIM_M or np.sort(size)[1] < config.min_object_m
+    if slim or size.max() > _MOST_M or low[2] - support.height_m > _LOW_M:
+        return False
+    return bool(high[2] - support.height_m > _RISE_M and bulge(graph, part) > _MIN_BULGE)
+
+
+def _without_fringes(graph: MeshGraph, parts: list[np.ndarray]) -> list[np.ndarray]:
+    """Leave out what is small beside a larger one: smears around it."""
+    kept: list[np.ndarray] = []
+    for part in sorted(parts, key=lambda p: (-graph.areas[p].sum(), p[0])):
+        area = graph.areas[part].sum()
+        for other in kept:
+            if area < _BESIDE_SHARE * graph.areas[other].sum() and _gap(graph, part, other) < _BESIDE_M:
+                break
+        else:
+            kept.append(part)
+    return kept
+
+
+def _gap(graph: MeshGraph, part: np.ndarray, other: np.ndarray) -> float:
+    outline = cv2.convexHull(graph.points[other, :2].astype(np.float32))
+    flat = graph.points[part, :2]
+    return -max(cv2.pointPolygonTest(outline, (float(x), float(y)), True) for x, y in flat)
