@@ -12,11 +12,20 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.observations import parse_obs_mode_to_struct
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
-from registry import BundleError, SceneBundle, SceneNotFound, SceneRegistry, UsageError, default_registry_root
+from registry import (
+    BundleError,
+    EnvironmentMissing,
+    SceneBundle,
+    SceneNotFound,
+    SceneRegistry,
+    UsageError,
+    default_registry_root,
+)
 from simrecon_envs.arrays import Array, tensor, tensors
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
@@ -130,8 +139,9 @@ class SceneEnv(BaseEnv):
         Raises:
             SceneNotFound: the registry has no such scene; the message lists what there is.
             SceneAssetsMissing: its files are gone or damaged.
-            UsageError: no such robot, task or target; the message lists what there is.
-            EnvironmentMissing: pictures were asked for, and nothing can render here.
+            UsageError: no such robot, task, target or mode; the message lists what there is.
+            EnvironmentMissing: pictures were asked for, and nothing can render here; or several environments,
+                and there is no CUDA.
         """
         if not isinstance(robot_uids, str):
             raise UsageError(
@@ -139,6 +149,7 @@ class SceneEnv(BaseEnv):
             )
         if robot_uids != "none":
             check_robot(robot_uids)
+        _check_options(scene_id, obs_mode, kwargs)
         self.bundle, self.revision_note = _load(scene_id, revision, registry, strict_revision)
         self.scene_id = scene_id
         self.task_config = PickTaskConfig(**task_config) if isinstance(task_config, dict) else task_config
@@ -376,6 +387,26 @@ class SceneEnv(BaseEnv):
 
     def _get_obs_extra(self, info: dict) -> dict:
         return tensors(self.known())
+
+
+def _check_options(scene_id: str, obs_mode: str | None, options: dict) -> None:
+    """Make sure of what ManiSkill would find wrong only later, and in its own words."""
+    try:
+        parse_obs_mode_to_struct(obs_mode or "state")
+    except AssertionError as error:
+        raise UsageError(
+            f"obs_mode {obs_mode!r}: expected state, state_dict, none, rgb, depth, segmentation, rgbd, pointcloud, "
+            "sensor_data, or several with + in between"
+        ) from error
+    reward_mode, modes = options.get("reward_mode"), SceneEnv.SUPPORTED_REWARD_MODES
+    if reward_mode not in (None, *modes):
+        raise UsageError(f"reward_mode {reward_mode!r}: expected one of {', '.join(modes)}")
+    count = options.get("num_envs", 1)
+    if count > 1 and not torch.cuda.is_available():
+        raise EnvironmentMissing(
+            f"num_envs={count} is simulated on a GPU, and there is no CUDA here; "
+            f"simrecon_envs.make_vec({scene_id!r}, {count}) starts one process an environment"
+        )
 
 
 def _load(scene_id: str, revision: str | None, registry: str | None, strict: bool) -> tuple[SceneBundle, str]:

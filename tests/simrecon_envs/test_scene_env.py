@@ -211,12 +211,21 @@ def test_a_hard_target_is_possible_but_noted(scenes_root: Path) -> None:
         ({"target": "table"}, "cannot move.*10 \\(box\\)"),
         ({"target": "lamp"}, "no such object.*11 \\(cup\\)"),
         ({"task": "juggle"}, "has no task 'juggle'.*Kinds: reach, pick.*pick_box"),
+        ({"task": "pik"}, "Did you mean 'pick'"),
         ({"robot_uids": "pandaa"}, "Did you mean 'panda'.*fetch"),
+        ({"obs_mode": "rgbb"}, "obs_mode 'rgbb': expected state, .*rgbd"),
+        ({"reward_mode": "shaped"}, "reward_mode 'shaped': expected one of normalized_dense, dense"),
     ],
 )
 def test_wrong_arguments_list_the_right_ones(kwargs: dict, text: str, scenes_root: Path) -> None:
     with pytest.raises(UsageError, match=text):
         _make(scenes_root, **kwargs)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_several_environments_without_cuda_name_what_does_it(scenes_root: Path) -> None:
+    with pytest.raises(EnvironmentMissing, match=r"make_vec\('room', 4\)"):
+        _make(scenes_root, num_envs=4)
 
 
 def test_robot_without_files_raises_instead_of_asking(scenes_root: Path) -> None:
