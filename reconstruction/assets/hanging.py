@@ -27,7 +27,7 @@ _BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02
 _MIN_WITNESSES = 2
 _PROBES = 7
 _SEEN_SHARE, _SEEN_PERCENT = 0.5, 2.0  # of its box on the wall
-_BEHIND_SHARE = 0.35  # of how far it stands out
+_BEHIND_SHARE, _MOST_PERCENT = 0.35, 80.0  # of how far it stands out; of the points
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def is_outlined(item: Instance, points: np.ndarray) -> bool:
     depth_m = float(item.extents_m[0])
     out = np.array([np.cos(item.yaw_rad), np.sin(item.yaw_rad)])
     away = (points[:, :2] - item.center[:2]) @ out + 0.5 * depth_m
-    if depth_m > _MAX_THICKNESS_M and np.percentile(away, 100 - _SEEN_PERCENT) < _BEHIND_SHARE * depth_m:
+    if depth_m > _MAX_THICKNESS_M and np.percentile(away, _MOST_PERCENT) < _BEHIND_SHARE * depth_m:
         return True
     along = points[:, :2] @ np.array([-np.sin(item.yaw_rad), np.cos(item.yaw_rad)])
     low, high = np.percentile(

@@ -159,7 +159,8 @@ def test_what_only_its_outline_is_known_of_is_the_box_of_that_with_its_back_on_t
     corners = center + np.array([[a * along[0], a * along[1], b] for a in (-0.4, 0.4) for b in (-0.15, 0.15)])
     assert is_outlined(shelf, center + 0.6 * (corners - center))
     assert not is_outlined(shelf, corners)
-    assert is_outlined(shelf, corners - 0.08 * normal)  # depth saw through it
+    behind = np.concatenate([np.repeat(corners - 0.08 * normal, 9, axis=0), corners + 0.09 * normal])
+    assert is_outlined(shelf, behind)  # depth saw through most of it
     nothing = InstanceSet(np.zeros(0, np.int32), (WALL,), (shelf,), np.zeros((2, 240, 320), np.uint16))
     body, frame = outlined_slab(shelf, frames(*TWICE), CAMERA, nothing, AssetsConfig())
     world = transform_points(frame.world_from_grid, body.vertices)
