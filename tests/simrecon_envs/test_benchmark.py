@@ -238,7 +238,7 @@ def test_a_policy_of_anybody_runs_and_wrong_ones_say_why(
         "no_such_module:Policy": "there is no module 'no_such_module'",
         "my_test_policy:Absent": "no callable 'Absent'",
         "my_test_policy:Greedy": "policy_options has task, which the suite decides",
-        "my_test_policy:Smell": "no environment can be made with obs_mode='smell': .*'smell'",
+        "my_test_policy:Smell": "obs_mode 'smell': expected state, .*rgb",
         "my_test_policy:lazy": r"what it returned \(object\) has no act",
     }.items():
         with pytest.raises(UsageError, match=message):
