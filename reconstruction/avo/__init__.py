@@ -11,7 +11,7 @@ from reconstruction.avo.scene import Target, ViewScene, make_target, prepare_sce
 from reconstruction.avo.stage import SceneViews, make_views
 from reconstruction.avo.strategies import STRATEGIES, Strategy, Viewpoint, load_strategy
 
-VERSION = 4
+VERSION = 5
 
 __all__ = [
     "AVO_PRESETS",

@@ -201,12 +201,21 @@ def _occupied(scene: ViewScene, target: Target, cloud: np.ndarray) -> np.ndarray
     opaque[target.rows] = False
     others = np.zeros(out.shape, bool)
     others[tuple(cells_of(scene.packed[opaque, :3].astype(np.float64)).T)] = True
-    span = np.arange(-_OWN_CELLS, _OWN_CELLS + 1)
-    around = np.stack(np.meshgrid(span, span, span, indexing="ij"), axis=-1).reshape(-1, 3)
-    own = np.unique(cells_of(cloud), axis=0)[:, None] + around[None]
-    own = np.clip(own.reshape(-1, 3), 0, shape - 1)
-    own = own[~others[tuple(own.T)]]
-    out[tuple(own.T)] = False
+    own = np.zeros(out.shape, bool)
+    own[tuple(cells_of(cloud).T)] = True
+    out &= others | ~_grown(own, _OWN_CELLS)
     carrying = int(np.floor((cloud[:, 2].min() + _STANDS_M - space.origin[2]) / space.voxel_size_m)) + 1
     out[:, :, : max(carrying, 0)] = False
+    return out
+
+
+def _grown(cells: np.ndarray, by: int) -> np.ndarray:
+    """Return marked cells (nx, ny, nz) and all that are at most `by` cells from one along every axis."""
+    from scipy import ndimage
+
+    out = cells.copy()
+    if cells.any():
+        rows = [np.flatnonzero(cells.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
+        box = tuple(slice(max(0, row[0] - by), row[-1] + 1 + by) for row in rows)
+        out[box] = ndimage.maximum_filter(cells[box].view(np.uint8), 2 * by + 1, mode="constant").astype(bool)
     return out

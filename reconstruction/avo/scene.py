@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from reconstruction.types import Camera, InstanceSet, SpaceGrid, Surface
 from registry.errors import UsageError
 
 _INPUTS = 40  # input cameras that are looked at, evenly spread over the film
+_CURVE_CELL_M = 0.01
 _OUTER_SHARE = 0.98  # of the target's Gaussians lie in its sphere: strays do not push the camera away
 
 
@@ -95,6 +96,42 @@ def make_target(scene: ViewScene, ids: Sequence[int] | int, config: AvoConfig) -
     half = math.radians(0.5 * config.fov_deg)
     distance = max(radius / math.sin(config.fill * half), config.min_distance_m)
     return Target(wanted, rows, center, radius, distance)
+
+
+def thinned(scene: ViewScene, target: Target, most: int) -> tuple[ViewScene, Target]:
+    """Return the scene and a target with at most `most` Gaussians, for pictures that show it coarsely.
+
+    Of the target, and of everything else, the same share of the Gaussians stays, evenly spread and so much larger that
+    they cover the same area. Only `packed` and `instance` of the scene and `rows` of the target are thinned.
+    """
+    share = most / len(target.rows)
+    if share >= 1.0:
+        return scene, target
+    own = np.zeros(len(scene.packed), bool)
+    own[target.rows] = True
+    kept = [
+        rows[np.linspace(0, len(rows) - 1, max(int(share * len(rows)), 1)).round().astype(int)]
+        for rows in (_along_curve(scene.packed, np.flatnonzero(mine)) for mine in (own, ~own))
+        if len(rows)
+    ]
+    rows = np.sort(np.concatenate(kept))
+    packed = scene.packed[rows]
+    packed[:, 7:9] -= 0.5 * math.log(share)
+    left = replace(scene, packed=packed, instance=scene.instance[rows])
+    return left, replace(target, rows=np.flatnonzero(own[rows]))
+
+
+def _along_curve(packed: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return rows of Gaussians along a curve that fills space (Morton's): neighbors on it lie close together."""
+    if not len(rows):
+        return rows
+    means = packed[rows, :3].astype(np.float64)
+    cells = ((means - means.min(axis=0)) / _CURVE_CELL_M).astype(np.uint64)
+    code = np.zeros(len(rows), np.uint64)
+    for bit in range(16):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return rows[np.argsort(code, kind="stable")]
 
 
 def reach_of(packed: np.ndarray, sigma_cutoff: float) -> np.ndarray:

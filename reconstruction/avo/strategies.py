@@ -11,9 +11,9 @@ from reconstruction.avo.cameras import look_at, square_camera
 from reconstruction.avo.closure import close_shape
 from reconstruction.avo.config import AvoConfig
 from reconstruction.avo.coverage import LEAST_PX, Coverage, Unseen
-from reconstruction.avo.scene import Target, ViewScene, reach_of
+from reconstruction.avo.scene import Target, ViewScene, reach_of, thinned
 from reconstruction.avo.search import Search
-from reconstruction.avo.starts import input_starts, starts_around, zoomed_camera
+from reconstruction.avo.starts import input_starts, starts_around, starts_below, zoomed_camera
 from reconstruction.types import Camera
 from registry.errors import UsageError
 from registry.geometry import matrix_from_quat
@@ -71,17 +71,20 @@ class ActiveViews:
     def choose(self, scene: ViewScene, target: Target, config: AvoConfig) -> list[Viewpoint]:
         """See `Strategy.choose`."""
         weight = config.depth_weight if self._with_depth else 0.0
-        config = _affordable(config, target)
+        closed = close_shape(scene, target)
+        large = 0 < config.large_gaussians < len(target.rows)
+        config, scene, target = _affordable(config, scene, target)
         fine = _objective(scene, target, square_camera(config.side_px, config.fov_deg), config)
         search = Search(fine, scene.clearance, target.distance_m, weight, config)
         starts = input_starts(scene, target, config)
         fine.fronts = _fronts(scene, target, fine, config)
         if config.starts == "around":
             starts = np.concatenate([starts, starts_around(scene, target, config)])
+            if large:
+                starts = np.concatenate([starts, starts_below(scene, target, config)])
         if self._with_depth:
             starts = _at_target_distance(starts, scene, target, config)
         shown = np.array([_scan(fine, start, target)[0] for start in starts])
-        closed = close_shape(scene, target)
         sights = closed.seen(starts, fine.camera)
         fixed = np.array([search.loss_of_place(start[:3, 3])[0] for start in starts])
         unseen = Unseen.of(_coverage(scene, target, shown.max(axis=0), config), closed.areas, sights)
@@ -137,12 +140,12 @@ class _Pool:
         return out
 
 
-def _affordable(config: AvoConfig, target: Target) -> AvoConfig:
-    """Return the settings for a target: coarser and shorter where it is large."""
+def _affordable(config: AvoConfig, scene: ViewScene, target: Target) -> tuple[AvoConfig, ViewScene, Target]:
+    """Return what a target is sought with: coarser, shorter and through fewer Gaussians where it is large."""
     if not 0 < config.large_gaussians < len(target.rows):
-        return config
+        return config, scene, target
     side, steps = min(config.side_px, config.scan_side_px), round(_LARGE_STEPS * config.steps)
-    return replace(config, side_px=side, steps=steps)
+    return replace(config, side_px=side, steps=steps), *thinned(scene, target, config.large_gaussians)
 
 
 def _scan(objective: "Objective", pose: np.ndarray, target: Target) -> tuple[np.ndarray, float]:

@@ -15,8 +15,9 @@ from reconstruction.avo.cameras import look_at, moved, square_camera, step_gradi
 from reconstruction.avo.clearance import measure_clearance
 from reconstruction.avo.coverage import Coverage
 from reconstruction.avo.objective import Objective
-from reconstruction.avo.scene import reach_of
+from reconstruction.avo.scene import reach_of, thinned
 from reconstruction.avo.search import Search
+from reconstruction.avo.starts import starts_below
 from reconstruction.avo.strategies import STRATEGIES
 from reconstruction.gaussians.fit import exponential
 from reconstruction.gaussians.model import SH_C0
@@ -218,6 +219,37 @@ def test_large_targets_are_optimized_coarser_and_seen_as_well(scene, found):
     (coarse,) = find_views(scene, [room.BOX], large)
     assert coarse.views[0].visibility > 0.9
     assert coarse.views[0].color.shape == found.views[0].color.shape
+
+
+def test_thinned_gaussians_cover_what_all_of_them_covered(scene):
+    target = make_target(scene, room.BOX, QUICK)
+    most = len(target.rows) // 2
+    few, same = thinned(scene, target, most)
+    assert len(same.rows) == most
+    assert len(few.packed) == pytest.approx(0.5 * len(scene.packed), abs=2)
+    np.testing.assert_array_equal(np.flatnonzero(few.instance == room.BOX), same.rows)
+    assert thinned(scene, target, len(target.rows)) == (scene, target)
+    camera = square_camera(64, 50.0)
+    for eye in ([0.9, -0.9, 0.8], [-0.9, 1.1, 0.5]):
+        pose = look_at(np.array(eye), target.center, 80.0)
+        all_of_it, left = (
+            rasterize(packed, camera, pose, RasterSettings()).features[..., 7] > 0.5
+            for packed in (scene.packed[target.rows], few.packed[same.rows])
+        )
+        assert (all_of_it & left).sum() > 0.85 * (all_of_it | left).sum()
+
+
+def test_low_starts_look_up_from_beside_the_target_and_never_from_below_it(scene):
+    target = make_target(scene, room.BOX, QUICK)
+    assert not len(
+        starts_below(scene, target, QUICK)
+    )  # a low thing: cameras beside its foot are too near the floor
+    target = replace(target, center=target.center + np.array([0.0, 0.0, 0.25]))
+    low = starts_below(scene, target, QUICK)
+    assert len(low)
+    assert (low[:, 2, 3] >= scene.packed[target.rows, 2].min()).all()
+    assert (low[:, 2, 3] < target.center[2]).all()
+    assert all(scene.clearance.at(pose[:3, 3]) >= QUICK.clearance_m for pose in low)
 
 
 def test_views_stop_at_k_and_at_the_remaining_share(scene, found):
