@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from reconstruction.assets import symmetry
+from reconstruction.assets.boards import find_board, with_underside
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.tails import without_whiskers
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
@@ -42,6 +43,9 @@ def complete(
         hull = hull_region(volume, frame.points, to_support=True)
         solid = enclosed(volume, hull, config.enclosed_directions)
         solid |= _contact(volume, hull, frame, solid, furniture=furniture)
+        board = find_board(volume, frame) if furniture else None
+        if board is not None:
+            volume, solid = with_underside(volume, solid, board)
     field = np.where(volume.known, volume.distance, np.where(solid, -volume.trunc_m, volume.trunc_m))
     field = _keep_shells(field.astype(np.float32), volume, config)
     field = _blend(field, volume, frame)

@@ -72,8 +72,8 @@ class AvoConfig:
     """How many of the best starts are followed for a third of the steps of a view; the best of them goes on."""
 
     large_gaussians: int = 2000
-    """Targets of more Gaussians than this (tables, shelves) are optimized at `scan_side_px`, with two thirds of the steps
-    and through no more Gaussians than this: their Gaussians are what takes time. 0: never."""
+    """Targets of more Gaussians than this (tables, shelves) are optimized at `scan_side_px`, with two thirds of the
+    steps and through no more Gaussians than this: their Gaussians are what takes time. 0: never."""
 
     sigma_cutoff: float = 3.5
     """Standard deviations at which a splat ends while views are optimized: a hard edge would falsify the gradient."""

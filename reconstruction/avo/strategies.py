@@ -25,6 +25,7 @@ _APART_DEG = 25.0  # starts that are optimized look from directions at least thi
 _CANONICAL_PITCH_DEG = 25.0
 _BY_PIXELS = 0.15  # beside what is seen anew, which counts as 1
 _FRONTS_FROM = 2  # every second input camera tells fronts from backs
+_FURNITURE_M = 0.35  # radius: what is larger may stand on legs and have an underside
 _LARGE_STEPS = 2 / 3  # of the steps are taken for large targets
 
 
@@ -72,7 +73,6 @@ class ActiveViews:
         """See `Strategy.choose`."""
         weight = config.depth_weight if self._with_depth else 0.0
         closed = close_shape(scene, target)
-        large = 0 < config.large_gaussians < len(target.rows)
         config, scene, target = _affordable(config, scene, target)
         fine = _objective(scene, target, square_camera(config.side_px, config.fov_deg), config)
         search = Search(fine, scene.clearance, target.distance_m, weight, config)
@@ -80,7 +80,7 @@ class ActiveViews:
         fine.fronts = _fronts(scene, target, fine, config)
         if config.starts == "around":
             starts = np.concatenate([starts, starts_around(scene, target, config)])
-            if large:
+            if target.radius_m > _FURNITURE_M:
                 starts = np.concatenate([starts, starts_below(scene, target, config)])
         if self._with_depth:
             starts = _at_target_distance(starts, scene, target, config)
