@@ -17,6 +17,7 @@ from reconstruction.assets.tails import without_whiskers
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 
 _HIDDEN_M = 0.02  # of a foot
+_RIM_DIRECTIONS = 6  # of 8: what has more than its own height in so many directions lies within a rim
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ def _drop_skirts(
 ) -> None:
     """Free what lies flat on the support around the object: support surface that was labelled as the object.
 
-    Depth is uncertain at outlines, so that a rim of the support within the noise counts as object there.
+    Depth is uncertain at outlines, so that a rim of the support within the noise counts as object there. What lies
+    flat within the object's own rim is its floor, and so is what something stands on.
     """
     height = max(3.0 * volume.noise_m, 2.0 * volume.voxel_m)
     if float(np.percentile(frame.points[:, 2], 98)) < 3.0 * height:
@@ -97,7 +99,10 @@ def _drop_skirts(
     taller = ((distance[:, :, last:] < 0) & known[:, :, last:]).any(axis=2)
     # Below unseen space there may still be object.
     hidden = (~known[:, :, last : last + 2]).any(axis=2)
-    skirt = ~taller & ~hidden
+    within = _directions_met(~taller[:, :, None], taller[:, :, None])[:, :, 0] >= _RIM_DIRECTIONS
+    skirt = ~taller & ~hidden & ~within
+    if volume.carrying is not None:
+        skirt &= ~volume.carrying
     for k in range(first, last):
         distance[:, :, k][skirt] = volume.trunc_m
         known[:, :, k][skirt] = True
@@ -146,10 +151,15 @@ def enclosed(volume: ObjectVolume, hull: np.ndarray, needed: int) -> np.ndarray:
     """
     unknown = ~volume.known & hull
     inside = volume.known & (volume.distance < 0)
-    count = np.zeros(volume.distance.shape, np.uint8)
+    return unknown & (_directions_met(unknown, inside) >= needed)
+
+
+def _directions_met(unknown: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return in how many of 8 horizontal directions (nx, ny, nz) the first voxel that is not unknown is inside."""
+    count = np.zeros(unknown.shape, np.uint8)
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         count += _meets(unknown, inside, dx, dy)
-    return unknown & (count >= needed)
+    return count
 
 
 def _meets(unknown: np.ndarray, inside: np.ndarray, dx: int, dy: int) -> np.ndarray:

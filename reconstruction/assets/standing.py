@@ -21,6 +21,9 @@ _FOOTPRINT_SHRINK_M = 0.006
 _SMEAR_REACH_M = 0.06  # depth of a thing smears as far onto what is around it
 _RISE_M = 0.004
 _LEAST_HIDDEN_M, _HIDDEN_BELOW_M = 0.01, 0.02  # the rim of what hides a foot passes for its support
+_LEAST_COVERED_M = 0.02  # of a carrier's sides is seen below the thing that covers it
+_COVERED_REACH_M, _COVERED_OVERLAP_M = 0.008, 0.012  # the sides err by as much
+_COVERED_SHARE, _COVERED_POINTS = 0.5, 30  # of the upper half of its sides
 _MOST_BEHIND = 0.5  # of a thing's volume: a wall that cuts off more is none
 _LEVEL_AROUND = 0.8  # of a rise's outline, where its carrier is at the level of what stands beside it
 
@@ -85,6 +88,8 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
             outline = flat[ConvexHull(flat).vertices]
         except (QhullError, ValueError):
             continue
+        if parent in seen and level is not None:
+            level = _covered_top(outline, float(low), level, seen[parent].points) or level
         by_child[item.id] = Standing(
             item.id, parent, float(low if level is None else level), level is not None, outline, float(high)
         )
@@ -98,6 +103,28 @@ def _hidden_foot(item: Instance, low: float, high: float) -> float | None:
     """
     bottom = float(item.center[2] - 0.5 * item.extents_m[2])
     return bottom if _LEAST_HIDDEN_M < low - bottom <= high - low else None
+
+
+def _covered_top(outline: np.ndarray, low: float, level: float, carrier: np.ndarray) -> float | None:
+    """Return the height of the top of a carrier that the thing on it covers, or None where it does not.
+
+    Args:
+        outline: of the thing, seen from above (k, 2).
+        low: where what was seen of the thing ends.
+        level: where the carrier's surface around it seemed to be.
+        carrier: points of the carrier (n, 3), world.
+
+    Its sides are all that is seen of such a carrier, and where they meet what it stands on itself passes for its top.
+    The wall of a container rises as high, but around the thing.
+    """
+    if low - level < _LEAST_COVERED_M:
+        return None
+    sides = carrier[carrier[:, 2] > 0.5 * (low + level)]
+    below = _within(sides[:, :2], outline, _COVERED_REACH_M)
+    if below.sum() < _COVERED_POINTS or below.mean() < _COVERED_SHARE:
+        return None
+    top = float(np.percentile(sides[below, 2], 95))
+    return top if top < low + _COVERED_OVERLAP_M else None
 
 
 def _agreed(by_child: dict[int, Standing]) -> dict[int, Standing]:
@@ -149,6 +176,7 @@ def without_children(
     own_plan = np.ones(shape, bool)
     if len(frame.points):
         own_plan = _within(plane, _outline(frame.points[:, :2]), volume.voxel_m).reshape(shape)
+    carrying = np.zeros(shape, bool)
     for s, corners, own in zip(standing, corners_of, filled):
         near = _within(plane, corners[:, :2], _SMEAR_REACH_M).reshape(shape)
         top = corners[0, 2] + s.top_m - s.level_m
@@ -164,7 +192,8 @@ def without_children(
             known[:, :, k][inside] = True
             free[:, :, k][inside] = True
             seen[:, :, k][inside] = above[k] < volume.trunc_m
-        core = _within(plane, corners[:, :2], -_FOOTPRINT_SHRINK_M).reshape(len(x), len(y)) & own_plan
+        core = _within(plane, corners[:, :2], -_FOOTPRINT_SHRINK_M).reshape(shape) & own_plan
+        carrying |= core
         for k in np.flatnonzero((above <= 0) & (above > -max(_BOARD_M, 2.5 * volume.voxel_m))):
             depth_below = max(float(above[k]), -volume.trunc_m)
             distance[:, :, k][core] = np.minimum(
@@ -172,7 +201,7 @@ def without_children(
             )
             known[:, :, k][core] = True
             free[:, :, k][core] = False
-    return replace(volume, distance=distance, known=known, free=free, seen=seen)
+    return replace(volume, distance=distance, known=known, free=free, seen=seen, carrying=carrying)
 
 
 def _smeared(

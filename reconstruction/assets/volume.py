@@ -30,6 +30,7 @@ class ObjectVolume:
     known: np.ndarray  # bool (nx, ny, nz)
     free: np.ndarray  # bool (nx, ny, nz) a ray passed through
     seen: np.ndarray  # bool (nx, ny, nz) close to measured surface of the object
+    carrying: np.ndarray | None = None  # bool (nx, ny) columns that something stands on
 
     def centers(self, axis: int) -> np.ndarray:
         """Return the coordinates of voxel centres along one axis."""

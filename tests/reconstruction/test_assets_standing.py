@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruction.assets.standing import Standing, _agreed, _hidden_foot, within_walls, without_children
+from reconstruction.assets.completion import _settle_on_support
+from reconstruction.assets.standing import (
+    Standing,
+    _agreed,
+    _covered_top,
+    _hidden_foot,
+    within_walls,
+    without_children,
+)
 from reconstruction.assets.support import support_height
 from reconstruction.assets.views import SeenPoints
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
@@ -167,3 +175,62 @@ def test_nothing_of_a_thing_lies_behind_a_wall():
     )  # most is behind: no wall
     assert solid_columns((before,)).min() == pytest.approx(-0.295)
     assert solid_columns((wall,), replace(frame, wall_y=0.0)).max() == pytest.approx(0.295)
+
+
+def flat_on_its_support(rim) -> tuple[ObjectVolume, ObjectFrame]:
+    """7 mm of thing all over a support at z = 0, and 5 cm of it where `rim` of x and y says so."""
+    voxel = 0.005
+    x, z = -0.2 + (np.arange(80) + 0.5) * voxel, -0.02 + (np.arange(20) + 0.5) * voxel
+    a, b = np.meshgrid(x, x, indexing="ij")
+    top = np.where(rim(a, b), 0.05, 0.007)
+    distance = np.clip(z - top[..., None], -0.02, 0.02).astype(np.float32)
+    every = np.ones(distance.shape, bool)
+    tall = rim(a, b)
+    points = np.column_stack([a[tall], b[tall], np.full(tall.sum(), 0.05)])
+    volume = ObjectVolume(
+        np.array([-0.2, -0.2, -0.02]), voxel, 0.02, 0.004, distance, every, distance > 0, every
+    )
+    return volume, ObjectFrame(np.eye(4), points, np.zeros_like(points), True, None)
+
+
+def lowest_layer(volume: ObjectVolume, frame: ObjectFrame) -> np.ndarray:
+    """Where (nx, ny) the thing is solid just above its support."""
+    made = _settle_on_support(volume, frame)
+    return made.distance[:, :, int(np.searchsorted(made.centers(2), 0.0))] < 0
+
+
+def test_a_thin_floor_within_a_rim_stays_and_what_lies_as_flat_around_it_goes():
+    tray = flat_on_its_support(lambda x, y: (np.hypot(x, y) > 0.1) & (np.hypot(x, y) < 0.11))
+    solid = lowest_layer(*tray)
+    assert solid[40, 40]
+    assert solid[30, 45]
+    assert not solid[2:10].any()
+    assert not solid[40, 70:].any()
+
+
+def test_a_thin_floor_stays_below_what_stands_on_it_where_its_rim_was_seen_on_two_sides_only():
+    volume, frame = flat_on_its_support(
+        lambda x, y: ((x > 0.1) & (x < 0.11) & (y < 0.11)) | ((y > 0.1) & (y < 0.11) & (x < 0.11))
+    )
+    assert not lowest_layer(volume, frame)[30, 30]
+    angle = np.arange(24) * np.pi / 12
+    outline = 0.04 * np.column_stack([np.cos(angle), np.sin(angle)]) - 0.05
+    everywhere = np.concatenate([frame.points, [[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [-0.2, 0.2, 0.0]] * 9])
+    standing = (Standing(5, 4, 0.007, True, outline, 0.1),)
+    made = without_children(volume, replace(frame, points=everywhere), standing, 0.01)
+    solid = lowest_layer(made, frame)
+    assert solid[30, 30]
+    assert not solid[2:10, :55].any()
+
+
+def test_a_thing_that_covers_its_carrier_stands_on_top_of_what_is_seen_of_its_sides():
+    outline = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
+    x, z = np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(0.4, 0.44, 20))
+    side = np.column_stack([x.ravel(), np.full(x.size, -0.098), z.ravel()])
+    other = side[:, [1, 0, 2]]
+    book = np.concatenate([side, other])
+    assert _covered_top(outline, 0.438, 0.405, book) == pytest.approx(0.44, abs=1e-3)
+    # It was seen down to where it seemed to stand; what is below it is a wall of what it is in, higher than it ends.
+    assert _covered_top(outline, 0.41, 0.405, book) is None
+    assert _covered_top(0.8 * outline, 0.438, 0.405, book) is None
+    assert _covered_top(outline, 0.42, 0.39, book + np.array([0, 0, 0.1])) is None
