@@ -5,6 +5,7 @@ than reading them, and all of them together more than the physics does. What is 
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,9 @@ from mani_skill.agents.robots import Fetch, Panda
 _MARGIN_M = 0.02  # more than PhysX keeps between bodies in contact
 _GRASP_N, _GRASP_DEG = 0.5, 85  # as in `is_grasping`
 # Inverse kinematics: ManiSkill's goes a tenth of the way to the goal a step, until 1e-4 are left.
-_BOLD, _POSE_TOLERANCE = 0.5, 1e-6
+_BOLD, _POSE_TOLERANCE = 0.5, 1e-5
+# What is left after 30 bold steps (m, rad) where the hand cannot get: ManiSkill's steps end no nearer.
+_OUT_OF_REACH = 2e-3
 
 
 class DirectReads:
@@ -303,8 +306,7 @@ class _Tip:
         self._indices = controller.active_joint_indices.numpy()
         self._root, self._tip = controller.root_link._objs[0], controller.ee_link._objs[0]
         low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
-        self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
-        self._least, self._most = -np.ones(3, np.float32), np.ones(3, np.float32)
+        self._middle, self._half = (0.5 * (high + low)).tolist(), (0.5 * (high - low)).tolist()
         self._turn = controller.config.rot_lower if type(controller) is PDEEPoseController else None
         kinematics = controller.kinematics
         self._known = kinematics.pmodel_active_joint_indices.numpy()
@@ -313,20 +315,19 @@ class _Tip:
 
     def drive(self, qpos: np.ndarray, action: np.ndarray) -> None:
         """Set the targets of a robot at `qpos` (d,) to where the hand is moved and turned by an action (3,) or (6,)."""
-        goal = self._root.entity_pose.inv() * self._tip.entity_pose
-        place = np.maximum(action[:3], self._least)
-        np.minimum(place, self._most, out=place)
-        place *= self._half
-        place += self._middle
-        place += goal.p
+        # In Python's numbers: right after the physics each operation of NumPy costs several of them.
+        *place, w, x, y, z = (self._root.entity_pose.inv() * self._tip.entity_pose).__getstate__()
+        wish = action.tolist()
+        for axis in (0, 1, 2):
+            place[axis] += self._middle[axis] + self._half[axis] * min(max(wish[axis], -1.0), 1.0)
+        turned = (w, x, y, z)
         if self._turn is not None:
-            x, y, z = action[3:].tolist()
-            scale = self._turn / max(math.hypot(x, y, z), 1.0)
-            goal = sapien.Pose(q=_turned(scale * x / 2, scale * y / 2, scale * z / 2)) * goal
-        goal.p = place
+            scale = 0.5 * self._turn / max(math.hypot(*wish[3:]), 1.0)
+            turned = _product(_turned(*(scale * angle for angle in wish[3:])), turned)
+        goal = sapien.Pose(place, turned)
         known = qpos.take(self._known)
-        solution, found, _ = self._solve(known, goal, eps=_POSE_TOLERANCE, dt=_BOLD, max_iterations=30)
-        if not found:
+        solution, found, left = self._solve(known, goal, eps=_POSE_TOLERANCE, dt=_BOLD, max_iterations=30)
+        if not found and math.hypot(*left.tolist()) < _OUT_OF_REACH:
             solution, found, _ = self._solve(known, goal, max_iterations=100)
         start = qpos.take(self._indices)
         target = solution.take(self._solved).astype(np.float32) if found else start
@@ -366,6 +367,17 @@ def _turned(x: float, y: float, z: float) -> list[float]:
     """Return the quaternion of the turn about x, after that about y, after that about z, of half angles (rad)."""
     (a, b, c), (d, e, f) = map(math.cos, (x, y, z)), map(math.sin, (x, y, z))
     return [a * b * c - d * e * f, d * b * c + a * e * f, a * e * c - d * b * f, a * b * f + d * e * c]
+
+
+def _product(one: Iterable[float], other: Iterable[float]) -> list[float]:
+    """Return the quaternion of the turn `other`, then `one`."""
+    (a, b, c, d), (w, x, y, z) = one, other
+    return [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
 
 
 def _row(pose: sapien.Pose) -> np.ndarray:

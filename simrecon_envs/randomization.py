@@ -1,11 +1,12 @@
 """Domain randomization: what may differ from one reset to the next, all of it drawn from the reset's seed.
 
 Poses stay within the support: a thing and what stands on it move together, stay on the level they stand on, and
-touch nothing that they did not touch before. Mass and friction stay within the bundle's `ranges`.
+touch nothing that they did not touch before, nor the robot (`shifting`). Mass and friction stay within the
+bundle's `ranges`.
 """
 
 import zlib
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,12 @@ import torch
 
 from registry import UsageError
 from simrecon_envs.robots import traits_of
-from simrecon_envs.surfaces import CELL_M, height_map
-from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.shifting import Group, about, group_things
 
 _TRIES = 6
 _TINTS = 4  # of each texture, made when they are first drawn
 _TINTED_PX = 512
-_GAP_M = 0.004
-_LEVEL_M = 0.006
+_ARM_M = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +103,11 @@ class Randomizer:
         """Plan the groups that move together; `env` is a `SceneEnv` whose facts are known."""
         self._env, self.config = env, config
         self._entries = {entry["id"]: entry for entry in env.bundle.scene["objects"]}
-        self._groups = _groups(env.facts) if config.shift_m or config.turn_rad else []
+        self._groups: list[Group] = []
+        if config.shift_m or config.turn_rad:
+            robot = env.robot_points if env.placement is None else env.placement.to_world(env.robot_points)
+            # An arm's joints carry the hand about as far as its reach, turned by so much.
+            self._groups = group_things(env.facts, robot, config.joints_rad * _ARM_M)
         self._home: dict[str, np.ndarray] = {}
         self._nominal: dict[int, tuple] = {}
 
@@ -119,22 +122,21 @@ class Randomizer:
         draws = draws.reshape(len(index), len(self._groups), _TRIES, 3)
         moves = [self._moves(one) for one in draws]
         for number, group in enumerate(self._groups):
-            for key in group.members:
-                poses = np.stack([move[number] @ group.start[key] for move in moves])
-                self._env.builder.place(key, poses, self._env.device)
+            for stack in group.stacks:
+                for key, start in stack.start.items():
+                    poses = np.stack([move[number] @ start for move in moves])
+                    self._env.builder.place(key, poses, self._env.device)
 
     def _moves(self, draws: np.ndarray) -> list[np.ndarray]:
         """Return a transform (4, 4) a group from draws (groups, tries, 3) in [-1, 1]."""
-        hulls = [group.hull for group in self._groups]
+        places = {id(group): group.outlines for group in self._groups}
         moves = [np.eye(4) for _ in self._groups]
         for number, group in enumerate(self._groups):
             for draw in draws[number]:
                 shift, turn = draw[:2] * self.config.shift_m, draw[2] * self.config.turn_rad
-                move = _about(group.center, shift, turn)
-                hull = group.hull @ move[:2, :2].T + move[:2, 3]
-                free = all(_gap(hull, hulls[k]) >= least for k, least in group.gaps.items())
-                if free and group.on_support(hull):
-                    hulls[number], moves[number] = hull, move
+                move = group.move(about(group.center, shift, turn), places)
+                if move is not None:
+                    moves[number] = move
                     break
         return moves
 
@@ -235,83 +237,6 @@ class Randomizer:
                     noisy = noisy if picture.is_floating_point() else noisy.round().clamp(max=32767)
                     textures[name] = torch.where(picture == 0, picture, noisy.to(picture.dtype))
         return data
-
-
-@dataclass
-class _Group:
-    """A thing on something that does not move, with all that stands on it."""
-
-    members: tuple[int, ...]
-    center: np.ndarray  # (2,)
-    hull: np.ndarray  # (h, 2) convex, seen from above
-    start: dict[int, np.ndarray]  # world_from_object (4, 4)
-    level: np.ndarray  # bool (nx, ny): cells of the support at the height it stands on
-    lower: np.ndarray  # (2,)
-    gaps: dict[int, float] = field(
-        default_factory=dict
-    )  # least gap to each other group, as seen from above (m)
-
-    def on_support(self, hull: np.ndarray) -> bool:
-        """Tell whether the outline lies on the level that the group stands on."""
-        edges = np.concatenate([hull, (hull + np.roll(hull, 1, axis=0)) / 2])
-        cell = np.floor((edges - self.lower) / CELL_M).astype(int)
-        if (cell < 0).any() or (cell >= self.level.shape).any():
-            return False
-        return bool(self.level[cell[:, 0], cell[:, 1]].all())
-
-
-def _groups(facts: SceneFacts) -> list[_Group]:
-    from scipy.spatial import ConvexHull
-
-    items = {item.id: item for item in facts.bundle.objects}
-    groups = []
-    for key in facts.movable:
-        parent = facts.parent[key]
-        if parent in facts.movable or facts.hangs(key):
-            continue
-        members = (key, *(k for k in facts.above(key) if k in facts.movable))
-        cloud = np.concatenate(
-            [s.vertices[:, :2] for s in facts.solids if s.owner in {key, *facts.above(key)}]
-        )
-        hull = cloud[ConvexHull(cloud).vertices]
-        target = facts.targets[key]
-        window = (hull.min(axis=0) - 0.5, hull.max(axis=0) + 0.5)
-        own = height_map([s for s in facts.solids if s.owner == parent], *window)
-        fixed = [s for s in facts.solids if s.owner not in facts.movable and s.owner != parent]
-        blocked = height_map([s for s in fixed if s.lower[2] < target.top_m], *window).top
-        level = (np.abs(own.top - target.bottom_m) <= _LEVEL_M) & (blocked <= target.bottom_m + _LEVEL_M)
-        start = {k: np.asarray(items[k].world_from_object) for k in members}
-        groups.append(_Group(members, target.center[:2], hull, start, level, own.lower))
-    for number, group in enumerate(groups):
-        # What overlaps as it was captured (one leans over the other, say) never comes nearer than that.
-        group.gaps = {
-            k: min(_gap(group.hull, other.hull), _GAP_M) for k, other in enumerate(groups) if k != number
-        }
-    return groups
-
-
-def _about(center: np.ndarray, shift: np.ndarray, turn: float) -> np.ndarray:
-    """Return the transform (4, 4) that turns about a vertical axis and shifts."""
-    c, s = np.cos(turn), np.sin(turn)
-    out = np.eye(4)
-    out[:2, :2] = [[c, -s], [s, c]]
-    out[:2, 3] = center + shift - out[:2, :2] @ center
-    return out
-
-
-def _gap(first: np.ndarray, second: np.ndarray) -> float:
-    """Return how far apart (m) two convex outlines (h, 2) are along the normal that separates them best.
-
-    Negative where they overlap: by how much one has to move to be clear of the other.
-    """
-    gaps = []
-    for hull in (first, second):
-        edges = np.roll(hull, -1, axis=0) - hull
-        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
-        a, b = first @ normals.T, second @ normals.T
-        gaps.append(np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0)).max())
-    return float(max(gaps))
 
 
 def _draw_lights(scene: Any, rng: np.random.RandomState, most: float, home: dict, number: int) -> None:

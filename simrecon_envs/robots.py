@@ -4,6 +4,7 @@ import contextlib
 import difflib
 import functools
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,7 @@ class RobotShape:
     points: np.ndarray  # float64 (n, 3) on its surface
     rest_qpos: np.ndarray  # float64 (d,)
     has_gripper: bool  # it can tell whether it grasps an object
+    control_modes: tuple[str, ...] = ()
 
 
 def usable_robots() -> list[str]:
@@ -85,8 +87,7 @@ def check_robot(uid: str) -> None:
     agents = _agents()
     listed = ", ".join(usable_robots())
     if uid not in agents:
-        near = difflib.get_close_matches(str(uid), agents, n=1)
-        meant = f" Did you mean {near[0]!r}?" if near else ""
+        meant = did_you_mean(uid, agents)
         raise UsageError(f"robot {uid!r} is not known to ManiSkill.{meant} Usable here: {listed}")
     if _file_of(agents[uid]) is None:
         raise EnvironmentMissing(
@@ -124,7 +125,28 @@ def robot_shape(uid: str) -> RobotShape:
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
     # One point a cell is enough, and much less to test.
     _, kept = np.unique(np.floor(points / _SAMPLE_SPACING_M), axis=0, return_index=True)
-    return RobotShape(points[np.sort(kept)], qpos, hasattr(agent, "is_grasping") and hasattr(agent, "tcp"))
+    grips = hasattr(agent, "is_grasping") and hasattr(agent, "tcp")
+    return RobotShape(points[np.sort(kept)], qpos, grips, tuple(agent.supported_control_modes))
+
+
+def check_control_mode(uid: str, mode: str | None) -> None:
+    """Make sure that a robot can be controlled in a way; None is its first.
+
+    Raises:
+        UsageError: lists the robot's ways, and the nearest.
+    """
+    modes = robot_shape(uid).control_modes
+    if mode is not None and mode not in modes:
+        raise UsageError(
+            f"control_mode {mode!r}: expected one of {', '.join(modes)} of robot {uid!r}."
+            + did_you_mean(mode, modes)
+        )
+
+
+def did_you_mean(wrong: object, known: Iterable[str]) -> str:
+    """Return a sentence with the nearest of what is known, with a space before it, or nothing."""
+    near = difflib.get_close_matches(str(wrong), list(known), n=1)
+    return f" Did you mean {near[0]!r}?" if near else ""
 
 
 def rest_qpos(agent: object) -> np.ndarray:

@@ -134,6 +134,16 @@ class SceneBuilder:
                 )
             self._set_pose(body.root, position, quat_from_matrix(rotation), device)
 
+    def rest(self) -> None:
+        """Let everything sleep until something touches or moves it; one environment on the CPU.
+
+        It rests as it was captured, and the assembly let it settle there. PhysX adds up forces in another order when
+        anything else in the scene stands elsewhere, and a thing that is balanced on another could tip over by that.
+        """
+        for body in self.bodies:
+            if body.dynamic:
+                self.objects[body.root].actor._bodies[0].put_to_sleep()
+
     def shift(self, key: int, env_idx: torch.Tensor, moved: np.ndarray, device: torch.device) -> None:
         """Move an object of the environments `env_idx` (b,) by (b, 3) from where the bundle has it."""
         body = next(body for body in self.bodies if body.root == key)

@@ -35,7 +35,15 @@ from simrecon_envs.measures import Measures
 from simrecon_envs.placement import Target
 from simrecon_envs.planning import Plan, plan_task
 from simrecon_envs.randomization import Randomization, Randomizer
-from simrecon_envs.robots import RobotShape, check_robot, rest_qpos, robot_shape, traits_of
+from simrecon_envs.robots import (
+    RobotShape,
+    check_control_mode,
+    check_robot,
+    did_you_mean,
+    rest_qpos,
+    robot_shape,
+    traits_of,
+)
 from simrecon_envs.scene_builder import SceneBuilder, scene_extent
 from simrecon_envs.stepping import DirectStep, check_action, flatten
 from simrecon_envs.tasks import PickTaskConfig, kind_of
@@ -44,6 +52,9 @@ from simrecon_envs.viewpoints import camera, observing_cameras, parse_cameras
 
 logger = logging.getLogger(__name__)
 
+OBS_MODES = (
+    "state", "state_dict", "none", "rgb", "depth", "segmentation", "rgbd", "pointcloud", "sensor_data",
+)  # fmt: skip
 # What observations with pictures keep of a task's own: touch, and what the robot was told.
 PUBLIC = ("is_grasped", "goal_position", "stage")
 
@@ -149,6 +160,7 @@ class SceneEnv(BaseEnv):
             )
         if robot_uids != "none":
             check_robot(robot_uids)
+            check_control_mode(robot_uids, kwargs.get("control_mode"))
         _check_options(scene_id, obs_mode, kwargs)
         self.bundle, self.revision_note = _load(scene_id, revision, registry, strict_revision)
         self.scene_id = scene_id
@@ -285,6 +297,8 @@ class SceneEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
+        if not self.gpu_sim_enabled and not any(self.pose_noise):
+            self.builder.rest()  # what is moved from here on wakes up
         if self.agent is not None:
             qpos = self._randomizer.joints(env_idx, self._batched_episode_rng, rest_qpos(self.agent))
             self.agent.reset(torch.as_tensor(qpos, dtype=torch.float32, device=self.device))
@@ -395,12 +409,13 @@ def _check_options(scene_id: str, obs_mode: str | None, options: dict) -> None:
         parse_obs_mode_to_struct(obs_mode or "state")
     except AssertionError as error:
         raise UsageError(
-            f"obs_mode {obs_mode!r}: expected state, state_dict, none, rgb, depth, segmentation, rgbd, pointcloud, "
-            "sensor_data, or several with + in between"
+            f"obs_mode {obs_mode!r}: expected {', '.join(OBS_MODES)}, or several with + in between."
+            + did_you_mean(obs_mode, OBS_MODES)
         ) from error
     reward_mode, modes = options.get("reward_mode"), SceneEnv.SUPPORTED_REWARD_MODES
     if reward_mode not in (None, *modes):
-        raise UsageError(f"reward_mode {reward_mode!r}: expected one of {', '.join(modes)}")
+        near = did_you_mean(reward_mode, modes)
+        raise UsageError(f"reward_mode {reward_mode!r}: expected one of {', '.join(modes)}.{near}")
     count = options.get("num_envs", 1)
     if count > 1 and not torch.cuda.is_available():
         raise EnvironmentMissing(

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 
 from simrecon_envs.arrays import Array, larger, norm, real, where, whole
+from simrecon_envs.placement import Placement
+from simrecon_envs.robots import robot_shape
 from simrecon_envs.tasks.base import Info, Task, draw
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
@@ -17,6 +19,7 @@ WITHIN_M = 0.03
 _MOST = 3
 _MOVED_M = (0.08, 0.30)
 _UPRIGHT = 0.95
+_ROBOT_GAP_M = 0.03
 
 
 class Restore(Carry):
@@ -166,11 +169,22 @@ def chosen_things(facts: SceneFacts) -> list[int]:
     return [key for key in things if facts.parent[key] == facts.parent[things[0]]]
 
 
-def displaced(facts: SceneFacts, key: int, placement: object) -> np.ndarray:
-    """Return where a thing may be moved to on its support (k, 3): within the robot's reach, if anything is."""
-    moves = _moves(facts, key)
+def displaced(facts: SceneFacts, key: int, placement: Placement) -> np.ndarray:
+    """Return where a thing may be moved to on its support (k, 3): beside the robot, within its reach if anything is."""
+    moves = _beside_robot(facts, key, placement)
     within = placement.reaches(moves, facts.traits)
     return (moves[within] if within.any() else moves)[:48]
+
+
+def _beside_robot(facts: SceneFacts, key: int, placement: Placement) -> np.ndarray:
+    """Return where a thing may be moved to (k, 3) without touching the robot at rest."""
+    moves, robot = _moves(facts, key), placement.to_world(robot_shape(facts.robot).points)
+    height = robot[None, :, 2] - moves[:, 2, None]
+    beside = (
+        np.linalg.norm(robot[None, :, :2] - moves[:, None, :2], axis=2) > facts.radius_m(key) + _ROBOT_GAP_M
+    )
+    clear = beside | (height < -_ROBOT_GAP_M) | (height > facts.height_m(key) + _ROBOT_GAP_M)
+    return moves[clear.all(axis=1)]
 
 
 def _moves(facts: SceneFacts, key: int) -> np.ndarray:

@@ -74,8 +74,9 @@ def unknown_task(facts: SceneFacts, name: str) -> str:
 
     known = [spec.name for spec in list_specs(facts)]
     every = [spec.name for spec in list_specs(facts, hard=True)]
-    near = [] if "_" in name else difflib.get_close_matches(name, KINDS, n=1)
-    near = near or difflib.get_close_matches(name, every, n=1, cutoff=0.4)
+    near = [] if "_" in name or name in KINDS else difflib.get_close_matches(name, KINDS, n=1)
+    if name not in KINDS:  # a kind that this scene has nothing for is spelled rightly
+        near = near or difflib.get_close_matches(name, every, n=1, cutoff=0.4)
     shown = ", ".join(known[:12]) + (f" and {len(known) - 12} more" if len(known) > 12 else "")
     meant = f" Did you mean {near[0]!r}?" if near else ""
     return (

@@ -1,7 +1,6 @@
 """Every task, robot and observation mode: the checkers of Gymnasium and stable-baselines3, and ManiSkill's ways."""
 
 import os
-import warnings
 from pathlib import Path
 
 import gymnasium as gym
@@ -9,10 +8,9 @@ import numpy as np
 import psutil
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import simrecon_envs
+from benchmarks.conventions import check_case
 
 TASKS = ("reach", "pick", "place", "put", "stack", "push", "rearrange", "none")
 STATE_MODES, PICTURE_MODES = ("state", "state_dict"), ("rgb", "rgbd", "segmentation", "pointcloud")
@@ -60,29 +58,8 @@ def _kwargs(task: str, mode: str) -> dict:
 @pytest.mark.parametrize(("scene", "task", "robot", "mode"), _parameters())
 def test_checkers_pass(scene: str, task: str, robot: str, mode: str, scenes_root: Path) -> None:
     env = simrecon_envs.make_cpu(scene, registry=scenes_root, robot_uids=robot, **_kwargs(task, mode))
-    batched = env.env
-    with warnings.catch_warnings():
-        # The checkers advise against unbounded boxes and small pictures, which ManiSkill's observations are.
-        warnings.simplefilter("ignore")
-        check_env(env, skip_render_check=True)
-        if mode in ("state", "rgb"):
-            sb3_check_env(env, warn=False, skip_render_check=True)
-    # ManiSkill's ways: torch, one row an environment, "success" in the info.
-    obs, info = batched.reset(seed=0)
-    assert batched.observation_space.contains(_numpy(obs))
-    obs, reward, terminated, truncated, info = batched.step(batched.action_space.sample())
-    for value in (reward, terminated, truncated, *([info["success"]] if task != "none" else [])):
-        assert isinstance(value, torch.Tensor)
-        assert value.shape == (1,)
-    assert 0 <= float(reward) <= 1
-    state = batched.unwrapped.get_state()
-    batched.unwrapped.set_state(state)
-    assert torch.allclose(batched.unwrapped.get_state(), state, atol=1e-6)
+    check_case(env)
     env.close()
-
-
-def _numpy(obs: object) -> object:
-    return {key: _numpy(value) for key, value in obs.items()} if isinstance(obs, dict) else np.asarray(obs)
 
 
 def _run_at_the_bounds(env: gym.Env, steps: int) -> None:

@@ -13,7 +13,8 @@ from made_scenes import BLOCK, BOX, CRATE, CUBE, CYLINDER, TABLE, BundleWriter, 
 import simrecon_envs
 from registry import SceneNotFound, SceneRegistry, UsageError
 from simrecon_envs.multi import split_of
-from simrecon_envs.randomization import _GAP_M, Randomization, _gap
+from simrecon_envs.randomization import Randomization
+from simrecon_envs.shifting import GAP_M, about, gap, group_things
 
 
 def _make(root: Path, scene: str = "things", **kwargs: object) -> gym.Env:
@@ -24,10 +25,11 @@ def _outline(env: gym.Env, key: int) -> np.ndarray:
     """Return where an object's outline (h, 2) is now."""
     scene = env.unwrapped
     item = next(o for o in scene.bundle.objects if o.id == key)
-    group = next(g for g in scene._randomizer._groups if key in g.members)
+    stacks = [stack for group in scene._randomizer._groups for stack in group.stacks]
+    hull = next(stack.hull for stack in stacks if key in stack.members)
     now = scene.builder.objects[key].actor.pose.to_transformation_matrix()[0].numpy()
     move = now @ np.linalg.inv(item.world_from_object)
-    return group.hull @ move[:2, :2].T + move[:2, 3]
+    return hull @ move[:2, :2].T + move[:2, 3]
 
 
 def test_poses_stay_on_their_support_and_apart(scenes_root: Path) -> None:
@@ -41,7 +43,7 @@ def test_poses_stay_on_their_support_and_apart(scenes_root: Path) -> None:
         for number, hull in enumerate(hulls):
             assert np.abs(hull - [0, 0.9]).max(axis=0)[0] < 0.6 + 0.01
             assert np.abs(hull - [0, 0.9]).max(axis=0)[1] < 0.4 + 0.01
-            assert all(_gap(hull, other) >= _GAP_M for other in hulls[:number])
+            assert all(gap(hull, other) >= GAP_M for other in hulls[:number])
         for _ in range(3):
             env.step(None)
         heights = [float(env.unwrapped.measures.position(key)[0, 2]) for key in env.unwrapped.movable_ids]
@@ -51,29 +53,68 @@ def test_poses_stay_on_their_support_and_apart(scenes_root: Path) -> None:
     env.close()
 
 
-def test_what_leans_over_another_never_comes_nearer_to_it(tmp_path: Path) -> None:
-    writer = BundleWriter(tmp_path / "made")
+def _bumpy_table(folder: Path) -> Path:
+    """Publish a scene "lamp": a lamp whose top is over a cube, a block, and a table that is 4 mm higher at one side."""
+    writer = BundleWriter(folder / "made")
     add_room(writer)
     table = np.eye(4)
     table[:2, 3] = 0, 0.9
-    writer.add_object(TABLE, "table", [box((1.2, 0.8, 0.4))], table, 1, mass=20, dynamic=False)
-    post, top, cube = np.eye(4), [box((0.04, 0.04, 0.2)), box((0.2, 0.2, 0.02), 0.2)], np.eye(4)
-    post[:3, 3], cube[:3, 3] = (0, 0.8, 0.4), (0.07, 0.8, 0.4)
+    parts = [box((1.2, 0.8, 0.4)), box((0.5, 0.8, 0.404), at=(0.35, 0.0))]
+    writer.add_object(TABLE, "table", parts, table, 1, mass=20, dynamic=False)
+    post, top, cube, block = (
+        np.eye(4),
+        [box((0.04, 0.04, 0.2)), box((0.2, 0.2, 0.02), 0.2)],
+        np.eye(4),
+        np.eye(4),
+    )
+    post[:3, 3], cube[:3, 3], block[:3, 3] = (-0.3, 0.8, 0.4), (-0.23, 0.8, 0.4), (0.05, 1.0, 0.4)
     writer.add_object(BLOCK, "lamp", top, post, TABLE)
     writer.add_object(CUBE, "cube", [box((0.05, 0.05, 0.06))], cube, TABLE)
+    writer.add_object(CYLINDER, "block", [box((0.06, 0.06, 0.08))], block, TABLE)
     writer.seal("lamp")
-    SceneRegistry(tmp_path / "registry", create=True).publish(writer.folder, "lamp")
-    env = _make(tmp_path / "registry", "lamp", randomize={"shift_m": 0.05, "turn_rad": 0.5})
-    lamp, under = env.unwrapped._randomizer._groups
-    captured = _gap(lamp.hull, under.hull)
-    assert captured < -0.02  # the lamp's top is over the cube
-    gaps = []
+    SceneRegistry(folder / "registry", create=True).publish(writer.folder, "lamp")
+    return folder / "registry"
+
+
+def test_what_leans_over_another_moves_with_it_and_nothing_is_thrown(tmp_path: Path) -> None:
+    config = {"shift_m": 0.15, "turn_rad": 0.5}
+    env = _make(_bumpy_table(tmp_path), "lamp", randomize=config, task="none")
+    scene = env.unwrapped
+    assert [group.members for group in scene._randomizer._groups] == [(CYLINDER,), (BLOCK, CUBE)]
+    lamp, cube, block = (scene.movable_ids.index(key) for key in (BLOCK, CUBE, CYLINDER))
+    gaps, heights, moved = [], [], []
     for seed in range(20):
         env.reset(seed=seed)
-        gaps.append(_gap(_outline(env, BLOCK), _outline(env, CUBE)))
-    assert min(gaps) >= captured - 1e-6
-    assert max(gaps) > captured + 0.005
+        gaps.append(gap(_outline(env, BLOCK), _outline(env, CUBE)))
+        start = scene.measures.poses[0, :, :3].copy()
+        heights.append(start[block, 2])
+        moved.append(start[[lamp, cube, block], :2])
+        for _ in range(10):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+        scene.measures.refresh()
+        assert np.linalg.norm(scene.measures.poses[0, :, :3] - start, axis=1).max() < 0.006
+    np.testing.assert_allclose(gaps, gaps[0], atol=1e-5)
+    assert min(heights) == pytest.approx(0.4, abs=1e-4)
+    assert max(heights) == pytest.approx(0.404, abs=1e-3)  # where the table is higher
+    assert np.std(moved, axis=0).min() > 0.01
     env.close()
+
+
+def test_nothing_is_moved_to_where_the_robot_is(scenes_root: Path) -> None:
+    scene = _make(scenes_root, randomize="start", task="none").unwrapped
+    cube, robot = (
+        next(s for g in scene._randomizer._groups for s in g.stacks if CUBE in s.members),
+        np.zeros((1, 3)),
+    )
+    robot[0, 2] = cube.height[0] + 0.01
+    for side, free in ((0.01, False), (0.05, True)):
+        right, middle = cube.hull[:, 0].max(), cube.hull[:, 1].mean()
+        robot[0, :2] = right + 0.02 + side, middle
+        group = next(g for g in group_things(scene.facts, robot) if CUBE in g.members)
+        places = {id(other): other.outlines for other in group.others}
+        move = group.move(about(group.center, np.array([0.02, 0]), 0.0), places)
+        assert (move is not None) == free
+    scene.close()
 
 
 def test_what_stands_on_a_thing_moves_with_it(scenes_root: Path) -> None:

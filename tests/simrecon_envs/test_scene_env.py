@@ -213,13 +213,35 @@ def test_a_hard_target_is_possible_but_noted(scenes_root: Path) -> None:
         ({"task": "juggle"}, "has no task 'juggle'.*Kinds: reach, pick.*pick_box"),
         ({"task": "pik"}, "Did you mean 'pick'"),
         ({"robot_uids": "pandaa"}, "Did you mean 'panda'.*fetch"),
-        ({"obs_mode": "rgbb"}, "obs_mode 'rgbb': expected state, .*rgbd"),
+        ({"obs_mode": "rgbb"}, "obs_mode 'rgbb': expected state, .*rgbd.*Did you mean 'rgb'"),
+        (
+            {"control_mode": "pd_ee_delta_poses"},
+            "control_mode 'pd_ee_delta_poses': expected one of pd_joint_delta_pos, .*of robot 'panda'. "
+            "Did you mean 'pd_ee_delta_pose'",
+        ),
         ({"reward_mode": "shaped"}, "reward_mode 'shaped': expected one of normalized_dense, dense"),
     ],
 )
 def test_wrong_arguments_list_the_right_ones(kwargs: dict, text: str, scenes_root: Path) -> None:
     with pytest.raises(UsageError, match=text):
         _make(scenes_root, **kwargs)
+
+
+def test_what_nobody_moved_sleeps_until_something_moves(scenes_root: Path) -> None:
+    env = simrecon_envs.make("things", registry=scenes_root, task="rearrange")
+    scene = env.unwrapped
+    bodies = {placed.id: placed.actor._bodies[0] for placed in scene.builder.movable_actors}
+    for seed in range(2):
+        env.reset(seed=seed)
+        moved = {stage.subject for stage in scene.task_object.stages}
+        assert {key for key, body in bodies.items() if not body.is_sleeping} == moved
+        before = scene.measures.poses.copy()
+        for _ in range(5):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+        for row, key in enumerate(bodies):
+            same = np.array_equal(scene.measures.poses[0, row], before[0, row])
+            assert same or key in moved
+    env.close()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")

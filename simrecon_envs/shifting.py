@@ -1,0 +1,231 @@
+"""Which things are moved together at reset, and where they may go: as seen from above, with the heights of supports."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from simrecon_envs.surfaces import CELL_M, height_map
+from simrecon_envs.tasks.facts import SceneFacts
+
+GAP_M = 0.004
+_LEVEL_M = 0.006
+_ROBOT_GAP_M = 0.02
+_AROUND_M = 0.5  # of a support, around what stands on it
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A thing on something that does not move, with all that stands on it; where it was captured."""
+
+    members: tuple[int, ...]
+    hull: np.ndarray  # (h, 2) convex, counterclockwise as seen from above
+    height: tuple[float, float]  # from its bottom to the top of what stands on it (m, world)
+    start: dict[int, np.ndarray]  # world_from_object (4, 4)
+    top: np.ndarray  # (nx, ny) height of its support, and of what does not move and is in the way
+    own: np.ndarray  # (nx, ny) height of its support alone
+    lower: np.ndarray  # (2,)
+
+    def stands(self, hull: np.ndarray) -> bool:
+        """Tell whether the outline lies on the level that it stands on, and nothing within is higher."""
+        edge = np.floor((_along(hull) - self.lower) / CELL_M).astype(int)
+        if (edge < 0).any() or (edge >= self.top.shape).any():
+            return False
+        outline = self.top[edge[:, 0], edge[:, 1]]
+        if (np.abs(outline - self.height[0]) > _LEVEL_M).any():
+            return False
+        return bool((self.top[self._within(hull)] <= self.height[0] + _LEVEL_M).all())
+
+    def rise(self, hull: np.ndarray) -> float:
+        """Return by how much (m) its support is higher under an outline than where it was captured.
+
+        Reconstructed tops are level to some millimetres, and PhysX throws what is that deep in another thing.
+        """
+        return max(self._highest(hull) - self._stood_at, 0.0)
+
+    @functools.cached_property
+    def _stood_at(self) -> float:
+        return self._highest(self.hull)
+
+    def _highest(self, hull: np.ndarray) -> float:
+        return float(self.own[self._within(hull)].max(initial=self.height[0] - _LEVEL_M))
+
+    def _within(self, hull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cells (k,), (k,) that an outline covers, and those that it touches."""
+        least = np.floor((hull.min(axis=0) - self.lower) / CELL_M).astype(int).clip(0, self.own.shape)
+        most = np.ceil((hull.max(axis=0) - self.lower) / CELL_M).astype(int).clip(0, self.own.shape)
+        grid = np.mgrid[least[0] : most[0], least[1] : most[1]].reshape(2, -1)
+        near = _outside(self.lower + (grid.T + 0.5) * CELL_M, hull) < CELL_M / 2
+        return grid[0, near], grid[1, near]
+
+
+@dataclass
+class Group:
+    """Stacks that overlap as seen from above (one leans over the other, say): they move as one."""
+
+    stacks: list[Stack]
+    others: list["Group"]
+    robot: np.ndarray  # (n, 3) points on the robot at rest, world
+    robot_gap_m: float
+
+    @functools.cached_property
+    def members(self) -> tuple[int, ...]:
+        """Return the ids of its things."""
+        return tuple(key for stack in self.stacks for key in stack.members)
+
+    @functools.cached_property
+    def center(self) -> np.ndarray:
+        """Return what it turns about (2,)."""
+        return np.mean([stack.hull.mean(axis=0) for stack in self.stacks], axis=0)
+
+    @functools.cached_property
+    def outlines(self) -> list[np.ndarray]:
+        """Return the stacks' outlines as they were captured."""
+        return [stack.hull for stack in self.stacks]
+
+    @functools.cached_property
+    def _beside(self) -> list[tuple[np.ndarray, float]]:
+        """Return of every stack the robot's points (n, 2) at its height, and how near they may be (m)."""
+        out = []
+        for stack in self.stacks:
+            low, high = stack.height
+            z = self.robot[:, 2]
+            near = (z > low - self.robot_gap_m) & (z < high + self.robot_gap_m)
+            points = self.robot[near, :2]
+            captured = float(_outside(points, stack.hull).min(initial=np.inf))
+            out.append((points, min(captured, self.robot_gap_m)))
+        return out
+
+    def least_gap(self, other: "Group", mine: int, theirs: int) -> float:
+        """Return how near (m) one of its stacks may come to another group's: no nearer than both were captured."""
+        return min(gap(self.stacks[mine].hull, other.stacks[theirs].hull), GAP_M)
+
+    def move(self, transform: np.ndarray, places: dict[int, list[np.ndarray]]) -> np.ndarray | None:
+        """Return a horizontal move (4, 4), risen to where the supports are; None where it cannot go there.
+
+        Args:
+            transform: The move.
+            places: The outlines of all groups' stacks as they stand now, by the groups' `id`.
+        """
+        hulls = [hull @ transform[:2, :2].T + transform[:2, 3] for hull in self.outlines]
+        if not all(stack.stands(hull) for stack, hull in zip(self.stacks, hulls, strict=True)):
+            return None
+        for (points, least), hull in zip(self._beside, hulls, strict=True):
+            if (_outside(points, hull) < least).any():
+                return None
+        for other in self.others:
+            for theirs, place in enumerate(places[id(other)]):
+                for mine, hull in enumerate(hulls):
+                    if gap(hull, place) < self.gaps[id(other), mine, theirs]:
+                        return None
+        places[id(self)] = hulls
+        risen = transform.copy()
+        risen[2, 3] = max(stack.rise(hull) for stack, hull in zip(self.stacks, hulls, strict=True))
+        return risen
+
+    @functools.cached_property
+    def gaps(self) -> dict[tuple[int, int, int], float]:
+        """Return `least_gap` of all pairs of stacks, by the other group's `id`."""
+        return {
+            (id(other), mine, theirs): self.least_gap(other, mine, theirs)
+            for other in self.others
+            for mine in range(len(self.stacks))
+            for theirs in range(len(other.stacks))
+        }
+
+
+def group_things(facts: SceneFacts, robot: np.ndarray, robot_gap_m: float = 0.0) -> list[Group]:
+    """Return what moves together, in the order of ids.
+
+    Args:
+        facts: The scene's.
+        robot: Points (n, 3) on the robot at rest, world; nothing is moved to where it is.
+        robot_gap_m: How far the robot's joints may be from there besides.
+    """
+    stacks, found = _stacks(facts), []
+    left = set(range(len(stacks)))
+    while left:
+        together, new = set(), {min(left)}
+        while new:
+            together |= new
+            new = {
+                k for k in left - together if any(gap(stacks[k].hull, stacks[n].hull) < 0 for n in together)
+            }
+        left -= together
+        found.append(Group([stacks[k] for k in sorted(together)], [], robot, _ROBOT_GAP_M + robot_gap_m))
+    for group in found:
+        group.others = [other for other in found if other is not group]
+    return found
+
+
+def _stacks(facts: SceneFacts) -> list[Stack]:
+    from scipy.spatial import ConvexHull
+
+    items = {item.id: item for item in facts.bundle.objects}
+    stacks = []
+    for key in facts.movable:
+        parent = facts.parent[key]
+        if parent in facts.movable or facts.hangs(key):
+            continue
+        with_it = {key, *facts.above(key)}
+        members = (key, *(k for k in facts.above(key) if k in facts.movable))
+        cloud = np.concatenate([s.vertices for s in facts.solids if s.owner in with_it])
+        flat = cloud[:, :2]
+        hull = flat[ConvexHull(flat).vertices]
+        target = facts.targets[key]
+        window = (hull.min(axis=0) - _AROUND_M, hull.max(axis=0) + _AROUND_M)
+        own = height_map([s for s in facts.solids if s.owner == parent], *window)
+        fixed = [s for s in facts.solids if s.owner not in facts.movable and s.owner != parent]
+        blocked = height_map([s for s in fixed if s.lower[2] < target.top_m], *window).top
+        start = {k: np.asarray(items[k].world_from_object) for k in members}
+        height = (float(target.bottom_m), float(cloud[:, 2].max()))
+        top = np.where(blocked > target.bottom_m + _LEVEL_M, blocked, own.top)
+        stacks.append(Stack(members, hull, height, start, top, own.top, own.lower))
+    return stacks
+
+
+def about(center: np.ndarray, shift: np.ndarray, turn: float) -> np.ndarray:
+    """Return the transform (4, 4) that turns about a vertical axis through `center` (2,) (rad) and shifts (m)."""
+    c, s = np.cos(turn), np.sin(turn)
+    out = np.eye(4)
+    out[:2, :2] = [[c, -s], [s, c]]
+    out[:2, 3] = center + shift - out[:2, :2] @ center
+    return out
+
+
+def gap(first: np.ndarray, second: np.ndarray) -> float:
+    """Return how far apart (m) two convex outlines (h, 2) are along the normal that separates them best.
+
+    Negative where they overlap: by how much one has to move to be clear of the other.
+    """
+    gaps = []
+    for hull in (first, second):
+        normals = _normals(hull)
+        a, b = first @ normals.T, second @ normals.T
+        gaps.append(np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0)).max())
+    return float(max(gaps))
+
+
+def _outside(points: np.ndarray, hull: np.ndarray) -> np.ndarray:
+    """Return how far (n,) (m) points (n, 2) are outside of a convex outline (h, 2), at least; negative within."""
+    normals = _normals(hull)
+    return (points @ normals.T - (hull * normals).sum(axis=1)).max(axis=1)
+
+
+def _normals(hull: np.ndarray) -> np.ndarray:
+    """Return the normals (h, 2) of the edges of an outline that goes counterclockwise, outwards."""
+    edges = np.roll(hull, -1, axis=0) - hull
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+
+
+def _along(hull: np.ndarray) -> np.ndarray:
+    """Return points (k, 2) on a convex outline, no farther apart than a cell."""
+    ends = np.roll(hull, -1, axis=0)
+    counts = np.maximum(np.ceil(np.linalg.norm(ends - hull, axis=1) / CELL_M).astype(int), 1)
+    return np.concatenate(
+        [
+            a + (b - a) * np.arange(count)[:, None] / count
+            for a, b, count in zip(hull, ends, counts, strict=True)
+        ]
+    )
