@@ -9,6 +9,7 @@ from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts, end_decomposer, kept_parts
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
+from reconstruction.assets.cuboids import unfreed_cuboid
 from reconstruction.assets.cut_off import Room, continued, cut_off_sides, lone_front, with_copies
 from reconstruction.assets.edges import with_simple_edges
 from reconstruction.assets.fused import fused_points, without_strays
@@ -289,6 +290,8 @@ def embedded_solid(
     if frame.wall_y is None:
         tolerance = max(0.003, 1.5 * volume.noise_m, 0.8 * volume.voxel_m)
         cuboid = solid.fit_cuboid(frame.points, frame.normals, body, tolerance)
+        if cuboid is None:
+            cuboid = unfreed_cuboid(volume, frame, tolerance)
         if cuboid is not None:
             return cuboid, "observed+box"
     on_bottom = np.abs(body.vertices[:, 2]) < 0.3 * volume.voxel_m
