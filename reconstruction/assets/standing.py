@@ -65,6 +65,8 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
         o.id: within_outlines(lift_object(posed, depth, pixels, o.id), posed, depth, pixels, o.id)
         for o in found.objects
     }
+    # What has no shape with a name may be the lower part of the thing itself: that is not raised onto it.
+    shaped = {o.id for o in found.objects if o.label != "unknown"}
     by_child: dict[int, Standing] = {}
     carriers: dict[int, SeenPoints] = {}
     for item in found.objects:
@@ -88,7 +90,7 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
             outline = flat[ConvexHull(flat).vertices]
         except (QhullError, ValueError):
             continue
-        if parent in seen and level is not None:
+        if level is not None and parent in shaped:
             level = _covered_top(outline, float(low), level, seen[parent].points) or level
         by_child[item.id] = Standing(
             item.id, parent, float(low if level is None else level), level is not None, outline, float(high)
