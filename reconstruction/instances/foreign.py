@@ -41,12 +41,18 @@ _BESIDE_M, _BESIDE_SHARE = 0.05, 0.35  # of a larger one: its own fringe
 
 
 @dataclass(frozen=True)
-class _View:
-    """What all carriers are looked at with."""
+class ColorView:
+    """The surface, and the keyframes that tell its colors."""
 
     graph: MeshGraph
     frames: list[Sighting]
     walls: list[WallPicture]
+
+    @classmethod
+    def of(cls, shell: Shell, frames: list[Sighting]) -> "ColorView":
+        """Return the surface of a shell seen in frames, with pictures of its walls."""
+        walls = [WallPicture(shell.graph, plane, frames) for plane in shell.planes if plane.label == "wall"]
+        return cls(shell.graph, frames, walls)
 
     def shows_wall(self, frame: Sighting, points: np.ndarray, lab: np.ndarray) -> np.ndarray:
         """Return which points, of colors (n, 3) in a frame, have there the color of the wall behind them."""
@@ -87,7 +93,7 @@ def cut_foreign(
     shell: Shell,
     things: list[Thing],
     owner: np.ndarray,
-    frames: list[Sighting],
+    view: ColorView,
     config: InstancesConfig,
     progress: Progress,
 ) -> list[Thing]:
@@ -97,7 +103,7 @@ def cut_foreign(
         shell: the surface and its base.
         things: what was found; theirs are the vertices.
         owner: int32 (v,) base entity of each vertex.
-        frames: keyframes, the surface drawn into them.
+        view: the surface and the keyframes.
         config: what a support and a thing are.
         progress: told of how many were cut off.
 
@@ -105,8 +111,6 @@ def cut_foreign(
         The things, those cut off at the end.
     """
     graph = shell.graph
-    walls = [WallPicture(graph, plane, frames) for plane in shell.planes if plane.label == "wall"]
-    view = _View(graph, frames, walls)
     free = (owner == 0) & ~shell.behind
     for thing in things:
         free[thing.vertices] = False
@@ -123,7 +127,9 @@ def cut_foreign(
     return [*things, *found]
 
 
-def _foreign_on(view: _View, carrier: Thing, free: np.ndarray, config: InstancesConfig) -> list[np.ndarray]:
+def _foreign_on(
+    view: ColorView, carrier: Thing, free: np.ndarray, config: InstancesConfig
+) -> list[np.ndarray]:
     """Return sorted vertices of each thing on a carrier, its own or `free` ones (v,) bool."""
     graph, found = view.graph, []
     supports = [
@@ -138,7 +144,7 @@ def _foreign_on(view: _View, carrier: Thing, free: np.ndarray, config: Instances
     colors = _own_colors(view, carrier.vertices)
     used = np.zeros(len(graph.points), bool)
     for support, pool in pools:
-        own = np.concatenate([colors, _main_colors(graph, support.vertices)])
+        own = np.concatenate([colors, main_colors(graph, support.vertices)])
         pool = pool[~used[pool]]
         odd = pool[view.foreign(pool, own)]
         odd = odd[~unconfirmed(graph.points[odd], graph.normals[odd], view.frames)]
@@ -162,7 +168,7 @@ def _above(
     return rows[support.footprint.contains(graph.points[rows, :2], 2)]
 
 
-def _own_colors(view: _View, vertices: np.ndarray) -> np.ndarray:
+def _own_colors(view: ColorView, vertices: np.ndarray) -> np.ndarray:
     """Return the colors (k, 3) of furniture without the smears on it."""
     graph = view.graph
     some = vertices[:: max(1, len(vertices) // _MOST_SAMPLES)]
@@ -170,10 +176,10 @@ def _own_colors(view: _View, vertices: np.ndarray) -> np.ndarray:
     sure = some[~doubtful]
     if graph.areas[sure].sum() < _WALL_SHARE * graph.areas[some].sum():
         sure = some  # furniture of the wall's color
-    return _main_colors(graph, sure)
+    return main_colors(graph, sure)
 
 
-def _main_colors(graph: MeshGraph, vertices: np.ndarray) -> np.ndarray:
+def main_colors(graph: MeshGraph, vertices: np.ndarray) -> np.ndarray:
     nearest, means = palette(graph.lab[vertices] * LIGHTNESS_WEIGHT, _COLORS, _COLOR_GAP)
     area = np.bincount(nearest, weights=graph.areas[vertices], minlength=len(means))
     return means[area > _MOST_FOREIGN * area.sum()]

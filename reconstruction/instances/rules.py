@@ -5,16 +5,19 @@ import numpy as np
 from reconstruction.instances.base import base_skirts
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.contents import cut_contents
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.feet import merge_feet
 from reconstruction.instances.flats import cut_flats
-from reconstruction.instances.foreign import cut_foreign
+from reconstruction.instances.flush import merge_flush
+from reconstruction.instances.foreign import ColorView, cut_foreign
 from reconstruction.instances.insides import merge_insides
 from reconstruction.instances.pictures import find_pictures
 from reconstruction.instances.scraps import without_fragments, without_skirts
 from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.side_by_side import cut_side_by_side
 from reconstruction.instances.sightings import Sighting
+from reconstruction.instances.skirt_colors import mark_unlike
 from reconstruction.instances.smears import without_smears
 from reconstruction.instances.stacks import cut_stacks
 from reconstruction.instances.stands import merge_stands
@@ -51,10 +54,13 @@ def cut_by_rules(
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)
-    things = cut_foreign(shell, things, owner, frames, config, progress)
+    view = ColorView.of(shell, frames)
+    things = cut_foreign(shell, things, owner, view, config, progress)
+    things = merge_flush(graph, cut_contents(view, things, config, progress), progress)
     things = without_smears(shell, things, owner, frames, config, progress)
     things = cut_side_by_side(graph, surface, things, posed, depth, config, progress)
     things = cut_stacks(graph, surface, things, posed, depth, config, progress)
+    mark_unlike(view, things, owner)
     things = without_skirts(graph, things, progress)
     things = without_fragments(graph, things, shell.base[0].observed, config, progress)
     for thing in things:

@@ -14,13 +14,13 @@ from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import InstanceSet
 
-_SKIRT_M, _SKIRT_BULGE, _SKIRT_TOP = (
+SKIRT_M, _SKIRT_BULGE, _SKIRT_TOP = (
     0.08,
     0.45,
     0.4,
 )  # height, shape, and share of the outline that is a top, at most
 _UP, _TOP_M = 0.6, 0.012
-_TOUCH_M, _BESIDE_M = 0.015, 0.06  # from a larger thing: its nearest, and four fifths of it
+TOUCH_M, _BESIDE_M = 0.015, 0.06  # from a larger thing: its nearest, and four fifths of it
 
 
 def without_fragments(
@@ -69,7 +69,7 @@ def without_skirts(graph: MeshGraph, things: list[Thing], progress: Progress) ->
 def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
     points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
     low, middle, high = quantiles(points[:, 2], areas, (0.02, 0.5, 0.98))
-    if high - low > _SKIRT_M or bulge(graph, thing.vertices) > _SKIRT_BULGE:
+    if high - low > SKIRT_M or bulge(graph, thing.vertices) > _SKIRT_BULGE:
         return False
     hull = cv2.convexHull(points[:, :2].astype(np.float32))
     top = (graph.normals[thing.vertices, 2] > _UP) & (points[:, 2] > high - _TOP_M)
@@ -83,7 +83,7 @@ def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
         reach = quantiles(graph.points[other.vertices, 2], graph.areas[other.vertices], (0.98,))[0]
         if (middle > reach - _TOP_M) if other is thing.rests_on else (high > reach + _TOP_M):
             continue  # on it, or higher than it
-        gap = cKDTree(graph.points[other.vertices]).query(points, distance_upper_bound=_TOUCH_M)[0]
+        gap = cKDTree(graph.points[other.vertices]).query(points, distance_upper_bound=TOUCH_M)[0]
         if not np.isfinite(gap).any():
             continue
         outline = cv2.convexHull(graph.points[other.vertices, :2].astype(np.float32))

@@ -2,9 +2,11 @@
 
 A low thing beside a tall one, or a small one beside a large one, has no waist from both sides. But what is on either
 side of the place where they meet has hardly a color in common, and together they have a bay in their outline that
-neither has alone. One thing of two colors has no such bay, and handles and spouts are of the thing's own colors.
+neither has alone, or level tops of two heights. One thing of two colors has no such bay and no such step, and handles
+and spouts are of the thing's own colors.
 """
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -21,6 +23,12 @@ _COLORS, _COLOR_GAP = 16, 6.0
 _MOST_COMMON = 0.3  # share of either side's area whose color the other side has, too
 _LEAST_SHARE = 0.12  # of the whole on either side
 _SOLID, _BAY = 0.93, 0.025  # of the hull of each side; and more than of the hull of both
+_BLOCK, _STEP_UP_M = 0.9, 0.015  # solidity of what has a level top, and a step between two tops
+_LEVEL, _TOP_M, _TOP_SHARE = (
+    0.7,
+    0.006,
+    0.33,
+)  # z of the normals of a top, half its spread, its share of the hull
 _MIN_SAMPLES, _MOST_SAMPLES = 200, 3000
 _GROUND_M = 0.025  # both stand on the same
 
@@ -49,9 +57,8 @@ def meeting_line(
         if not (side & high).any() or points[side, 2].min() > bottom + _GROUND_M:
             return None
     solid = min(_solidity(points[side & high, :2]) for side in (first, ~first))
-    if solid < _SOLID or solid - _solidity(points[high, :2]) < _BAY:
-        return None
-    return axis, at
+    bay = solid >= _SOLID and solid - _solidity(points[high, :2]) >= _BAY
+    return (axis, at) if bay or (solid >= _BLOCK and _steps(samples, axis, at, clear)) else None
 
 
 def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
@@ -78,6 +85,25 @@ def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
             if common < best:
                 best, line = common, (axis, float(at))
     return line
+
+
+def _steps(samples: SurfaceSamples, axis: np.ndarray, at: float, clear: float) -> bool:
+    """Tell whether both sides of a line have level tops, of two heights."""
+    first, high = samples.points[:, :2] @ axis < at, samples.points[:, 2] > clear
+    tops = [_level_top(samples.of(side & high)) for side in (first, ~first)]
+    return None not in tops and abs(tops[0] - tops[1]) > _STEP_UP_M
+
+
+def _level_top(samples: SurfaceSamples) -> float | None:
+    """Return the height at which most of what faces up is, None where it covers too little of the outline."""
+    up = samples.normals[:, 2] > _LEVEL
+    if not up.any():
+        return None
+    z, areas = samples.points[up, 2], samples.areas[up]
+    height = quantiles(z, areas, (0.5,))[0]
+    level = areas[np.abs(z - height) < _TOP_M].sum()
+    hull = cv2.contourArea(cv2.convexHull(samples.points[:, :2].astype(np.float32)))
+    return float(height) if level > _TOP_SHARE * hull else None
 
 
 def _solidity(flat: np.ndarray) -> float:

@@ -6,7 +6,7 @@ from surfaces import filmed, looking_at, merged, sheet, solid_box, surface_from
 
 from reconstruction.instances import InstancesConfig
 from reconstruction.instances.cut import Shell
-from reconstruction.instances.foreign import cut_foreign
+from reconstruction.instances.foreign import ColorView, cut_foreign
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import sightings
 from reconstruction.progress import NO_PROGRESS
@@ -40,7 +40,9 @@ def cut(book_color, *, raised=True, smeared=False):
     points = shell.graph.points
     whole = Thing(np.flatnonzero((shell.owner == 0) & (points[:, 2] > 0.02)))
     frames = sightings(surface, posed, depth)
-    things = cut_foreign(shell, [whole], shell.owner, frames, InstancesConfig(), NO_PROGRESS)
+    things = cut_foreign(
+        shell, [whole], shell.owner, ColorView.of(shell, frames), InstancesConfig(), NO_PROGRESS
+    )
     assert things[0] is whole
     of_book = (points[:, 2] > 0.601) & (points[:, 1] < HIGH[1] - 0.05)
     return points, things, np.flatnonzero(of_book)

@@ -81,14 +81,27 @@ def test_a_small_thing_beside_a_large_one_is_cut_off_by_its_color(container):
     assert sum(len(thing.vertices) for thing in things) == len(above)
 
 
+def test_level_tops_of_two_heights_tell_two_things_of_two_colors():
+    """There is no bay between them, but a step where the colors meet."""
+    surface, graph, above = scene(
+        box((-0.12, -0.05, 0.0), (0.0, 0.05, 0.06), RED), box((0.0, -0.05, 0.0), (0.08, 0.05, 0.085), BLUE)
+    )
+    things = cut(surface, graph, [Thing(above)])
+    assert len(things) == 2
+    left, right = sorted(things, key=lambda thing: graph.points[thing.vertices, 0].mean())
+    assert graph.points[left.vertices, 0].max() < 0.02
+    assert graph.points[right.vertices, 0].min() > -0.02
+
+
 @pytest.mark.parametrize(
     "solids",
     [
         [box((-0.12, -0.1, 0.0), (0.0, 0.1, 0.06), RED), box((0.0, -0.09, 0.0), (0.08, -0.02, 0.09), RED)],
+        [box((-0.12, -0.05, 0.0), (0.0, 0.05, 0.06), RED), box((0.0, -0.05, 0.0), (0.08, 0.05, 0.085), RED)],
         [box((-0.12, -0.05, 0.0), (0.0, 0.05, 0.08), RED), box((0.0, -0.05, 0.0), (0.12, 0.05, 0.08), BLUE)],
         [can((0.0, 0.0), 0.045, 0.0, 0.1, RED), box((0.04, -0.008, 0.03), (0.08, 0.008, 0.08), BLUE)],
     ],
-    ids=["of one color", "without a bay", "a handle above the ground"],
+    ids=["of one color", "of one color and two heights", "without a bay", "a handle above the ground"],
 )
 def test_neither_a_bay_nor_colors_alone_cut(solids):
     surface, graph, above = scene(*solids)

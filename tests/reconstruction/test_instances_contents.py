@@ -1,0 +1,148 @@
+"""What is in a container is told from it by color, whole; its inside, prints and corners are its own."""
+
+import numpy as np
+import pytest
+from fused_surfaces import box, can, fused, tray
+from surfaces import Patchwork, filmed, floor_sheet, looking_at, merged, sheet, solid_box, surface_from
+
+from reconstruction.instances import InstancesConfig
+from reconstruction.instances.contents import cut_contents
+from reconstruction.instances.cut import Shell
+from reconstruction.instances.flush import merge_flush
+from reconstruction.instances.foreign import ColorView
+from reconstruction.instances.scraps import without_skirts
+from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.sightings import sightings
+from reconstruction.instances.skirt_colors import mark_unlike
+from reconstruction.progress import NO_PROGRESS
+from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.types import Camera
+
+WOOD, PURPLE, GREEN, CREAM = (150, 105, 60), (95, 45, 130), (60, 140, 50), (220, 200, 150)
+CRATE = tray((-0.16, -0.12, 0.0), (0.16, 0.12, 0.1), 0.015, WOOD)
+CAMERA = Camera(320, 240, 300.0, 300.0, 160.0, 120.0)
+
+
+def seen(surface):
+    """Return a surface, filmed from all around, with its graph."""
+    turns = np.linspace(0.0, 2 * np.pi, 10, endpoint=False)
+    poses = np.stack([looking_at((0.7 * np.cos(t), 0.7 * np.sin(t), 0.7), (0.0, 0.0, 0.05)) for t in turns])
+    truth = Patchwork(surface.vertices, surface.faces, surface.normals, surface.colors)
+    posed, depth = filmed(truth, surface.colors.astype(float), surface, poses, CAMERA)
+    shell = Shell.of(surface, NO_PROGRESS)
+    return ColorView.of(shell, sightings(surface, posed, depth)), shell
+
+
+def contents_of(solids, *, container=True, taken=None):
+    """Return the graph, the crate on the floor, what is cut off it, and what was found in it before."""
+    view, _ = seen(fused(solids, half_m=0.3, top_m=0.3))
+    points = view.graph.points
+    whole = Thing(np.flatnonzero(points[:, 2] > 0.012), container=container)
+    known = []
+    if taken is not None:
+        known = [Thing(whole.vertices[taken(points[whole.vertices])], whole, 1)]
+        whole.vertices = np.setdiff1d(whole.vertices, known[0].vertices)
+    things = cut_contents(view, [whole, *known], InstancesConfig(), NO_PROGRESS)
+    assert things[0] is whole
+    return view.graph, things[1 + len(known) :], known
+
+
+def bounds(graph, thing):
+    return graph.points[thing.vertices].min(axis=0), graph.points[thing.vertices].max(axis=0)
+
+
+@pytest.mark.parametrize("container", [True, False], ids=["known for one", "that none knew"])
+def test_a_can_that_leans_on_a_side_is_a_thing_in_the_crate(container):
+    """The mesh joins them, so that it has neither a foot nor a crease there."""
+    graph, found, _ = contents_of([*CRATE, can((-0.1, 0.0), 0.035, 0.015, 0.13, PURPLE)], container=container)
+    assert len(found) == 1
+    low, high = bounds(graph, found[0])
+    np.testing.assert_allclose([*low, *high], [-0.135, -0.035, 0.015, -0.065, 0.035, 0.13], atol=0.02)
+    assert found[0].rests_on.vertices.size > len(found[0].vertices)
+    assert np.intersect1d(found[0].vertices, found[0].rests_on.vertices).size == 0
+
+
+def test_what_is_under_a_lid_of_another_color_is_of_one_thing_with_it():
+    """The lower half of the can has the color of the crate."""
+    half = can((0.05, 0.02), 0.035, 0.015, 0.07, WOOD)
+    graph, found, _ = contents_of([*CRATE, half, can((0.05, 0.02), 0.035, 0.07, 0.12, PURPLE)])
+    assert len(found) == 1
+    low, high = bounds(graph, found[0])
+    assert low[2] < 0.04
+    assert high[2] > 0.11
+
+
+def test_a_slice_that_something_else_in_the_crate_had_comes_back():
+    """What was found before, a block beside the can, keeps what is its own."""
+    block = box((0.03, -0.06, 0.015), (0.11, 0.04, 0.05), GREEN)
+
+    def taken(points):
+        of_block = (points[:, 0] > 0.02) & (points[:, 1] > -0.075) & (points[:, 1] < 0.055)
+        of_can = np.hypot(points[:, 0] + 0.02, points[:, 1]) < 0.05
+        inner = (np.abs(points[:, 0]) < 0.13) & (points[:, 2] > 0.025)
+        return inner & ((of_block & ~of_can) | (of_can & (points[:, 2] > 0.05) & (points[:, 2] < 0.07)))
+
+    graph, found, (known,) = contents_of(
+        [*CRATE, block, can((-0.02, 0.0), 0.035, 0.015, 0.12, PURPLE)], taken=taken
+    )
+    assert len(found) == 1
+    assert bounds(graph, found[0])[0][2] < 0.04
+    heights = graph.points[found[0].vertices, 2]
+    assert ((heights > 0.05) & (heights < 0.07)).sum() > 20
+    assert graph.points[known.vertices, 0].max() > 0.1
+    assert graph.points[known.vertices, 2].max() < 0.07
+
+
+@pytest.mark.parametrize(
+    "solids",
+    [
+        [*CRATE, can((-0.1, 0.0), 0.035, 0.015, 0.13, WOOD)],
+        [*CRATE, box((-0.145, -0.105, 0.01), (0.145, 0.105, 0.018), PURPLE)],
+        [*CRATE, box((-0.162, -0.122, 0.0), (-0.1, -0.06, 0.102), PURPLE)],
+        [
+            box((-0.16, -0.12, 0.0), (0.16, 0.12, 0.1), WOOD),
+            box((-0.08, -0.06, 0.09), (0.08, 0.06, 0.101), PURPLE),
+        ],
+    ],
+    ids=["of its color", "a lining", "its corner", "a print on a closed box"],
+)
+def test_what_is_of_the_container_stays(solids):
+    assert contents_of(solids, container=len(solids) > 2)[1] == []
+
+
+@pytest.mark.parametrize(("color", "kept"), [(GREEN, True), (WOOD, False), (CREAM, False)])
+def test_a_slanted_low_thing_is_no_skirt_if_nothing_around_has_its_color(color, kept):
+    """It rises to the side of a box, as smeared depth does; the box is of wood, the ground cream."""
+    block = solid_box((-0.1, -0.1, 0.0), (0.1, 0.1, 0.12), WOOD)
+    slope = sheet((-0.06, 0.102, 0.06), (0.12, 0, 0), (0, 0.07, -0.055), color)
+    view, shell = seen(surface_from(merged(floor_sheet(CREAM, 0.4), block, slope)))
+    points = view.graph.points
+    near = (np.abs(points[:, :2]) < 0.2).all(axis=1)
+    ground = Thing(np.flatnonzero((points[:, 2] < 1e-3) & near))
+    of_slope = near & (points[:, 2] > 1e-3) & (points[:, 1] > 0.101)
+    things = [ground, Thing(np.flatnonzero(near & (points[:, 2] > 1e-3) & ~of_slope), ground)]
+    things.append(Thing(np.flatnonzero(of_slope), ground))
+    mark_unlike(view, things, shell.owner)
+    assert things[2].foreign == kept
+    assert len(without_skirts(view.graph, things, NO_PROGRESS)) == 2 + kept
+
+
+@pytest.mark.parametrize(
+    ("rise_m", "color", "parts"),
+    [(0.0, GREEN, 1), (0.0, WOOD, 2), (0.03, GREEN, 2)],
+    ids=["one top", "two colors", "two heights"],
+)
+def test_a_cut_through_one_top_is_undone(rise_m, color, parts):
+    left = solid_box((-0.1, -0.06, 0.0), (0.0, 0.06, 0.03), GREEN)
+    right = solid_box((0.0, -0.06, 0.0), (0.08, 0.06, 0.03 + rise_m), color)
+    graph = MeshGraph.from_surface(surface_from(merged(floor_sheet(CREAM, 0.4), left, right)))
+    points, ground = graph.points, Thing(np.flatnonzero(graph.points[:, 2] < 1e-3))
+    above, first = points[:, 2] > 1e-3, points[:, 0] < -0.005
+    things = [
+        ground,
+        Thing(np.flatnonzero(above & first), ground),
+        Thing(np.flatnonzero(above & ~first), ground),
+    ]
+    found = merge_flush(graph, things, NO_PROGRESS)
+    assert len(found) == 1 + parts
+    assert sum(len(thing.vertices) for thing in found) == len(points)
