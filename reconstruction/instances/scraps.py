@@ -20,6 +20,7 @@ SKIRT_M, _SKIRT_BULGE, _SKIRT_TOP = (
     0.4,
 )  # height, shape, and share of the outline that is a top, at most
 _UP, _TOP_M = 0.6, 0.012
+_COLLAR_M = 0.02  # how far a skirt rises around the foot of what seems to lie on it: plates rise less
 TOUCH_M, _BESIDE_M = 0.015, 0.06  # from a larger thing: its nearest, and four fifths of it
 
 
@@ -76,7 +77,9 @@ def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
     if areas[top].sum() > _SKIRT_TOP * cv2.contourArea(hull):
         return False
     for other in things:
-        if other is thing or other.rests_on is thing or other.attached:
+        if other is thing or other.attached:
+            continue
+        if other.rests_on is thing and not _stands_in(graph, other, low, high):
             continue  # what lies on a plate hides its top
         if graph.areas[other.vertices].sum() < areas.sum():
             continue
@@ -91,6 +94,12 @@ def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
         if quantiles(np.array(away), areas, (0.8,))[0] < _BESIDE_M:
             return True
     return False
+
+
+def _stands_in(graph: MeshGraph, other: Thing, low: float, high: float) -> bool:
+    """Tell whether a thing begins in the lower half of what rises between two heights, and far below its end."""
+    bottom = quantiles(graph.points[other.vertices, 2], graph.areas[other.vertices], (0.02,))[0]
+    return bool(bottom < 0.5 * (low + high) and high - bottom > _COLLAR_M)
 
 
 def without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progress) -> InstanceSet:

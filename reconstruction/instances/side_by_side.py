@@ -3,8 +3,9 @@
 Depth smears over a gap of a centimetre or two, and a thin wall of that has no crease at which the mesh could be cut.
 Seen from above the two still tell: whatever the height at which one looks, the outline has bays on both sides at one
 place, and what lies on either side of it is about as long as wide. One thing has no such waist: handles and spouts are
-slimmer than things, and notches of L-shaped ones are on one side. Where there is none,
-colors may tell (`two_colors`).
+slimmer than things, and notches of L-shaped ones are on one side. Sheets that stand, seen from above, are slim, and
+their noise pinches them: so the sides of what is cut must turn towards each other at the waist, on one flank at least,
+and no face runs straight on there. Where there is no waist, colors may tell (`two_colors`).
 """
 
 from dataclasses import dataclass
@@ -31,6 +32,10 @@ _AXES = np.radians(np.arange(0.0, 180.0, 10.0))
 _PINCH = 0.07  # depth of the shallower bay, as a share of the narrower part's width
 _LONG = 0.75  # each part's length along the axis, as a share of its width
 _MIN_CELLS, _MIN_SHARE = 60, 0.2  # of an outline; of it on either side
+_VALLEY, _VALLEY_M = 0.2, 0.03  # how far normals turn towards the waist, of their length; this near to it
+_FLAT, _COHERENT = 0.1, 0.97  # a face: they hardly turn, and have that mean length
+_STEEP, _OUTWARD = 0.5, 0.3  # of |z| of a flank's normals, and of their part across the axis
+_MIN_SAMPLES = 6
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,11 @@ class _Waist:
     depth: float  # share of the narrower part's width
     axis: np.ndarray  # float64 (2,) unit, across the waist
     at_m: float  # along the axis
+
+    @property
+    def across(self) -> np.ndarray:
+        """Return the unit vector along the waist."""
+        return np.array([-self.axis[1], self.axis[0]])
 
 
 def cut_side_by_side(
@@ -103,10 +113,10 @@ def _parts(
     if not len(samples.points):
         return None
     waist = _waist(samples.points, samples.areas, config.min_object_m)
-    if waist is None or waist.depth < _PINCH:
+    if waist is None or waist.depth < _PINCH or not _is_valley(samples, waist):
         return None
     along = graph.points[body, :2] @ waist.axis - waist.at_m
-    across = graph.points[body, :2] @ np.array([-waist.axis[1], waist.axis[0]])
+    across = graph.points[body, :2] @ waist.across
     bottom, top = quantiles(graph.points[body, 2], graph.areas[body], (0.01, 0.99))
     high = graph.points[body, 2] > bottom + _LEVELS[0] * (top - bottom)
     parts = []
@@ -121,6 +131,30 @@ def _parts(
         parts.append(body[side])
     first, second = sorted(parts, key=lambda part: -graph.areas[part].sum())
     return first, second
+
+
+def _is_valley(samples: SurfaceSamples, waist: _Waist) -> bool:
+    """Tell whether the sides of two things turn towards each other at a waist, on one of its flanks at least."""
+    along = samples.points[:, :2] @ waist.axis - waist.at_m
+    bottom, top = quantiles(samples.points[:, 2], samples.areas, (0.01, 0.99))
+    near = (np.abs(along) < _VALLEY_M) & (np.abs(samples.normals[:, 2]) < _STEEP)
+    near &= samples.points[:, 2] > bottom + _LEVELS[0] * (top - bottom)
+    towards, outwards = (samples.normals[:, :2] @ axis for axis in (waist.axis, waist.across))
+    found = False
+    for flank in (near & (outwards > _OUTWARD), near & (outwards < -_OUTWARD)):
+        sides = [flank & (along < 0), flank & (along >= 0)]
+        if min(side.sum() for side in sides) < _MIN_SAMPLES:
+            continue
+        first, second = (np.average(towards[side], weights=samples.areas[side]) for side in sides)
+        if abs(first - second) < _FLAT and _is_flat(samples.of(flank)):
+            return False  # one face that runs on
+        found |= first - second > _VALLEY
+    return found
+
+
+def _is_flat(samples: SurfaceSamples) -> bool:
+    normals = samples.normals / np.linalg.norm(samples.normals, axis=1, keepdims=True)
+    return bool(np.linalg.norm(np.average(normals, axis=0, weights=samples.areas)) > _COHERENT)
 
 
 def _colored_parts(

@@ -10,18 +10,37 @@ it, with what is right below:
   mostly keeps its color);
 - and it stays changed: the colors above and below differ as a whole.
 
-A flat thing that reaches beyond what it lies on (a plate on a carton, a book on a box) steps out instead, and hides
-from above where it lies: it is told by that step, and by the colors of its rim and of what is below.
+What stands turned or off the middle on something as wide as itself makes no ledge around, yet its outline crosses that
+of the lower one: it steps in on some sides and out on others, which no thing of one piece does. Sides that slant alike
+above and below, those of a tent or a cone, move the outline steadily: that is deducted.
+
+A flat thing that reaches beyond what it lies on steps out instead (`lying_across`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
+from reconstruction.instances.columns import (
+    BELOW,
+    CONTRAST,
+    DIRECTIONS,
+    FAR_M,
+    MIN_KNOWN,
+    MIN_SAMPLES,
+    NEAR_M,
+    SEAM_COLOR,
+    SEAMS,
+    STEEP,
+    medians,
+    middle_of,
+    polar,
+    upright_share,
+)
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.image_colors import SurfaceSamples, surface_samples, with_colors
+from reconstruction.instances.lying_across import is_flat, score_of_flat, without_sides
 from reconstruction.instances.merging import nearest_of
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
@@ -31,27 +50,22 @@ from reconstruction.types import DepthMaps, PosedFrames, Surface
 _LARGEST_M = 0.6  # furniture has legs and tops of its own colors
 _LOWEST_M = 0.015  # of the lower part
 _STEP_M = 0.005  # between the heights tried
-_NEAR_M, _FAR_M = 0.006, 0.035  # bands above and below a height, clear of its blur
 _SEAM_M = 0.012  # colors this close to a height show a step of color
-_DIRECTIONS = 16
-_MIN_KNOWN = 8  # directions in which both are seen
-_STEEP, _UPRIGHT, _LEVEL = 0.5, 0.35, 0.6  # of |z| of a normal
+_LEVEL = 0.6  # of |z| of a normal
 _LEDGE_M, _FLUSH_M = 0.007, 0.003  # a step in plan, and none
 _REACH_M = 0.03  # how far beyond the upper part its ledge is looked for
+_CLOSE_M = 0.02  # half of a band
 _BESIDE_M = 0.04  # and the colors of what is below
 _LEDGE_M2 = 3e-5
-_SEAM_COLOR = 8.0
-# What each sign must reach for the product of all to be enough; more of one makes up for less of another.
-_LEDGES, _SEAMS, _ABOVE, _BELOW, _CONTRAST = 0.4, 0.65, 0.7, 0.5, 12.0
+# Outlines that cross: their mean gap in ledges, of it the lesser of in and out, and how upright what stands across is.
+_CROSSED, _BALANCE, _COLUMN = 0.5, 0.25, 0.95
+_LEAST_OUTWARD = 0.5  # of a normal in plan, for its slant to be told
+# What signs must reach for the product of all to be enough, beside those of `columns`; more of one makes up for less of
+# another.
+_LEDGES, _ABOVE = 0.4, 0.7
 _LEAST_LEDGES = 0.3
-_MIN_SAMPLES = 10
-_THIN_M, _WIDE_M = 0.01, 0.13  # height of the flattest thing, and how wide flat things are at least
-_FLAT_M = 0.07  # height of the highest that may lie across what is smaller
-_OUT_M, _OUT, _LEAST_OUT = 0.01, 0.4, 0.3  # how far it reaches beyond that, in what share of directions
-_RIM_SHARE = 90  # percentile of radii that is its rim
-_TOP, _TOP_SHARE = 0.6, 0.35  # z of the normals of its top, and share of its outline that this is
+_THIN_M = 0.01  # height of the flattest thing
 _NEARLY = 0.85  # of the surest seam: as good as that
-_STEM = 0.4  # of its reach: what is slimmer below is the stem of one thing
 
 
 @dataclass(frozen=True)
@@ -133,14 +147,14 @@ def _best_seam(
             if graph.areas[piece].sum() < config.min_object_area_m2:
                 break  # the largest come first
             extents = np.ptp(graph.points[piece], axis=0)
-            flat = with_flats and height - z.min() > config.min_object_m and _is_flat(graph, piece)
+            flat = with_flats and height - z.min() > config.min_object_m and is_flat(graph, piece)
             solid = min(np.sort(extents)[1], extents[2]) >= config.min_object_m
             if not (flat or solid):
                 continue
             inside[:] = False
             inside[piece] = True
             above = inside[own.vertex] & (own.points[:, 2] > height - 0.003)
-            if flat and (score := _score_of_flat(own, above, float(height))) >= 1.0:
+            if flat and (score := score_of_flat(own, above, float(height))) >= 1.0:
                 flats.append(_Seam(score, float(height), piece))
             score = _score(own, above, float(height)) if solid else 0.0
             if score >= (1.0 if best is None else best.score + 1e-9):
@@ -149,6 +163,7 @@ def _best_seam(
         surest = max(seam.score for seam in flats)
         if best is None or surest > best.score:
             best = [seam for seam in flats if seam.score > _NEARLY * surest][-1]
+            best = replace(best, upper=without_sides(graph, body, best.upper, best.height_m))
     if best is None:
         return None
     rest = np.setdiff1d(body, best.upper, assume_unique=True)
@@ -157,86 +172,82 @@ def _best_seam(
     return best
 
 
-def _is_flat(graph: MeshGraph, piece: np.ndarray) -> bool:
-    """Tell what is low, wide and mostly a top: a plate, a book, a tray."""
-    points, areas = graph.points[piece], graph.areas[piece]
-    wide, deep, high = (np.ptp(quantiles(points[:, k], areas, (0.02, 0.98))) for k in range(3))
-    if high > _FLAT_M or min(wide, deep) < _WIDE_M:
-        return False
-    return bool(areas[graph.normals[piece, 2] > _TOP].sum() > _TOP_SHARE * wide * deep)
-
-
-def _score_of_flat(own: SurfaceSamples, above: np.ndarray, height: float) -> float:
-    """Return how sure it is that samples `above` (mask) a height are of a flat thing that lies across those below."""
-    z, steep = own.points[:, 2], np.abs(own.normals[:, 2]) < _STEEP
-    upper = above & (z > height) & (z < height + _FAR_M)
-    lower = ~above & (z < height - _NEAR_M) & (z > height - _FAR_M)
-    column = lower & steep
-    if column.sum() < _MIN_SAMPLES:
-        return 0.0
-    radius, turn = _around(own, column)
-    below, reach = _medians(radius, turn, column), _medians(radius, turn, upper, _RIM_SHARE)
-    known = np.isfinite(below) & np.isfinite(reach)
-    if known.sum() < _MIN_KNOWN or np.median(below[known]) < _STEM * np.median(reach[known]):
-        return 0.0
-    out = float((reach - below > _OUT_M)[known].mean())
-    if out < _LEAST_OUT:
-        return 0.0
-    rim = upper & (radius > below[turn] - _OUT_M)
-    seen = np.isfinite(own.lab[:, 0])
-    if min((rim & seen).sum(), (column & seen).sum()) < _MIN_SAMPLES:
-        return 0.0
-    lab = own.lab * LIGHTNESS_WEIGHT
-    sides = [
-        np.stack([_medians(lab[:, k], turn, side & seen) for k in range(3)], 1) for side in (rim, column)
-    ]
-    steps = np.linalg.norm(sides[0] - sides[1], axis=1)
-    steps = steps[np.isfinite(steps)]
-    if len(steps) < _MIN_KNOWN:
-        return 0.0
-    contrast = np.linalg.norm(np.median(lab[rim & seen], axis=0) - np.median(lab[column & seen], axis=0))
-    upright = min(1.0, _upright_share(own, lower & (radius < below[turn] + _OUT_M)) / _BELOW)
-    shape = min(1.0, out / _OUT) * upright
-    return shape * float((steps > _SEAM_COLOR).mean()) / _SEAMS * min(2.0, float(contrast) / _CONTRAST)
-
-
-def _around(own: SurfaceSamples, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far samples (n,) are from the middle of a column (mask) in plan, and in which direction."""
-    flat = own.points[:, :2] - np.percentile(own.points[column, :2], [5, 95], axis=0).mean(axis=0)
-    turn = np.floor(np.arctan2(flat[:, 1], flat[:, 0]) / (2 * np.pi) * _DIRECTIONS).astype(int) % _DIRECTIONS
-    return np.hypot(flat[:, 0], flat[:, 1]), turn
-
-
 def _score(own: SurfaceSamples, above: np.ndarray, height: float) -> float:
     """Return how sure it is that samples `above` (mask) a height are of another thing than those below."""
     z, slope = own.points[:, 2], np.abs(own.normals[:, 2])
-    upper = above & (z > height + _NEAR_M) & (z < height + _FAR_M)
-    lower = ~above & (z < height - _NEAR_M) & (z > height - _FAR_M)
-    column = upper & (slope < _STEEP)
-    if column.sum() < _MIN_SAMPLES:
+    upper = above & (z > height + NEAR_M) & (z < height + FAR_M)
+    lower = ~above & (z < height - NEAR_M) & (z > height - FAR_M)
+    column = upper & (slope < STEEP)
+    if column.sum() < MIN_SAMPLES:
         return 0.0
-    radius, turn = _around(own, column)
-    around = _medians(radius, turn, column)
-    below = _medians(radius, turn, lower & (slope < _STEEP) & (radius > 0.4 * around[turn]))
-    level = (own.normals[:, 2] > _LEVEL) & (np.abs(z - height) < 2 * _NEAR_M)
+    radius, turn = polar(own, column)
+    around = medians(radius, turn, column)
+    side = lower & (slope < STEEP) & (radius > 0.4 * around[turn])
+    below = medians(radius, turn, side)
+    level = (own.normals[:, 2] > _LEVEL) & (np.abs(z - height) < 2 * NEAR_M)
     level &= (radius > around[turn] + 0.002) & (radius < around[turn] + _REACH_M)
-    ledge = np.bincount(turn[level], weights=own.areas[level], minlength=_DIRECTIONS) > _LEDGE_M2
+    ledge = np.bincount(turn[level], weights=own.areas[level], minlength=DIRECTIONS) > _LEDGE_M2
     known = np.isfinite(around) & (np.isfinite(below) | ledge)
-    if known.sum() < _MIN_KNOWN:
+    if known.sum() < MIN_KNOWN:
         return 0.0
-    step = np.where(np.isfinite(below), below - around, np.inf)
-    ledges = float(
-        ((step > _LEDGE_M) & (np.isfinite(step) | ledge) | (ledge & (step > _FLUSH_M)))[known].mean()
-    )
+    gap = np.where(np.isfinite(below), below - around, np.inf)
+
+    def share(step: np.ndarray) -> float:
+        out = (step > _LEDGE_M) & (np.isfinite(step) | ledge) | (ledge & (step > _FLUSH_M))
+        return float(out[known].mean())
+
+    ledges = share(gap)
+    if ledges >= _LEAST_LEDGES:
+        ledges = share(gap - _slanted(own, radius, turn, column, side))
+    beside = lower & (radius < around[turn] + _BESIDE_M)
+    upright = upright_share(own, upper), upright_share(own, beside)
+    if upright[0] > _COLUMN and _crossing(gap) > 0:
+        close = np.abs(z - height) < _CLOSE_M  # a step in the midst of a band is none at this height
+        near = medians(radius, turn, side & close) - medians(radius, turn, column & close)
+        ledges = max(ledges, _LEDGES / _CROSSED * min(_crossing(gap), _crossing(near)))
     if ledges < _LEAST_LEDGES:
         return 0.0
-    beside = lower & (radius < around[turn] + _BESIDE_M)
     shape = [
         ledges / _LEDGES,
-        min(1.0, _upright_share(own, upper) / _ABOVE),
-        min(1.0, _upright_share(own, beside) / _BELOW),
+        min(1.0, upright[0] / _ABOVE),
+        min(1.0, upright[1] / BELOW),
     ]
     return float(np.prod(shape)) * _color_evidence(own, above, upper, beside, turn, height)
+
+
+def _slanted(
+    own: SurfaceSamples, radius: np.ndarray, turn: np.ndarray, upper: np.ndarray, lower: np.ndarray
+) -> np.ndarray:
+    """Return how far (16,) the outline moves out from an upper to a lower band (masks) by the slant that both have.
+
+    It is nan in directions in which too little faces outwards to tell the slant.
+    """
+    middle = own.points[:, :2] - middle_of(own, upper)
+    outward = (own.normals[:, :2] * middle).sum(axis=1) / np.maximum(radius, 1e-9)
+    told = outward > _LEAST_OUTWARD
+    slant = own.normals[:, 2] / np.maximum(outward, _LEAST_OUTWARD)
+    one, two = (_least_slant(slant, turn, band & told) for band in (upper, lower))
+    drop = medians(own.points[:, 2], turn, upper) - medians(own.points[:, 2], turn, lower)
+    return np.where(one * two < 0, 0.0, 0.5 * (one + two)) * drop
+
+
+def _least_slant(slant: np.ndarray, turn: np.ndarray, band: np.ndarray) -> np.ndarray:
+    """Return the slant (16,) that two thirds of a band have, either way: what is smoothed at a ledge has none."""
+    low, high = (medians(slant, turn, band, percent) for percent in (33.0, 67.0))
+    return np.where(low > 0, low, np.where(high < 0, high, 0.0 * low))
+
+
+def _crossing(step: np.ndarray) -> float:
+    """Return how far two outlines are apart, a ledge or more all around is 1; 0 unless they cross each other.
+
+    Steps (16,) in where positive, nan where unknown.
+    """
+    step = np.clip(step[np.isfinite(step)] / _LEDGE_M, -1.0, 1.0)
+    if len(step) < MIN_KNOWN:
+        return 0.0
+    inwards, outwards = (float(np.maximum(side, 0.0).mean()) for side in (step, -step))
+    both = inwards + outwards
+    return both if min(inwards, outwards) >= _BALANCE * both else 0.0
 
 
 def _color_evidence(
@@ -248,31 +259,15 @@ def _color_evidence(
     height: float,
 ) -> float:
     seen = np.isfinite(own.lab[:, 0])
-    if min((upper & seen).sum(), (beside & seen).sum()) < _MIN_SAMPLES:
+    if min((upper & seen).sum(), (beside & seen).sum()) < MIN_SAMPLES:
         return 0.0
     lab = own.lab * LIGHTNESS_WEIGHT
-    rise, steep = own.points[:, 2] - height, np.abs(own.normals[:, 2]) < _STEEP
+    rise, steep = own.points[:, 2] - height, np.abs(own.normals[:, 2]) < STEEP
     high = above & seen & steep & (rise > 0.25 * _SEAM_M) & (rise < _SEAM_M)
     low = ~above & seen & steep & (rise < -0.25 * _SEAM_M) & (rise > -1.25 * _SEAM_M)
-    sides = [np.stack([_medians(lab[:, k], turn, side) for k in range(3)], axis=1) for side in (high, low)]
+    sides = [np.stack([medians(lab[:, k], turn, side) for k in range(3)], axis=1) for side in (high, low)]
     steps = np.linalg.norm(sides[0] - sides[1], axis=1)
     steps = steps[np.isfinite(steps)]
-    seams = float((steps > _SEAM_COLOR).mean()) if len(steps) else 0.0
+    seams = float((steps > SEAM_COLOR).mean()) if len(steps) else 0.0
     contrast = np.linalg.norm(np.median(lab[upper & seen], axis=0) - np.median(lab[beside & seen], axis=0))
-    return seams / _SEAMS * min(2.0, float(contrast) / _CONTRAST)
-
-
-def _medians(values: np.ndarray, turn: np.ndarray, chosen: np.ndarray, percent: float = 50.0) -> np.ndarray:
-    """Return the median of the chosen values, or another percentile, in each direction, nan where there are too few."""
-    out = np.full(_DIRECTIONS, np.nan)
-    rows = np.flatnonzero(chosen)
-    for direction in range(_DIRECTIONS):
-        there = values[rows[turn[rows] == direction]]
-        if len(there) >= 3:
-            out[direction] = np.percentile(there, percent)
-    return out
-
-
-def _upright_share(own: SurfaceSamples, chosen: np.ndarray) -> float:
-    areas = own.areas[chosen]
-    return float(areas @ (np.abs(own.normals[chosen, 2]) < _UPRIGHT)) / max(float(areas.sum()), 1e-12)
+    return seams / SEAMS * min(2.0, float(contrast) / CONTRAST)

@@ -77,3 +77,19 @@ def fused(solids: list[Solid], voxel_m: float = 0.008, half_m: float = 0.5, top_
     ).sum(axis=1) < 0
     faces[turned] = faces[turned][:, ::-1]
     return surface_from(Patchwork(vertices, faces, outward, colors.round().astype(np.uint8)))
+
+
+def tent(low, high, color, top_m: float = 0.01, yaw_rad: float = 0.0) -> Solid:
+    """Return a prism on the floor of a box: two sides lean to each other along y, up to a ridge `top_m` wide."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    center, half, height = 0.5 * (low + high), 0.5 * (high - low), high[2] - low[2]
+    lean = (half[1] - 0.5 * top_m) / height
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        local = (points - center) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        ends = np.abs(local) - half
+        side = np.abs(local[..., 1]) - half[1] + lean * (local[..., 2] + half[2])
+        return np.maximum.reduce([ends[..., 0], ends[..., 2], side / np.hypot(1.0, lean)])
+
+    return distance, color

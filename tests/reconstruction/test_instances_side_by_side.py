@@ -66,6 +66,17 @@ def test_what_has_no_waist_stays_whole(solids):
     assert len(cut(surface, graph, [Thing(above)])) == 1
 
 
+@pytest.mark.parametrize("yaw", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize("strut", [False, True], ids=["a board", "a picture on its strut"])
+def test_a_board_that_stands_stays_whole(yaw, strut):
+    """It is so slim from above that the cells of its outline pinch it somewhere."""
+    solids = [box((-0.09, -0.018, 0.0), (0.09, 0.018, 0.2), GRAY, yaw)]
+    if strut:
+        solids.append(box((-0.012, 0.0, 0.0), (0.012, 0.06, 0.12), GRAY, yaw))
+    surface, graph, above = scene(*solids)
+    assert len(cut(surface, graph, [Thing(above)])) == 1
+
+
 @pytest.mark.parametrize("container", [False, True])
 def test_a_small_thing_beside_a_large_one_is_cut_off_by_its_color(container):
     """There is a bay on one side of them at most, so no waist."""

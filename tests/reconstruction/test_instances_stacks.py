@@ -1,8 +1,10 @@
 """Stacks are cut at the level seam where outline and color change; prints, lids and necks are no seams."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from fused_surfaces import box, can, fused
+from fused_surfaces import box, can, fused, tent
 from surfaces import floor_sheet, frames_of, surface_from
 
 from reconstruction.instances import InstancesConfig, find_instances
@@ -10,6 +12,7 @@ from reconstruction.instances.contact_skirts import cut_cleaned_stacks
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.describe import describe
 from reconstruction.instances.image_colors import surface_samples, with_colors
+from reconstruction.instances.lying_across import without_sides
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.stacks import cut_stacks
 from reconstruction.progress import NO_PROGRESS
@@ -58,6 +61,38 @@ def test_a_stack_of_three_is_three():
 
 
 @pytest.mark.parametrize(
+    "upper",
+    [
+        box((-0.06, -0.05, 0.06), (0.06, 0.05, 0.16), WHITE, 0.35),
+        can((0.004, 0.0), 0.06, 0.06, 0.16, WHITE),
+    ],
+    ids=["a box, turned", "a can"],
+)
+def test_what_is_as_wide_as_its_carrier_is_a_thing_where_their_outlines_cross(upper):
+    things, graph = stacked([box((-0.06, -0.05, 0.0), (0.06, 0.05, 0.06), BLUE), upper])
+    assert len(things) == 2
+    low, high = things
+    assert high.rests_on is low
+    assert np.percentile(graph.points[low.vertices, 2], 98) < 0.07
+    assert np.percentile(graph.points[high.vertices, 2], 2) > 0.05
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4])
+def test_a_tent_with_printed_bands_stays_whole(yaw):
+    """Its outline steps in all the way up, by its slant."""
+    whole = ((-0.07, -0.06, 0.0), (0.07, 0.06, 0.15))
+    surface = fused([tent(*whole, GREEN, yaw_rad=yaw)], half_m=0.25, top_m=0.3)
+    painted = surface.colors.copy()
+    painted[(surface.vertices[:, 2] > 0.05) & (surface.vertices[:, 2] < 0.1)] = WHITE
+    surface = replace(surface, colors=painted)
+    posed, depth = frames_of(surface, 480, 360)
+    graph = MeshGraph.from_surface(surface)
+    body = Thing(np.flatnonzero(graph.points[:, 2] > 0.012))
+    things = cut_stacks(graph, surface, [body], posed, depth, InstancesConfig(), NO_PROGRESS)
+    assert len(things) == 1
+
+
+@pytest.mark.parametrize(
     "solids",
     [
         [box((-0.06, -0.05, low), (0.06, 0.05, low + 0.05), c) for low, c in ((0, RED), (0.05, WHITE), (0.1, BLUE))],
@@ -85,12 +120,28 @@ def test_a_flat_thing_that_hides_what_it_lies_on_is_a_thing(upper):
     low, high = things
     assert high.rests_on is low
     assert graph.points[high.vertices, 2].min() > 0.04
+    assert np.percentile(graph.points[high.vertices, 2], 2) > 0.06  # the carrier's sides are the carrier's
     assert np.percentile(graph.points[low.vertices, 2], 95) < 0.08
     ids = np.zeros(len(graph.points), np.int32)
     room = Shell.of(surface_from(floor_sheet(WHITE, 0.6, 0.3)), NO_PROGRESS)
     boxes = {o.id: o for o in describe(graph, things, room.base, ids)}
     flat = boxes[ids[high.vertices[0]]]
     assert flat.extents_m[2] < 0.05  # it does not reach down to what its carrier stands on
+
+
+def test_the_sides_of_what_a_plate_lies_on_are_no_part_of_the_plate():
+    """A seam that was found too low gives the plate the upper half of the package's sides."""
+    surface = fused([PACKAGE, can((0.01, 0.0), 0.11, 0.07, 0.09, WHITE)], half_m=0.25, top_m=0.2)
+    graph = MeshGraph.from_surface(surface)
+    body = np.flatnonzero(graph.points[:, 2] > 0.012)
+    piece = body[graph.points[body, 2] > 0.035]
+    kept = without_sides(graph, body, piece, 0.035)
+    z = graph.points[:, 2]
+    assert z[kept].min() > 0.055
+    assert np.isin(piece[z[piece] > 0.085], kept).all()
+    assert np.isin(
+        np.flatnonzero((z > 0.07) & (np.hypot(*(graph.points[:, :2] - [0.01, 0]).T) > 0.1)), kept
+    ).all()
 
 
 @pytest.mark.parametrize(
