@@ -180,6 +180,7 @@ def _own_colors(view: ColorView, vertices: np.ndarray) -> np.ndarray:
 
 
 def main_colors(graph: MeshGraph, vertices: np.ndarray) -> np.ndarray:
+    """Return the colors (k, 3), weighted CIELAB, that cover a good part of the area of some vertices."""
     nearest, means = palette(graph.lab[vertices] * LIGHTNESS_WEIGHT, _COLORS, _COLOR_GAP)
     area = np.bincount(nearest, weights=graph.areas[vertices], minlength=len(means))
     return means[area > _MOST_FOREIGN * area.sum()]

@@ -18,7 +18,7 @@ SKIRT_M, _SKIRT_BULGE, _SKIRT_TOP = (
     0.08,
     0.45,
     0.4,
-)  # height, shape, and share of the outline that is a top, at most
+)  # at most: height, shape, share of the outline that is a top
 _UP, _TOP_M = 0.6, 0.012
 _COLLAR_M = 0.02  # how far a skirt rises around the foot of what seems to lie on it: plates rise less
 TOUCH_M, _BESIDE_M = 0.015, 0.06  # from a larger thing: its nearest, and four fifths of it

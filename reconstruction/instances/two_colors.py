@@ -24,11 +24,7 @@ _MOST_COMMON = 0.3  # share of either side's area whose color the other side has
 _LEAST_SHARE = 0.12  # of the whole on either side
 _SOLID, _BAY = 0.93, 0.025  # of the hull of each side; and more than of the hull of both
 _BLOCK, _STEP_UP_M = 0.9, 0.015  # solidity of what has a level top, and a step between two tops
-_LEVEL, _TOP_M, _TOP_SHARE = (
-    0.7,
-    0.006,
-    0.33,
-)  # z of the normals of a top, half its spread, its share of the hull
+_LEVEL, _TOP_M, _TOP_SHARE = 0.7, 0.006, 0.33  # of a top: z of normals, half its spread, share of the hull
 _MIN_SAMPLES, _MOST_SAMPLES = 200, 3000
 _GROUND_M = 0.025  # both stand on the same
 
