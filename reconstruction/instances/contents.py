@@ -7,6 +7,8 @@ outwards as things do, and has none of those colors in most frames that see it, 
 two colors does not turn outwards, and corners and prints of the container are at its rim.
 """
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
@@ -26,6 +28,7 @@ _RIM_M = 0.025  # how far within the outline rims and sides reach
 _CLEAR = 0.3  # of the height: below it are skirts, and the colors of the ground
 _LOW = 0.4  # of the height: bottoms are below it
 _MIN_INNER = 0.85  # share of a content that is further within the outline than a rim
+_SOME = 0.2  # share of the foreign color in what stands free: shade and light of its own colors are the rest
 _MOST_PLAN = 0.5  # of the container's outline
 _UNDER = 0.75  # of the mesh's spacing, about half the diagonal of a cell: closer in plan is right under
 _BOTTOM_M, _LEVEL = 0.02, 0.7  # height and z of the normals of a bottom
@@ -77,14 +80,17 @@ def _contents_of(
     colors = _own_colors(view, body, hull, config)
     if colors is None:
         return []
-    odd = body[view.foreign(body, colors)]
-    odd = odd[~unconfirmed(graph.points[odd], graph.normals[odd], view.frames)]
+    sure = ~unconfirmed(points, graph.normals[body], view.frames)
+    odd = view.foreign(body, colors) & sure
     low, inset = quantiles(points[:, 2], graph.areas[body], (0.02,))[0], _inset(hull, points)
     bottom = (points[:, 2] < low + _BOTTOM_M) & (graph.normals[body, 2] > _LEVEL)
-    sides = body[(inset > _RIM_M) & ~bottom]
+    inner = (inset > _RIM_M) & ~bottom
+    sides = body[inner]
     parts: list[np.ndarray] = []
     used = np.zeros(len(graph.points), bool)
-    for top in pieces(graph, odd, config.bridge_gap_m) if len(odd) else []:
+    tops = pieces(graph, body[odd], config.bridge_gap_m)
+    free = pieces(graph, body[inner & sure]) if carrier.container else []
+    for top in [*_partly_odd(graph, free, tops), *tops]:
         top = top[~used[top]]
         if not _is_shaped(graph, top, hull):
             continue
@@ -128,6 +134,17 @@ def _is_shaped(graph: MeshGraph, part: np.ndarray, hull: np.ndarray) -> bool:
         return False
     inner = (_inset(hull, points) > _RIM_M).mean()
     return bool(inner > _MIN_INNER and bulge(graph, part) > MIN_BULGE)
+
+
+def _partly_odd(graph: MeshGraph, free: list[np.ndarray], tops: list[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yield pieces that nothing joins to their container and that much of one top is on, with that top."""
+    for piece in free:
+        on = [top for top in tops if np.isin(top, piece).sum() >= _MIN_VERTICES]
+        if len(on) != 1:
+            continue
+        odd = np.intersect1d(piece, on[0])
+        if graph.areas[odd].sum() > _SOME * graph.areas[piece].sum():
+            yield np.union1d(piece, on[0])
 
 
 def _is_large(graph: MeshGraph, part: np.ndarray, config: InstancesConfig) -> bool:

@@ -93,6 +93,16 @@ def test_a_slice_that_something_else_in_the_crate_had_comes_back():
     assert graph.points[known.vertices, 2].max() < 0.07
 
 
+def test_what_stands_free_in_a_container_may_have_another_color_in_part():
+    """The knob is too small for a thing, and nothing of what it is on lies right under it."""
+    body = can((0.03, 0.0), 0.035, 0.015, 0.05, WOOD)
+    graph, found, _ = contents_of([*CRATE, body, can((0.03, 0.0), 0.022, 0.05, 0.07, PURPLE)])
+    assert len(found) == 1
+    low, high = bounds(graph, found[0])
+    np.testing.assert_allclose([*low[:2], *high], [-0.005, -0.035, 0.065, 0.035, 0.07], atol=0.01)
+    assert low[2] < 0.03
+
+
 @pytest.mark.parametrize(
     "solids",
     [
