@@ -206,19 +206,29 @@ class Measures:
     def supported(self, key: int, support: int) -> Array:
         """Return whether a support carries a good part of a thing's weight (b,).
 
-        PhysX reports no contacts of bodies that sleep; what was so when they fell asleep still is.
+        PhysX reports no contacts of bodies that sleep; what was so when they fell asleep still is. What sleeps since
+        the reset stands where it was captured.
         """
         name = ("supported", key, support)
         if name not in self._cache:
             linear, angular = self.speeds(key)
             asleep = (linear == 0) & (angular == 0)
-            known = self._supported.get((key, support), asleep & ~asleep)
+            known = self._supported.get((key, support))
+            if known is None:
+                known = asleep & self._sleeps_on(key, support)
             if not bool(asleep.all()):
                 enough = self._force_on(key, support) >= 0.25 * component(self._weight_n[key], 0)
                 known = asleep & known | ~asleep & enough
             self._supported[key, support] = known
             self._cache[name] = known
         return self._cache[name]
+
+    def _sleeps_on(self, key: int, support: int) -> bool:
+        """Tell whether nothing has moved a thing since a reset that left it sleeping on a support."""
+        facts = self._env.facts
+        if self._direct is None or facts.parent[key] != support or facts.relation[key] != "supported_by":
+            return False
+        return all(body.is_sleeping for body in self._actors[self._row[key]]._bodies)
 
     def rests_on(self, key: int, support: int) -> Array:
         """Return whether a thing is at rest, and carried by a support (b,).

@@ -169,6 +169,16 @@ def test_success_needs_contact_with_the_support_and_rest(scenes_root: Path) -> N
     env.close()
 
 
+def test_what_sleeps_since_the_reset_is_carried_by_what_it_was_captured_on(scenes_root: Path) -> None:
+    for task, there in (("place_cube_on_table", True), ("place_cube_on_shelf", False)):
+        env = _make(scenes_root, task)
+        env.reset(seed=0)
+        assert _settle(env, 3)["is_there"] == there
+        _teleport(env, CUBE, (0.85, 0.6, 0.55))  # in the air: it is awake, and nothing carries it
+        assert not _settle(env, 1)["is_there"]
+        env.close()
+
+
 def test_a_thing_above_the_rim_is_not_in_the_crate(scenes_root: Path) -> None:
     env = _make(scenes_root, "put_cup_in_crate")
     env.reset(seed=0)
