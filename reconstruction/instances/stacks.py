@@ -55,6 +55,7 @@ _LEVEL = 0.6  # of |z| of a normal
 _LEDGE_M, _FLUSH_M = 0.007, 0.003  # a step in plan, and none
 _REACH_M = 0.03  # how far beyond the upper part its ledge is looked for
 _CLOSE_M = 0.02  # half of a band
+_BLUR_M = 0.0025  # what the outline of one thing moves by: where outlines cross, more in most directions
 _BESIDE_M = 0.04  # and the colors of what is below
 _LEDGE_M2 = 3e-5
 # Outlines that cross: their mean gap in ledges, of it the lesser of in and out, and how upright what stands across is.
@@ -242,9 +243,10 @@ def _crossing(step: np.ndarray) -> float:
 
     Steps (16,) in where positive, nan where unknown.
     """
-    step = np.clip(step[np.isfinite(step)] / _LEDGE_M, -1.0, 1.0)
-    if len(step) < MIN_KNOWN:
+    step = step[np.isfinite(step)]
+    if len(step) < MIN_KNOWN or np.median(np.abs(step)) < _BLUR_M:
         return 0.0
+    step = np.clip(step / _LEDGE_M, -1.0, 1.0)
     inwards, outwards = (float(np.maximum(side, 0.0).mean()) for side in (step, -step))
     both = inwards + outwards
     return both if min(inwards, outwards) >= _BALANCE * both else 0.0
