@@ -17,6 +17,7 @@ from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.convexity import MIN_BULGE, bulge
 from reconstruction.instances.foreign import ColorView, main_colors
+from reconstruction.instances.outlines import inset
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import unconfirmed
 from reconstruction.instances.supports import find_supports
@@ -77,14 +78,16 @@ def _contents_of(
     if sides.min() < _LEAST_SIDE_M or sides.max() > _MOST_SIDE_M:
         return []
     hull = cv2.convexHull(points[:, :2].astype(np.float32))
-    colors = _own_colors(view, body, hull, config)
+    within = np.full(len(graph.points), np.nan)  # meters within the outline, of the body's vertices
+    within[body] = inset(hull, points[:, :2])
+    sure = ~unconfirmed(points, graph.normals[body], view.frames)
+    colors = _own_colors(graph, body, within, sure, config)
     if colors is None:
         return []
-    sure = ~unconfirmed(points, graph.normals[body], view.frames)
     odd = view.foreign(body, colors) & sure
-    low, inset = quantiles(points[:, 2], graph.areas[body], (0.02,))[0], _inset(hull, points)
+    low = quantiles(points[:, 2], graph.areas[body], (0.02,))[0]
     bottom = (points[:, 2] < low + _BOTTOM_M) & (graph.normals[body, 2] > _LEVEL)
-    inner = (inset > _RIM_M) & ~bottom
+    inner = (within[body] > _RIM_M) & ~bottom
     sides = body[inner]
     parts: list[np.ndarray] = []
     used = np.zeros(len(graph.points), bool)
@@ -92,7 +95,7 @@ def _contents_of(
     free = pieces(graph, body[inner & sure]) if carrier.container else []
     for top in [*_partly_odd(graph, free, tops), *tops]:
         top = top[~used[top]]
-        if not _is_shaped(graph, top, hull):
+        if not _is_shaped(graph, top, hull, within[top]):
             continue
         under = [_under(graph, top, sides), *(_scrap_under(graph, top, thing) for thing in inside)]
         part = np.unique(np.concatenate([top, *under]))
@@ -100,40 +103,47 @@ def _contents_of(
         if _is_large(graph, part, config):
             used[part] = True
             parts.append(part)
-    if parts and (carrier.container or _is_hollow(points, inset, low, used[body])):
+    if parts and (carrier.container or _is_hollow(points, within[body], low, used[body])):
         return parts
     return []
 
 
 def _own_colors(
-    view: ColorView, body: np.ndarray, hull: np.ndarray, config: InstancesConfig
+    graph: MeshGraph, body: np.ndarray, within: np.ndarray, sure: np.ndarray, config: InstancesConfig
 ) -> np.ndarray | None:
-    """Return the colors (k, 3) of a container's rim, outer sides and bottom, None if no rim is sure."""
-    graph = view.graph
+    """Return the colors of a container's rim, outer sides and bottom.
+
+    Args:
+        graph: the surface.
+        body: sorted vertices (n,) of the container.
+        within: (v,) of each vertex of the surface, those of the container only: meters within its outline in plan.
+        sure: bool (n,) which of `body` the frames confirm.
+        config: what a support is.
+
+    Returns:
+        Weighted CIELAB (k, 3), None if no rim is sure.
+    """
     low, high = quantiles(graph.points[body, 2], graph.areas[body], (0.02, 0.98))
     clear = graph.points[body, 2] > low + _CLEAR * (high - low)
-    edge = body[clear & (_inset(hull, graph.points[body]) < _RIM_M)]
-    edge = edge[~unconfirmed(graph.points[edge], graph.normals[edge], view.frames)]
+    edge = body[clear & (within[body] < _RIM_M) & sure]
     if len(edge) < _MIN_VERTICES:
         return None
     colors = [main_colors(graph, edge)]
     for support in find_supports(graph, body, config):
-        inner = support.vertices[_inset(hull, graph.points[support.vertices]) > _RIM_M]
+        inner = support.vertices[within[support.vertices] > _RIM_M]
         if support.height_m < low + _LOW * (high - low) and len(inner) >= _MIN_VERTICES:
             colors.append(main_colors(graph, inner))
     return np.concatenate(colors)
 
 
-def _is_shaped(graph: MeshGraph, part: np.ndarray, hull: np.ndarray) -> bool:
-    """Tell a thing within an outline from the inside of what it is in, from its rim and from a print on it."""
+def _is_shaped(graph: MeshGraph, part: np.ndarray, hull: np.ndarray, within: np.ndarray) -> bool:
+    """Tell a thing, `within` (n,) meters inside an outline, from the inside of that, from its rim and from a print."""
     if len(part) < _MIN_VERTICES:
         return False
-    points = graph.points[part]
-    outline = cv2.convexHull(points[:, :2].astype(np.float32))
+    outline = cv2.convexHull(graph.points[part, :2].astype(np.float32))
     if cv2.contourArea(outline) > _MOST_PLAN * cv2.contourArea(hull):
         return False
-    inner = (_inset(hull, points) > _RIM_M).mean()
-    return bool(inner > _MIN_INNER and bulge(graph, part) > MIN_BULGE)
+    return bool((within > _RIM_M).mean() > _MIN_INNER and bulge(graph, part) > MIN_BULGE)
 
 
 def _partly_odd(graph: MeshGraph, free: list[np.ndarray], tops: list[np.ndarray]) -> Iterator[np.ndarray]:
@@ -169,21 +179,19 @@ def _scrap_under(graph: MeshGraph, part: np.ndarray, thing: Thing) -> np.ndarray
     return under[:0] if most else under
 
 
-def _is_hollow(points: np.ndarray, inset: np.ndarray, low: float, content: np.ndarray) -> bool:
-    """Tell whether points (n, 3), contents (n,) aside, are lower within a rim than along it."""
+def _is_hollow(points: np.ndarray, within: np.ndarray, low: float, content: np.ndarray) -> bool:
+    """Tell whether points (n, 3), contents (n,) aside, are lower within a rim than along it.
+
+    `within` (n,) is how far each is inside the outline, in meters.
+    """
     cells = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / _CELL_M).astype(int)
     top = np.full(cells.max(axis=0) + 1, -np.inf)
     np.maximum.at(top, tuple(cells.T), points[:, 2] - low)
     rim, inner, filled = (np.zeros(top.shape, bool) for _ in range(3))
-    rim[tuple(cells[inset < _RIM_M].T)] = True
-    inner[tuple(cells[inset >= _RIM_M].T)] = True
+    rim[tuple(cells[within < _RIM_M].T)] = True
+    inner[tuple(cells[within >= _RIM_M].T)] = True
     filled[tuple(cells[content].T)] = True
     inner &= ~filled & ~rim
     if not rim.any() or not inner.any():
         return False
     return bool((top[inner] < 0.5 * np.median(top[rim])).mean() > _MIN_HOLLOW)
-
-
-def _inset(hull: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return how far points (n, 3) are within a convex outline in plan, in metres."""
-    return np.array([cv2.pointPolygonTest(hull, (float(x), float(y)), True) for x, y in points[:, :2]])

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.instances.outlines import inset
 from reconstruction.surface.mesh_graph import MeshGraph
 
 MIN_BULGE = 0.2
@@ -27,8 +28,7 @@ def is_within(graph: MeshGraph, vertices: np.ndarray, other: np.ndarray) -> bool
     """Return whether a piece lies within the convex outline of another one in plan."""
     hull = cv2.convexHull(graph.points[other, :2].astype(np.float32))
     flat = graph.points[vertices[:: max(1, len(vertices) // 400)], :2]
-    inside = [cv2.pointPolygonTest(hull, (float(x), float(y)), True) > -_SLACK_M for x, y in flat]
-    return float(np.mean(inside)) > _ENCLOSED
+    return float(np.mean(inset(hull, flat) > -_SLACK_M)) > _ENCLOSED
 
 
 def is_inside(graph: MeshGraph, container: np.ndarray, inner: np.ndarray, bottom: float) -> bool:
@@ -50,9 +50,8 @@ def is_inside(graph: MeshGraph, container: np.ndarray, inner: np.ndarray, bottom
         return False
     hull = cv2.convexHull(rim.astype(np.float32))
     within = np.zeros(len(container), bool)
-    for row in np.flatnonzero(np.abs(height) < _RIM_M):
-        x, y = graph.points[container[row], :2]
-        within[row] = cv2.pointPolygonTest(hull, (float(x), float(y)), True) > _DEEPER_M
+    near = np.flatnonzero(np.abs(height) < _RIM_M)
+    within[near] = inset(hull, graph.points[container[near], :2]) > _DEEPER_M
     up, area = graph.normals[container, 2], graph.areas[container]
     lower = area[within & (height < -_DEEPER_M) & (up > 0.0)].sum()
     level = area[within & (np.abs(height) < _DEEPER_M) & (up > _LEVEL)].sum()

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from reconstruction.instances.merging import merge_pairs
+from reconstruction.instances.outlines import inset
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -41,8 +42,7 @@ def _foot_of(graph: MeshGraph, thing: Thing, things: list[Thing]) -> Thing | Non
     own, other = _outline(graph, thing), _outline(graph, carried[0])
     if cv2.contourArea(own) > _MAX_AREA_SHARE * cv2.contourArea(other):
         return None
-    flat = graph.points[thing.vertices, :2]
-    inside = [cv2.pointPolygonTest(other, (float(x), float(y)), True) > -_REACH_M for x, y in flat]
+    inside = inset(other, graph.points[thing.vertices, :2]) > -_REACH_M
     return carried[0] if np.mean(inside) > _MIN_INSIDE else None
 
 

@@ -16,6 +16,7 @@ from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.convexity import bulge
 from reconstruction.instances.cut import Shell
+from reconstruction.instances.outlines import inset
 from reconstruction.instances.patches import palette
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import Sighting, unconfirmed
@@ -214,5 +215,4 @@ def _without_fringes(graph: MeshGraph, parts: list[np.ndarray]) -> list[np.ndarr
 
 def _gap(graph: MeshGraph, part: np.ndarray, other: np.ndarray) -> float:
     outline = cv2.convexHull(graph.points[other, :2].astype(np.float32))
-    flat = graph.points[part, :2]
-    return -max(cv2.pointPolygonTest(outline, (float(x), float(y)), True) for x, y in flat)
+    return -float(inset(outline, graph.points[part, :2]).max())

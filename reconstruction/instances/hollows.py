@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.convexity import MIN_BULGE, bulge, is_within
-from reconstruction.instances.outlines import filled_hull
+from reconstruction.instances.outlines import filled_hull, inset
 from reconstruction.instances.supports import SupportRegion
 from reconstruction.surface.mesh_graph import MeshGraph
 
@@ -185,8 +185,8 @@ def clings_to(graph: MeshGraph, part: np.ndarray, container: np.ndarray) -> bool
     ):
         return False
     hull = cv2.convexHull(graph.points[container, :2].astype(np.float32))
-    away = [-cv2.pointPolygonTest(hull, (float(x), float(y)), True) for x, y in graph.points[part, :2]]
-    return float(quantiles(np.array(away), graph.areas[part], (0.8,))[0]) < _CLINGS_M
+    away = -inset(hull, graph.points[part, :2])
+    return float(quantiles(away, graph.areas[part], (0.8,))[0]) < _CLINGS_M
 
 
 def looks_like(graph: MeshGraph, part: np.ndarray, container: np.ndarray) -> bool:
@@ -213,8 +213,7 @@ def _has_own_shape(graph: MeshGraph, part: np.ndarray, body: np.ndarray, whole_m
     if turn < MIN_BULGE or np.ptp(graph.points[part, 2]) < _MIN_CONTENT_M:
         return False
     hull = cv2.convexHull(graph.points[body, :2].astype(np.float32))
-    depth = [cv2.pointPolygonTest(hull, (float(x), float(y)), True) for x, y in graph.points[part, :2]]
-    return float(np.mean(np.array(depth) > _RIM_REACH_M)) > _MIN_INNER
+    return float(np.mean(inset(hull, graph.points[part, :2]) > _RIM_REACH_M)) > _MIN_INNER
 
 
 def _hull_m2(graph: MeshGraph, vertices: np.ndarray) -> float:

@@ -24,6 +24,7 @@ from reconstruction.instances.columns import (
     upright_share,
 )
 from reconstruction.instances.image_colors import SurfaceSamples
+from reconstruction.instances.outlines import inset
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _WIDE_M = 0.13  # how wide flat things are at least
@@ -95,8 +96,5 @@ def without_sides(graph: MeshGraph, body: np.ndarray, piece: np.ndarray, height:
         return piece
     outline = cv2.convexHull(graph.points[sides, :2].astype(np.float32))
     hanging = np.flatnonzero(~up & (graph.points[piece, 2] < level))
-    over = [
-        cv2.pointPolygonTest(outline, (float(x), float(y)), True) > -_SLACK_M
-        for x, y in graph.points[piece[hanging], :2]
-    ]
-    return np.delete(piece, hanging[np.array(over, bool)])
+    over = inset(outline, graph.points[piece[hanging], :2]) > -_SLACK_M
+    return np.delete(piece, hanging[over])

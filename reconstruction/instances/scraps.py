@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.convexity import bulge
+from reconstruction.instances.outlines import inset
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -90,8 +91,7 @@ def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
         if not np.isfinite(gap).any():
             continue
         outline = cv2.convexHull(graph.points[other.vertices, :2].astype(np.float32))
-        away = [-cv2.pointPolygonTest(outline, (float(x), float(y)), True) for x, y in points[:, :2]]
-        if quantiles(np.array(away), areas, (0.8,))[0] < _BESIDE_M:
+        if quantiles(-inset(outline, points[:, :2]), areas, (0.8,))[0] < _BESIDE_M:
             return True
     return False
 

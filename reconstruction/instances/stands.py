@@ -12,6 +12,7 @@ import numpy as np
 
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.merging import merge_pairs
+from reconstruction.instances.outlines import inset
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -65,8 +66,7 @@ def _heights(graph: MeshGraph, thing: Thing, low: float) -> np.ndarray:
 
 def _share_within(graph: MeshGraph, vertices: np.ndarray, outline: np.ndarray) -> float:
     """Return the share of the vertices' area within an outline from above, grown by the reach."""
-    flat = graph.points[vertices, :2]
-    inside = [cv2.pointPolygonTest(outline, (float(x), float(y)), True) > -_REACH_M for x, y in flat]
+    inside = inset(outline, graph.points[vertices, :2]) > -_REACH_M
     return float(np.average(inside, weights=np.maximum(graph.areas[vertices], 1e-12)))
 
 
