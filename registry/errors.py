@@ -11,6 +11,9 @@ SimReconError                 exit code 1   anything that we raise on purpose
 A message says what failed, where (scene, stage, frame or file), what was expected, and what to do next.
 """
 
+import difflib
+from collections.abc import Iterable
+
 
 class SimReconError(Exception):
     """Root of every error that the project raises on purpose."""
@@ -54,3 +57,18 @@ class EnvironmentMissing(SimReconError, RuntimeError):
 
 class BundleError(SimReconError, ValueError):
     """A bundle on disk is malformed, unsafe or damaged."""
+
+
+def did_you_mean(wrong: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
+    """Return a sentence for a message with the nearest of the names that are known, or nothing if none is near.
+
+    Args:
+        wrong: the name that is not known.
+        known: those that are.
+        cutoff: how alike the two are at least, 0 to 1 (`difflib.SequenceMatcher.ratio`).
+
+    Returns:
+        " Did you mean 'name'?" with a space before it, or "".
+    """
+    near = difflib.get_close_matches(wrong, list(known), n=1, cutoff=cutoff)
+    return f" Did you mean {near[0]!r}?" if near else ""

@@ -16,7 +16,6 @@ removal.
 """
 
 import contextlib
-import difflib
 import errno
 import os
 import re
@@ -28,7 +27,14 @@ from pathlib import Path
 
 from registry.bundle import SceneBundle, seal_bundle
 from registry.db import Index, SceneRow, utc_text
-from registry.errors import BundleError, EnvironmentMissing, SceneBusy, SceneNotFound, UsageError
+from registry.errors import (
+    BundleError,
+    EnvironmentMissing,
+    SceneBusy,
+    SceneNotFound,
+    UsageError,
+    did_you_mean,
+)
 from registry.locks import LockHeld, file_lock, is_leased
 from registry.schema import check_scene_id
 
@@ -259,10 +265,8 @@ class SceneRegistry:
             if not self._index.exists() and self._folder_ids():
                 hint = "its index is lost; recover it with `registry.SceneRegistry(root).rebuild_index()`"
             return f"scene {scene_id!r} is not in {self.root}: {hint}"
-        near = difflib.get_close_matches(scene_id, known, n=1)
         shown = ", ".join(known[:10]) + (f" and {len(known) - 10} more" if len(known) > 10 else "")
-        meant = f" Did you mean {near[0]!r}?" if near else ""
-        return f"scene {scene_id!r} is not in {self.root}.{meant} There are: {shown}"
+        return f"scene {scene_id!r} is not in {self.root}.{did_you_mean(scene_id, known)} There are: {shown}"
 
     def _folder_ids(self) -> Names:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):

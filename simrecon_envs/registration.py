@@ -6,7 +6,6 @@ registration travels in the kwargs; `SceneEnv` says what it does when the scene 
 the id when it is made, and their version is that of the rules of success and reward.
 """
 
-import difflib
 import re
 import sys
 import warnings
@@ -18,6 +17,7 @@ from gymnasium.envs import registration as gym_registration
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 from registry import SceneRegistry, SimReconError, default_registry_root
+from registry.errors import did_you_mean
 from simrecon_envs.errors import EnvNotFound
 
 NAMESPACE = "SimRecon"
@@ -213,9 +213,8 @@ def _not_found(name: str, ids: list[str], registry: Path | str | None) -> str:
     if not ids:
         hint = "make a scene with `simrecon reconstruct VIDEO`"
         return f"{name} does not exist: the registry {place} is empty; {hint}"
-    near = difflib.get_close_matches(name.split("-")[0], ids, n=1)
     shown = ", ".join(ids[:10]) + (f" and {len(ids) - 10} more" if len(ids) > 10 else "")
-    meant = f" Did you mean {near[0]}?" if near else ""
+    meant = did_you_mean(name.split("-")[0], ids)
     where = f"in the registry {place}" if registry is not None else "among the registered scenes"
     tasks = f" Tasks are {NAMESPACE}/SCENE-TASK-v{TASK_VERSION}: simrecon_envs.list_tasks(SCENE) lists them."
     return f"{name} does not exist {where}.{meant} There are: {shown}.{tasks}"

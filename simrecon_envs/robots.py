@@ -1,15 +1,14 @@
 """Which robots can be used here, and what shape they have at rest."""
 
 import contextlib
-import difflib
 import functools
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from registry import EnvironmentMissing, UsageError
+from registry.errors import did_you_mean
 
 _SAMPLE_SPACING_M = 0.02
 
@@ -87,7 +86,7 @@ def check_robot(uid: str) -> None:
     agents = _agents()
     listed = ", ".join(usable_robots())
     if uid not in agents:
-        meant = did_you_mean(uid, agents)
+        meant = did_you_mean(str(uid), agents)
         raise UsageError(f"robot {uid!r} is not known to ManiSkill.{meant} Usable here: {listed}")
     if _file_of(agents[uid]) is None:
         raise EnvironmentMissing(
@@ -139,14 +138,8 @@ def check_control_mode(uid: str, mode: str | None) -> None:
     if mode is not None and mode not in modes:
         raise UsageError(
             f"control_mode {mode!r}: expected one of {', '.join(modes)} of robot {uid!r}."
-            + did_you_mean(mode, modes)
+            + did_you_mean(str(mode), modes)
         )
-
-
-def did_you_mean(wrong: object, known: Iterable[str]) -> str:
-    """Return a sentence with the nearest of what is known, with a space before it, or nothing."""
-    near = difflib.get_close_matches(str(wrong), list(known), n=1)
-    return f" Did you mean {near[0]!r}?" if near else ""
 
 
 def rest_qpos(agent: object) -> np.ndarray:

@@ -26,6 +26,7 @@ from registry import (
     UsageError,
     default_registry_root,
 )
+from registry.errors import did_you_mean
 from simrecon_envs.arrays import Array, tensor, tensors
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
@@ -39,7 +40,6 @@ from simrecon_envs.robots import (
     RobotShape,
     check_control_mode,
     check_robot,
-    did_you_mean,
     rest_qpos,
     robot_shape,
     traits_of,
@@ -410,11 +410,11 @@ def _check_options(scene_id: str, obs_mode: str | None, options: dict) -> None:
     except AssertionError as error:
         raise UsageError(
             f"obs_mode {obs_mode!r}: expected {', '.join(OBS_MODES)}, or several with + in between."
-            + did_you_mean(obs_mode, OBS_MODES)
+            + did_you_mean(str(obs_mode), OBS_MODES)
         ) from error
     reward_mode, modes = options.get("reward_mode"), SceneEnv.SUPPORTED_REWARD_MODES
     if reward_mode not in (None, *modes):
-        near = did_you_mean(reward_mode, modes)
+        near = did_you_mean(str(reward_mode), modes)
         raise UsageError(f"reward_mode {reward_mode!r}: expected one of {', '.join(modes)}.{near}")
     count = options.get("num_envs", 1)
     if count > 1 and not torch.cuda.is_available():

@@ -1,9 +1,9 @@
 """Tasks by name: `pick_mug`, `place_box_7_on_table`, `reach_can-then-pick_can`."""
 
-import difflib
 from dataclasses import dataclass
 
 from registry import UsageError
+from registry.errors import did_you_mean
 from simrecon_envs.tasks.facts import SceneFacts, best_name
 
 THEN = "-then-"
@@ -74,11 +74,11 @@ def unknown_task(facts: SceneFacts, name: str) -> str:
 
     known = [spec.name for spec in list_specs(facts)]
     every = [spec.name for spec in list_specs(facts, hard=True)]
-    near = [] if "_" in name or name in KINDS else difflib.get_close_matches(name, KINDS, n=1)
+    meant = ""
     if name not in KINDS:  # a kind that this scene has nothing for is spelled rightly
-        near = near or difflib.get_close_matches(name, every, n=1, cutoff=0.4)
+        of_kind = "" if "_" in name else did_you_mean(name, KINDS)
+        meant = of_kind or did_you_mean(name, every, cutoff=0.4)
     shown = ", ".join(known[:12]) + (f" and {len(known) - 12} more" if len(known) > 12 else "")
-    meant = f" Did you mean {near[0]!r}?" if near else ""
     return (
         f"scene {facts.scene_id} has no task {name!r}.{meant} Kinds: {', '.join(KINDS)}, none. Tasks for "
         f"{facts.robot}: {shown or 'none, because nothing here can be moved'}"

@@ -1,12 +1,12 @@
 """What a training run is told: everything that its result depends on, as one value that is written to its folder."""
 
 import dataclasses
-import difflib
 import json
 from dataclasses import dataclass, field
 from typing import Any
 
 from registry import UsageError
+from registry.errors import did_you_mean
 
 ALGORITHMS = ("ppo", "sac")
 OBS_MODES = ("state", "rgb")
@@ -163,8 +163,7 @@ def parse_settings(algo: str, texts: list[str]) -> Settings:
         if not equals:
             raise UsageError(f"--set {text}: expected name=value, for example learning_rate=3e-4")
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            meant = f" Did you mean {near[0]}?" if near else ""
+            meant = did_you_mean(name, known)
             raise UsageError(f"--set {text}: {algo} has no {name!r}.{meant} There are: {', '.join(known)}")
         given[name] = _parse(text, value, known[name])
     return kind(**given)

@@ -101,7 +101,7 @@ def test_spec_round_trips_through_json(scenes_root: Path) -> None:
 
 
 def test_unknown_scene_lists_what_there_is_and_the_nearest(scenes_root: Path) -> None:
-    expected = r"Did you mean SimRecon/room\?.*SimRecon/bare, SimRecon/room, SimRecon/things"
+    expected = r"Did you mean 'SimRecon/room'\?.*SimRecon/bare, SimRecon/room, SimRecon/things"
     with pytest.raises(SceneNotFound, match=expected):
         simrecon_envs.make("rooms", registry=scenes_root)
     simrecon_envs.register_scenes(scenes_root)
@@ -143,7 +143,7 @@ def test_task_ids_are_found_without_being_listed(scenes_root: Path) -> None:
         ),
         (
             "roam",
-            "EnvNotFound SimRecon/roam does not exist among the registered scenes. Did you mean SimRecon/room?",
+            "EnvNotFound SimRecon/roam does not exist among the registered scenes. Did you mean 'SimRecon/room'?",
         ),
     ],
 )

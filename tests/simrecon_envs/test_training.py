@@ -216,7 +216,7 @@ def test_success_pays_what_staying_would_and_the_told_return_is_the_environments
 @pytest.mark.parametrize(
     ("algo", "text", "message"),
     [
-        ("ppo", "learning_rat=1", "Did you mean learning_rate\\?"),
+        ("ppo", "learning_rat=1", "Did you mean 'learning_rate'\\?"),
         ("ppo", "tau=0.1", "ppo has no 'tau'.*rollout_steps"),
         ("ppo", "gamma=1.5", "a number between 0 and 0.9999"),
         ("ppo", "gamma=nan", "a number between"),
