@@ -18,10 +18,13 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJ
 from mani_skill.agents.robots import Fetch, Panda
 
 _MARGIN_M = 0.02  # more than PhysX keeps between bodies in contact
+_STILL = np.float32(0)
 _GRASP_N, _GRASP_DEG = 0.5, 85  # as in `is_grasping`
-# Inverse kinematics: ManiSkill's goes a tenth of the way to the goal a step, until 1e-4 are left.
-_BOLD, _POSE_TOLERANCE = 0.5, 1e-5
-# What is left after 30 bold steps (m, rad) where the hand cannot get: ManiSkill's steps end no nearer.
+# Inverse kinematics: ManiSkill's goes a tenth of the way to the goal a step, until 1e-4 are left. Here the first steps
+# go half of it, which decides where the elbow is, and the others all of it, where each leaves about the square of what
+# the one before left.
+_BOLD, _BOLD_STEPS, _NEWTON_STEPS, _POSE_TOLERANCE = 0.5, 3, 12, 1e-5
+# What is left after them (m, rad) where the hand cannot get: ManiSkill's steps end no nearer.
 _OUT_OF_REACH = 2e-3
 
 
@@ -46,6 +49,7 @@ class DirectReads:
         self._tip = env.agent.tcp._objs[0].entity if hasattr(env.agent, "tcp") else None
         self.tcp = np.zeros((1, 7), np.float32)
         """The pose of the point between the fingers, as of the last `refresh`."""
+        self._spot: list[float] | None = None
         self._size, self._places = 0, np.zeros((0, 7), np.int64)
         self._touching: dict[int, list] = {}
         self._all_contacts: list | None = None
@@ -68,7 +72,7 @@ class DirectReads:
 
     def refresh(self) -> list[int]:
         """Read the poses and forget the contacts: the simulator has moved on. Return the rows of what moved."""
-        self._touching, self._all_contacts, self._boxes = {}, None, {}
+        self._touching, self._all_contacts, self._boxes, self._spot = {}, None, {}, None
         packed = self._env.scene.sub_scenes[0].pack_poses()
         if len(packed) != self._size:
             self.find()
@@ -81,6 +85,12 @@ class DirectReads:
         self.poses = poses[None]
         return np.flatnonzero((poses != before).any(1)).tolist()
 
+    def tip(self) -> list[float]:
+        """Return where (3,) the point between the fingers is."""
+        if self._spot is None:
+            self._spot = self.tcp[0, :3].tolist()
+        return self._spot
+
     def pose(self, row: int) -> np.ndarray:
         """Return the pose (1, 7) of a thing's box centre, with the orientation of its actor."""
         return _row(self._entities[row].pose * self._centers[row])
@@ -92,6 +102,8 @@ class DirectReads:
     def speeds(self, row: int) -> tuple[np.float32, np.float32]:
         """Return the linear (m/s) and angular (rad/s) speed of a thing."""
         body = self._bodies[row]
+        if body.is_sleeping:  # which PhysX stops
+            return _STILL, _STILL
         linear, angular = body.linear_velocity.tolist(), body.angular_velocity.tolist()
         return np.float32(math.hypot(*linear)), np.float32(math.hypot(*angular))
 
@@ -185,8 +197,7 @@ class DirectDrive:
         self._robot = agent.robot._objs[0]
         self.foreign: list[tuple[slice, BaseController]] = []
         """Those that ManiSkill drives itself, with their share of the action."""
-        self._tips: list[tuple[slice, _Tip]] = []
-        children, joints = [], []
+        children, joints, tips = [], [], []
         if type(self.controller) is CombinedController:
             for name, child in self.controller.controllers.items():
                 share = slice(*self.controller.action_mapping[name])
@@ -194,10 +205,13 @@ class DirectDrive:
                 if _Joints.fits(child):
                     joints.append((share, child))
                 elif _Tip.fits(child):
-                    self._tips.append((share, _Tip(child)))
+                    tips.append((share, child))
                 else:
                     self.foreign.append((share, child))
-        self._joints = _Joints(joints) if joints else None
+        self._joints = _Joints(joints)
+        self._tips = [_Tip(*tip) for tip in tips]
+        driven = [controller for _, controller in (*joints, *tips)]
+        self._targets = _Targets(driven) if driven else None
         idle = {BaseController.before_simulation_step, PDJointPosController.before_simulation_step}
         self.idle = (
             bool(children)
@@ -209,16 +223,18 @@ class DirectDrive:
         )
         """Whether controllers have nothing to do between a control step's time steps."""
 
-    def set_action(self, action: torch.Tensor, numbers: np.ndarray) -> None:
+    def set_action(self, action: torch.Tensor, numbers: list[float]) -> None:
         """Give the controllers an action (1, k), whose numbers are (k,), as `controller.set_action` does."""
-        if self._joints is None and not self._tips:
+        if self._targets is None:
             self.controller.set_action(action)
             return
         qpos = self._robot.qpos
-        if self._joints is not None:
-            self._joints.drive(qpos, numbers)
-        for share, tip in self._tips:
-            tip.drive(qpos, numbers[share])
+        # In Python's numbers: right after the physics each operation of NumPy costs several of them.
+        angles = qpos.tolist()
+        wanted = self._joints.targets(angles, numbers)
+        for tip in self._tips:
+            wanted += tip.targets(angles, numbers)
+        self._targets.set(qpos, wanted)
         for share, child in self.foreign:
             child.set_action(action[:, share])
 
@@ -233,34 +249,29 @@ class _Joints:
         return plain and not (controller.config.interpolate or controller.config.use_target)
 
     def __init__(self, parts: list[tuple[slice, PDJointPosController]]) -> None:
-        controllers = [controller for _, controller in parts]
-        self._targets = _Targets(controllers)
-        # Of every joint: which it is, whose angle and which number of the action its target comes from, and how:
-        # target = (angle * delta + middle + half * action) * factor + offset, the last two where joints are mimicked.
-        rows = [np.concatenate(column) for column in zip(*(_columns(*part) for part in parts), strict=True)]
-        self._indices, self._source, self._number = (row.astype(np.int64) for row in rows[:3])
-        self._low, self._high, self._delta, self._middle, self._half, self._factor, self._offset = (
-            row.astype(np.float32) for row in rows[3:]
-        )
-        self._changes = bool(self._delta.any())
-        self._mimics = bool((self._factor != 1).any() or self._offset.any())
+        self._rows = [row for part in parts for row in _rows(*part)]
 
-    def drive(self, qpos: np.ndarray, action: np.ndarray) -> None:
-        """Set the targets of joints of a robot at `qpos` (d,) from the whole action (k,)."""
-        target = action.take(self._number)
-        np.maximum(target, self._low, out=target)
-        np.minimum(target, self._high, out=target)
-        target *= self._half
-        target += self._middle
-        if self._changes:
-            target += qpos.take(self._source) * self._delta
-        if self._mimics:
-            target = target * self._factor + self._offset
-        self._targets.set(qpos.take(self._indices), target)
+    def targets(self, angles: list[float], action: list[float]) -> list[float]:
+        """Return the targets of joints, whose controllers' joints come one after the other.
+
+        Args:
+            angles: Where all of the robot's joints are (d,).
+            action: The whole action (k,).
+        """
+        return [
+            delta * angles[source] + middle + half * min(max(action[number], -bound), bound)
+            for source, number, bound, delta, middle, half in self._rows
+        ]
 
 
-def _columns(share: slice, controller: PDJointPosController) -> list[np.ndarray]:
-    """Return what `_Joints` keeps of each of a controller's joints, ten arrays (k,)."""
+def _rows(
+    share: slice, controller: PDJointPosController
+) -> list[tuple[int, int, float, float, float, float]]:
+    """Return of each joint whose angle and which number of the action its target comes from, and how.
+
+    A row is (source, number, bound, delta, middle, half); the target is
+    delta * angle + middle + half * action, the action within the bound.
+    """
     indices = controller.active_joint_indices.numpy()
     count = len(indices)
     source, factor, offset = np.arange(count), np.ones(count), np.zeros(count)
@@ -278,11 +289,19 @@ def _columns(share: slice, controller: PDJointPosController) -> list[np.ndarray]
     if controller._normalize_action:
         low, high = controller.action_space_low.numpy(), controller.action_space_high.numpy()
         middle, half, bound = 0.5 * (high + low), 0.5 * (high - low), 1.0
-    scale = np.zeros((2, count), np.float32)
+    scale = np.zeros((2, count))
     scale[:, control] = middle, half
-    delta = np.full(count, float(controller.config.use_delta))
-    return [indices, indices[source], number[source], np.full(count, -bound), np.full(count, bound), delta,
-            *scale[:, source], factor, offset]  # fmt: skip
+    middle, half = scale[:, source]
+    delta = factor * float(controller.config.use_delta)
+    columns = (
+        indices[source],
+        number[source],
+        np.full(count, bound),
+        delta,
+        factor * middle + offset,
+        factor * half,
+    )
+    return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 class _Tip:
@@ -300,43 +319,57 @@ class _Tip:
         plain = controller.config.use_delta and controller._normalize_action
         return plain and controller.config.frame == frames[type(controller)]
 
-    def __init__(self, controller: PDEEPosController) -> None:
+    def __init__(self, share: slice, controller: PDEEPosController) -> None:
         self._controller = controller
-        self._targets = _Targets([controller])
-        self._indices = controller.active_joint_indices.numpy()
+        self._share = share
+        self._indices = controller.active_joint_indices.tolist()
         self._root, self._tip = controller.root_link._objs[0], controller.ee_link._objs[0]
         low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
         self._middle, self._half = (0.5 * (high + low)).tolist(), (0.5 * (high - low)).tolist()
         self._turn = controller.config.rot_lower if type(controller) is PDEEPoseController else None
         kinematics = controller.kinematics
-        self._known = kinematics.pmodel_active_joint_indices.numpy()
-        self._solved = kinematics.pmodel_controlled_joint_indices.numpy()
-        self._mask = kinematics.qmask.numpy()
+        self._known = kinematics.pmodel_active_joint_indices.tolist()
+        self._solved = kinematics.pmodel_controlled_joint_indices.tolist()
+        # Of the types that are asked for, so that they need not be converted at every step.
+        self._mask = kinematics.qmask.numpy().astype(np.int32)
 
-    def drive(self, qpos: np.ndarray, action: np.ndarray) -> None:
-        """Set the targets of a robot at `qpos` (d,) to where the hand is moved and turned by an action (3,) or (6,)."""
-        # In Python's numbers: right after the physics each operation of NumPy costs several of them.
+    def targets(self, angles: list[float], action: list[float]) -> list[float]:
+        """Return the targets of the joints that move and turn the hand by its share of an action.
+
+        Args:
+            angles: Where all of the robot's joints are (d,).
+            action: The whole action (k,).
+        """
         *place, w, x, y, z = (self._root.entity_pose.inv() * self._tip.entity_pose).__getstate__()
-        wish = action.tolist()
+        wish = action[self._share]
         for axis in (0, 1, 2):
             place[axis] += self._middle[axis] + self._half[axis] * min(max(wish[axis], -1.0), 1.0)
         turned = (w, x, y, z)
         if self._turn is not None:
             scale = 0.5 * self._turn / max(math.hypot(*wish[3:]), 1.0)
             turned = _product(_turned(*(scale * angle for angle in wish[3:])), turned)
-        goal = sapien.Pose(place, turned)
-        known = qpos.take(self._known)
-        solution, found, left = self._solve(known, goal, eps=_POSE_TOLERANCE, dt=_BOLD, max_iterations=30)
-        if not found and math.hypot(*left.tolist()) < _OUT_OF_REACH:
-            solution, found, _ = self._solve(known, goal, max_iterations=100)
-        start = qpos.take(self._indices)
-        target = solution.take(self._solved).astype(np.float32) if found else start
-        self._targets.set(start, target)
+        solution = self._solve(np.array([angles[k] for k in self._known]), sapien.Pose(place, turned))
+        if solution is None:
+            return [angles[k] for k in self._indices]
+        found = solution.tolist()
+        return [found[k] for k in self._solved]
 
-    def _solve(self, qpos: np.ndarray, goal: sapien.Pose, **options: float) -> tuple[np.ndarray, bool, Any]:
+    def _solve(self, start: np.ndarray, goal: sapien.Pose) -> np.ndarray | None:
+        """Return joints (d,) with the hand at a goal, near those where they start (d,); None where there are none."""
+        solve = self._steps
+        bold, found, _ = solve(start, goal, dt=_BOLD, max_iterations=_BOLD_STEPS)
+        if not found:
+            bold, found, left = solve(bold, goal, dt=1.0, max_iterations=_NEWTON_STEPS)
+        if not found and math.hypot(*left.tolist()) < _OUT_OF_REACH:
+            bold, found, _ = solve(start, goal, eps=1e-4, dt=0.1, max_iterations=100)  # ManiSkill's
+        return bold if found else None
+
+    def _steps(
+        self, start: np.ndarray, goal: sapien.Pose, eps: float = _POSE_TOLERANCE, **options: float
+    ) -> tuple[np.ndarray, bool, np.ndarray]:
         kinematics = self._controller.kinematics
         return kinematics.pmodel.compute_inverse_kinematics(
-            kinematics.end_link_idx, goal, initial_qpos=qpos, active_qmask=self._mask, **options
+            kinematics.end_link_idx, goal, initial_qpos=start, active_qmask=self._mask, eps=eps, **options
         )
 
 
@@ -346,20 +379,21 @@ class _Targets:
     def __init__(self, controllers: list[PDJointPosController]) -> None:
         joints = [joint._objs[0] for controller in controllers for joint in controller.joints]
         self._set = [joint.set_drive_target for joint in joints]
+        self._indices = np.concatenate([c.active_joint_indices.numpy() for c in controllers]).astype(np.intp)
         # One tensor each for all steps: to make them anew costs more than to set the joints.
         start, target = (torch.zeros((1, len(joints))) for _ in range(2))
-        self._views = start.numpy()[0], target.numpy()[0]
+        self._start, self._target = start.numpy()[0], target.numpy()[0]
         counts = [len(controller.joints) for controller in controllers]
         self._parts = list(zip(controllers, start.split(counts, 1), target.split(counts, 1), strict=True))
 
-    def set(self, start: np.ndarray, target: np.ndarray) -> None:
-        """Set the targets (k,) of joints that are at `start` (k,)."""
+    def set(self, qpos: np.ndarray, target: list[float]) -> None:
+        """Set the targets (k,) of the joints of a robot that is at `qpos` (d,)."""
         for controller, before, after in self._parts:
             controller._step = 0
             controller._start_qpos, controller._target_qpos = before, after
-        self._views[0][:] = start
-        self._views[1][:] = target
-        for give, value in zip(self._set, target.tolist(), strict=True):
+        qpos.take(self._indices, out=self._start, mode="clip")  # with "raise" it would be copied
+        self._target[:] = target
+        for give, value in zip(self._set, target, strict=True):
             give(value)
 
 

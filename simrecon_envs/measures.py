@@ -4,6 +4,7 @@ With many environments on a GPU these are tensors of ManiSkill's structs. On the
 NumPy's and come straight from SAPIEN (`direct`): the structs and tensors cost more than the physics does.
 """
 
+import math
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -51,9 +52,12 @@ class Measures:
         self._centers = self.array(centers)[None]
         self._supported: dict[tuple[int, int], Array] = {}
         self._cache: dict[Any, Array] = {}
-        self._placed: dict[Any, tuple[int, Any]] = {}
+        self._placed: dict[Hashable, Any] = {}
         self._keys = list(self._row)
-        self._moves = dict.fromkeys(self._row, 0)  # how often each thing was found elsewhere
+        self._about: dict[int, set[Hashable]] = {
+            key: set() for key in self._row
+        }  # of `_placed`, by what it is about
+        self._spots: dict[int, list[float]] = {}
         self._axes: dict[tuple[int, int], np.ndarray] = {}
 
     def array(self, numbers: np.ndarray) -> Array:
@@ -67,19 +71,23 @@ class Measures:
         self._cache = {}
         moved = range(len(self._actors)) if self._direct is None else self._direct.refresh()
         for row in moved:
-            self._moves[self._keys[row]] += 1
+            key = self._keys[row]
+            self._spots.pop(key, None)
+            for name in self._about[key]:
+                self._placed.pop(name, None)
+            self._about[key].clear()
 
     def while_still(self, name: Hashable, keys: tuple[int, ...], compute: Callable[[], Any]) -> Any:
         """Return what `compute` makes of where things are, computed once until one of them moves.
 
         Most things stand still most of the time. What else `compute` depends on must not change in an episode.
         """
-        moves = self._moves
-        stamp = sum([moves[key] for key in keys])
         known = self._placed.get(name)
-        if known is None or known[0] != stamp:
-            known = self._placed[name] = stamp, compute()
-        return known[1]
+        if known is None:
+            known = self._placed[name] = compute()
+            for key in keys:
+                self._about[key].add(name)
+        return known
 
     def forget(self, env_idx: torch.Tensor) -> None:
         """Forget what carried what in the environments that start anew, and all that was computed."""
@@ -87,7 +95,7 @@ class Measures:
             self._direct.find()
             self._supported = {}
         self.refresh()
-        self._placed = {}
+        self._placed, self._spots = {}, {}
         for known in self._supported.values():
             known[env_idx] = False
 
@@ -109,7 +117,7 @@ class Measures:
 
     def position(self, key: int) -> Array:
         """Return where a thing's box centre is (b, 3)."""
-        return self.pose(key)[:, :3]
+        return self.while_still(("position", key), (key,), lambda: self.pose(key)[:, :3])
 
     def pose(self, key: int) -> Array:
         """Return the pose (b, 7) of a thing's box centre, with the orientation of its actor."""
@@ -161,11 +169,23 @@ class Measures:
             self._cache["tcp"] = self.link_pose(self._env.agent.tcp)
         return self._cache["tcp"]
 
+    @property
+    def tip(self) -> Array:
+        """Return where (b, 3) the point between the fingers is."""
+        if "tip" not in self._cache:
+            self._cache["tip"] = self.tcp[:, :3]
+        return self._cache["tip"]
+
     def tcp_distance(self, key: int) -> Array:
         """Return how far (b,) the point between the fingers is from a thing's box centre."""
         name = ("tcp_distance", key)
         if name not in self._cache:
-            self._cache[name] = norm(self.position(key) - self.tcp[:, :3])
+            if self._direct is None:
+                self._cache[name] = norm(self.position(key) - self.tcp[:, :3])
+            else:
+                if key not in self._spots:
+                    self._spots[key] = self.position(key)[0].tolist()
+                self._cache[name] = np.float32(math.dist(self._spots[key], self._direct.tip()))
         return self._cache[name]
 
     @property

@@ -113,7 +113,7 @@ class Carry(Task):
         return {
             "is_grasped": column(info["is_grasped"]),
             "target_pose": pose,
-            "tcp_to_target": pose[:, :3] - measures.tcp[:, :3],
+            "tcp_to_target": pose[:, :3] - measures.tip,
             "goal_position": goal,
             "target_to_goal": self._while_still("way", lambda: goal - pose[:, :3]),
         }

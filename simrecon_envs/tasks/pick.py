@@ -76,7 +76,7 @@ class Pick(Task):
         return {
             "is_grasped": column(info["is_grasped"]),
             "target_pose": pose,
-            "tcp_to_target": pose[:, :3] - self.env.measures.tcp[:, :3],
+            "tcp_to_target": pose[:, :3] - self.env.measures.tip,
             "target_lift": column(info["lift_m"]),
         }
 

@@ -137,7 +137,7 @@ class Push(Task):
         pose = measures.pose(self.subject)
         return {
             "target_pose": pose,
-            "tcp_to_target": pose[:, :3] - measures.tcp[:, :3],
+            "tcp_to_target": pose[:, :3] - measures.tip,
             "goal_position": self.goal,
             "target_to_goal": self._while_still("way", lambda: self.goal - pose[:, :3]),
         }

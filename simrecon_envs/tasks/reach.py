@@ -54,7 +54,7 @@ class Reach(Task):
 
     def evaluate(self) -> Info:
         measures = self.env.measures
-        distance = norm(self._goal() - measures.tcp[:, :3])
+        distance = norm(self._goal() - measures.tip)
         still = measures.joint_speed <= STILL_RAD_S
         near, unmoved = distance <= WITHIN_M, self._while_still("unmoved", self._unmoved)
         return {"success": near & still & unmoved, "is_near": near, "is_still": still, "is_unmoved": unmoved,
@@ -70,7 +70,7 @@ class Reach(Task):
         measures = self.env.measures
         return {
             "target_pose": measures.pose(self.subject),
-            "tcp_to_goal": self._goal() - measures.tcp[:, :3],
+            "tcp_to_goal": self._goal() - measures.tip,
         }
 
     def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
