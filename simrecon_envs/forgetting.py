@@ -11,19 +11,24 @@ import sapien
 from sapien import physx
 
 
-def renew_physics(env: Any) -> None:
+def renew_physics(env: Any, entities: list[sapien.Entity] | None = None) -> None:
     """Move everything of a `SceneEnv` with one environment on the CPU to a new PhysX scene, in the order of before.
 
-    Takes a millisecond or two. Entities keep their ids, poses and components; velocities are the caller's affair.
+    Takes a millisecond or two. Entities keep their ids, poses and components; velocities and who sleeps are the
+    caller's affair.
+
+    Args:
+        env: The environment.
+        entities: All of its entities in their order, where some were taken out of the scene.
     """
     old = env.scene.sub_scenes[0]
-    entities = list(old.entities)
+    entities = list(old.entities) if entities is None else entities
     env._set_scene_config()  # a default of the process, which another environment may have changed
     engine = physx.PhysxCpuSystem()
     engine.timestep = env.scene.px.timestep
     renders = env.scene.can_render()
     new = sapien.Scene([engine, old.render_system] if renders else [engine])
-    for entity in entities:
+    for entity in list(old.entities):
         entity.remove_from_scene()
     for entity in entities:
         entity.add_to_scene(new)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from registry import UsageError
+from simrecon_envs.rehearsal import rehearse
 from simrecon_envs.robots import traits_of
 from simrecon_envs.shifting import Group, about, group_things
 
@@ -104,6 +105,10 @@ class Randomizer:
         self._env, self.config = env, config
         self._entries = {entry["id"]: entry for entry in env.bundle.scene["objects"]}
         self._groups: list[Group] = []
+        self._moved: list[Group] = []
+        self._places: dict[int, list[np.ndarray]] = {}
+        self.returned: tuple[int, ...] = ()
+        """Ids of what would have fallen where this episode's draw had it, or was in its way: it stands as captured."""
         if config.shift_m or config.turn_rad:
             robot = env.robot_points if env.placement is None else env.placement.to_world(env.robot_points)
             # An arm's joints carry the hand about as far as its reach, turned by so much.
@@ -122,14 +127,51 @@ class Randomizer:
         draws = draws.reshape(len(index), len(self._groups), _TRIES, 3)
         moves = [self._moves(one) for one in draws]
         for number, group in enumerate(self._groups):
-            for stack in group.stacks:
-                for key, start in stack.start.items():
-                    poses = np.stack([move[number] @ start for move in moves])
-                    self._env.builder.place(key, poses, self._env.device)
+            self._place(group, [move[number] for move in moves])
+        self._moved = [
+            group for group, move in zip(self._groups, moves[0], strict=True) if (move != np.eye(4)).any()
+        ]
+
+    def settle(self) -> None:
+        """Let stand what `poses` has moved; what falls, or is in its way back, stands as captured.
+
+        One environment on the CPU; nothing is awake afterwards.
+        """
+        self.returned = ()
+        if not self._groups:
+            return
+        moved = {key for group in self._moved for key in group.members}
+        self._env.builder.rest(self._env.builder.movable_ids - moved)
+        if moved:
+            fell = rehearse(self._env)
+            for group in self._fallen(fell):
+                self._place(group, [np.eye(4)])
+                self.returned += tuple(key for key in group.members if key in moved)
+            self._env.builder.rest()
+
+    def _fallen(self, fell: set[int]) -> list[Group]:
+        """Return the groups of what fell, and those that stand where it was captured."""
+        back = [group for group in self._groups if not fell.isdisjoint(group.members)]
+        for group in back:  # it grows
+            self._places[id(group)] = group.outlines
+            back += [
+                other
+                for other in self._moved
+                if all(other is not one for one in back)
+                and not group.clears(other, group.outlines, self._places[id(other)])
+            ]
+        return back
+
+    def _place(self, group: Group, moves: list[np.ndarray]) -> None:
+        """Move a group from where it was captured by transforms (4, 4), one an environment."""
+        for stack in group.stacks:
+            for key, start in stack.start.items():
+                poses = np.stack([move @ start for move in moves])
+                self._env.builder.place(key, poses, self._env.device)
 
     def _moves(self, draws: np.ndarray) -> list[np.ndarray]:
         """Return a transform (4, 4) a group from draws (groups, tries, 3) in [-1, 1]."""
-        places = {id(group): group.outlines for group in self._groups}
+        self._places = places = {id(group): group.outlines for group in self._groups}
         moves = [np.eye(4) for _ in self._groups]
         for number, group in enumerate(self._groups):
             for draw in draws[number]:

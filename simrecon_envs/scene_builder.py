@@ -11,6 +11,7 @@
 Welding is the stiffest fixed joint there is: no drive that could stretch, on the CPU and on the GPU alike.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,15 +135,15 @@ class SceneBuilder:
                 )
             self._set_pose(body.root, position, quat_from_matrix(rotation), device)
 
-    def rest(self) -> None:
-        """Let everything sleep until something touches or moves it; one environment on the CPU.
+    def rest(self, keys: Iterable[int] | None = None) -> None:
+        """Let everything, or the objects `keys`, sleep until something touches or moves it; one environment on the CPU.
 
-        It rests as it was captured, and the assembly let it settle there. PhysX adds up forces in another order when
-        anything else in the scene stands elsewhere, and a thing that is balanced on another could tip over by that.
+        It rests as it was captured, and the assembly let it settle there, or as it came to rest in a rehearsal. PhysX
+        adds up forces in another order when anything else in the scene stands elsewhere, and a thing that is balanced
+        on another could tip over by that.
         """
-        for body in self.bodies:
-            if body.dynamic:
-                self.objects[body.root].actor._bodies[0].put_to_sleep()
+        for key in self.movable_ids if keys is None else keys:
+            self.objects[key].actor._bodies[0].put_to_sleep()
 
     def shift(self, key: int, env_idx: torch.Tensor, moved: np.ndarray, device: torch.device) -> None:
         """Move an object of the environments `env_idx` (b,) by (b, 3) from where the bundle has it."""

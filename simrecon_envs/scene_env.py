@@ -299,13 +299,16 @@ class SceneEnv(BaseEnv):
         self.builder.initialize(env_idx, self.device, self.pose_noise, self._batched_episode_rng)
         if not self.gpu_sim_enabled and not any(self.pose_noise):
             self.builder.rest()  # what is moved from here on wakes up
+        qpos = None
         if self.agent is not None:
             qpos = self._randomizer.joints(env_idx, self._batched_episode_rng, rest_qpos(self.agent))
-            self.agent.reset(torch.as_tensor(qpos, dtype=torch.float32, device=self.device))
-            self.agent.robot.set_pose(Pose.create(self._root_pose(), device=self.device))
         self._randomizer.poses(env_idx, self._batched_episode_rng)
         if not self.gpu_sim_enabled:  # on the GPU they are fixed once the simulation runs
             self._randomizer.physics(env_idx, self._batched_episode_rng)
+            self._randomizer.settle()
+        if self.agent is not None:
+            self.agent.reset(torch.as_tensor(qpos, dtype=torch.float32, device=self.device))
+            self.agent.robot.set_pose(Pose.create(self._root_pose(), device=self.device))
         self._randomizer.looks(env_idx, self._batched_episode_rng)
         self.measures.forget(env_idx)
         if self.task_object is not None:

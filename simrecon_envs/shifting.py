@@ -113,15 +113,20 @@ class Group:
         for (points, least), hull in zip(self._beside, hulls, strict=True):
             if (_outside(points, hull) < least).any():
                 return None
-        for other in self.others:
-            for theirs, place in enumerate(places[id(other)]):
-                for mine, hull in enumerate(hulls):
-                    if gap(hull, place) < self.gaps[id(other), mine, theirs]:
-                        return None
+        if not all(self.clears(other, hulls, places[id(other)]) for other in self.others):
+            return None
         places[id(self)] = hulls
         risen = transform.copy()
         risen[2, 3] = max(stack.rise(hull) for stack, hull in zip(self.stacks, hulls, strict=True))
         return risen
+
+    def clears(self, other: "Group", hulls: list[np.ndarray], places: list[np.ndarray]) -> bool:
+        """Tell whether its stacks' outlines keep off those of another group."""
+        return all(
+            _boxes_apart(hull, place) or gap(hull, place) >= self.gaps[id(other), mine, theirs]
+            for theirs, place in enumerate(places)
+            for mine, hull in enumerate(hulls)
+        )
 
     @functools.cached_property
     def gaps(self) -> dict[tuple[int, int, int], float]:
@@ -204,6 +209,12 @@ def gap(first: np.ndarray, second: np.ndarray) -> float:
         a, b = first @ normals.T, second @ normals.T
         gaps.append(np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0)).max())
     return float(max(gaps))
+
+
+def _boxes_apart(first: np.ndarray, second: np.ndarray) -> bool:
+    """Tell whether the boxes around two outlines are so far apart that `gap` need not be asked: most are."""
+    between = np.maximum(first.min(axis=0) - second.max(axis=0), second.min(axis=0) - first.max(axis=0))
+    return bool(between.max() > GAP_M)
 
 
 def _outside(points: np.ndarray, hull: np.ndarray) -> np.ndarray:
