@@ -7,13 +7,15 @@ lower they drop on it, and PhysX adds up the forces in another order. One enviro
 import math
 from typing import Any
 
+import sapien
+
 from simrecon_envs.forgetting import renew_physics
 
 # What stands hardly moves after a fifth of a second, and ever less; what still wobbles after half a second counts as
 # fallen. What begins to tip over is slow at first, but gets faster.
 _LEAST_S, _MOST_S, _LOOK_S = 0.2, 0.5, 0.05
 _CALM_M_S, _CALM_RAD_S = 0.02, 0.2
-_STILL_M_S, _STILL_RAD_S = 0.002, 0.02
+_STILL_M_S, _STILL_RAD_S = 0.001, 0.01
 # Things rock where a support is not quite level, for a second and more: with this damping for a tenth of it. What tips
 # over does so all the same.
 _DAMPING_PER_S = 10.0
@@ -54,8 +56,8 @@ class _Start:
     """Where a body was when the rehearsal began, and what has become of it."""
 
     def __init__(self, body: Any) -> None:
-        self._body, self._pose = body, body.entity.pose
-        self._speeds = math.inf, math.inf
+        self._body, self._start = body, body.entity.pose
+        self._last, self._speeds = self._start, (math.inf, math.inf)
         self.calm, self.fell = False, False
 
     def damp(self, rate_per_s: float) -> None:
@@ -63,12 +65,18 @@ class _Start:
         self._body.set_angular_damping(rate_per_s)
 
     def look(self) -> None:
-        body, before = self._body, self._speeds
-        linear, angular = math.hypot(*body.linear_velocity), math.hypot(*body.angular_velocity)
+        now, before = self._body.entity.pose, self._speeds
+        # Between two looks: at a single time step contacts make a thing at rest tremble.
+        linear, angular = (way / _LOOK_S for way in _apart(self._last, now))
         slow = linear <= _CALM_M_S and angular <= _CALM_RAD_S
         slower = linear <= max(before[0], _STILL_M_S) and angular <= max(before[1], _STILL_RAD_S)
-        self._speeds = linear, angular
-        self.calm = body.is_sleeping or (slow and slower)
-        moved = self._pose.inv() * body.entity.pose
-        turned = 2 * math.acos(min(abs(float(moved.q[0])), 1.0))
-        self.fell = math.hypot(*moved.p) > _FELL_M or turned > _FELL_RAD
+        self._last, self._speeds = now, (linear, angular)
+        self.calm = slow and slower
+        moved, turned = _apart(self._start, now)
+        self.fell = moved > _FELL_M or turned > _FELL_RAD
+
+
+def _apart(one: sapien.Pose, other: sapien.Pose) -> tuple[float, float]:
+    """Return how far (m) and by which angle (rad) two poses are apart."""
+    between = one.inv() * other
+    return math.hypot(*between.p), 2 * math.atan2(math.hypot(*between.q[1:]), abs(between.q[0]))
