@@ -189,7 +189,7 @@ def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Pat
     (folder / home).mkdir(parents=True)
     write_glb(item.visual, folder / home / "visual.glb")
     collision, primitives = [], []
-    for number, part in enumerate(placed.collision or item.collision):
+    for number, part in enumerate(item.collision if placed.collision is None else placed.collision):
         collision.append(str(home / f"collision_{number:03d}.obj"))
         write_obj(part, folder / collision[-1])
         primitive = primitive_of(part.vertices)

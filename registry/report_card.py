@@ -90,6 +90,7 @@ def physics_report(
         "timestep_s": timestep_s,
         "dynamic_objects": len(objects),
         "fixed_objects": len(fixed),
+        "without_collision": [spec.name for spec in fixed if not spec.parts],
         "stable_rate": rate("stable", 1.0),
         "stable_rate_10cm_0.1rad": rate("stable_10cm_0.1rad", 1.0),
         "stable_rate_5cm_drop_5deg": rate("stable_5cm_drop_5deg", 1.0),

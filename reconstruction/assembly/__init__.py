@@ -26,10 +26,11 @@ from registry.report_card import (
     STABLE_TURN_DEG,
     VERIFY_DURATION_S,
     physics_report,
+    spawn_contacts,
 )
 from registry.simulation import TIMESTEP_S, BodySpec, build_physics, pose_change
 
-VERSION = 6
+VERSION = 7
 _MARGIN = 0.5  # of each bound of the report card: what moves more than this share of it is repaired
 _FREE_S = 0.5  # without damping, after all have settled together
 
@@ -91,6 +92,9 @@ def _build_up(
             progress.note(f"assembly: {by_id[edge.child].label} {edge.child}: {note}")
         progress.advance()
     report = _settle_together(placer, base_specs(assets), config, progress)
+    for placement in placer.placed.values():
+        if not placement.parts:
+            progress.note(f"assembly: {placement.asset.label} {placement.asset.id}: {placement.notes[-1]}")
     return placer.placed, report
 
 
@@ -148,19 +152,47 @@ def _settle_together(
     report = best[2]
     for placement in list(placer.placed.values()):
         placer.commit(placement)  # the workbench may hold what a worse round came to
-    while unstable := [entry["id"] for entry in report["objects"] if not entry["stable"]]:
+    return _hold_the_rest(placer, base, report, config, progress)
+
+
+def _hold_the_rest(
+    placer: Placer, base: list[BodySpec], report: dict, config: AssemblyConfig, progress: Progress
+) -> dict:
+    """Make immovable what no repair helped, clear of all else; return the report of what that comes to."""
+    held: set[int] = set()
+    while faults := _faults(placer, base, report, held):
         done = "it was made immovable" if config.freeze_unstable else "it was left as it is"
-        for i in unstable:
-            label = placer.placed[i].asset.label
-            progress.note(f"assembly: {label} {i} does not stay put for {report['duration_s']:g} s; {done}")
+        for i, fault in faults.items():
+            progress.note(f"assembly: {placer.placed[i].asset.label} {i} {fault}; {done}")
         if not config.freeze_unstable:
             break
-        for i in unstable:
-            placer.hold(i, "made immovable: it does not stay where it was seen")
+        for i, fault in faults.items():
+            placer.hold(i, f"made immovable: it {fault}")
+        held |= set(faults)
         # What leant on them may need a moment, or fall now.
         _joint_settle(placer, base, config.joint_settle_s, _FREE_S)
         report = _report(placer.assets, placer.placed, base)
     return report
+
+
+def _faults(placer: Placer, base: list[BodySpec], report: dict, held: set[int]) -> dict[int, str]:
+    """Return what is wrong with objects that are not held yet."""
+    found: dict[int, str] = {}
+    if report["spawn_penetration_mm"] > MOST_PENETRATION_MM:
+        order = {i: number for number, i in enumerate(placer.placed)}
+        specs = scene_specs(placer.placed.values(), base)
+        names = {spec.id: spec.name.replace("_", " ") for spec in specs}
+        for contact in spawn_contacts(specs, -1e-3 * MOST_PENETRATION_MM):
+            # Who came later was to be clear of who was there.
+            first, second = sorted((contact.first, contact.second), key=lambda i: order.get(i, -1))
+            if second not in held:
+                found[second] = f"overlaps {names[first]}"
+    for entry in report["objects"]:
+        if entry["floating"]:
+            found[entry["id"]] = "is carried by nothing where it was seen"
+        if not entry["stable"]:
+            found[entry["id"]] = "does not stay where it was seen"
+    return found
 
 
 def _restless(report: dict) -> set[int]:
@@ -214,7 +246,7 @@ def _finish(placement: Placement, stable: bool) -> PlacedObject:
         turned_deg=turned,
         repair="; ".join(placement.notes),
         stable=stable and placement.stands,
-        collision=placement.parts if changed else (),
+        collision=placement.parts if changed else None,
     )
 
 

@@ -80,7 +80,10 @@ class Placer(Settler):
 
     def hold(self, asset_id: int, note: str) -> Placement:
         """Make a placed thing immovable where it was seen; where it reaches into its neighbors it is cut."""
-        old = self.placed[asset_id].noted(note, dynamic=False)
+        old = self.placed[asset_id]
+        if not old.parts:
+            return old
+        old = old.noted(note, dynamic=False)
         if not any(p.edge.parent == asset_id for p in self.placed.values()):
             edge = self._edges[asset_id]
             pose, parts = self._seen(old.asset, edge), old.unflattened
@@ -117,7 +120,8 @@ class Placer(Settler):
         parent = self.base.get(item.edge.parent)
         if parent is None:
             carrier = self.placed[item.edge.parent]
-            hung = self.keep_clear(replace(item, dynamic=carrier.dynamic), shift_m=_FIXED_SHIFT_M)
+            held = replace(item, dynamic=carrier.dynamic)
+            hung = self.keep_clear(held, shift_m=_FIXED_SHIFT_M, at_any_cost=False)
             if hung.stands:
                 return hung
             # It cannot hang there without being inside something: let gravity find what carries it.

@@ -60,8 +60,12 @@ class Settler(Surroundings):
         best = self._try(item, seen)
         if not best.clear:
             # No place nearby is free, whatever its foot is like.
+            before = dict(self.placed)
             opened = self.cut_clear(item)
-            return best.better(self._try(opened, seen)).placement if opened.stands else best.placement
+            cleared = best.better(self._try(opened, seen)) if opened.stands else best
+            if cleared is best:
+                self.back_to(before)
+            return cleared.placement
         for band in self.config.foot_bands_mm:
             if best.cost_mm < _NEAR_ENOUGH_MM:
                 return best.placement

@@ -64,8 +64,8 @@ def give_way(
         The pieces of both, and the deepest overlap that was taken away (0: nothing was cut).
     """
     one, other, deepest = list(first), list(second), 0.0
-    ours = [_in_world(part, first_pose) for part in one]
-    theirs = [_in_world(part, second_pose) for part in other]
+    ours = [in_world(part, first_pose) for part in one]
+    theirs = [in_world(part, second_pose) for part in other]
     for i in range(len(one)):
         for j in range(len(other)):
             found = overlap_of(ours[i], theirs[j], sideways_only=not rests_on)
@@ -78,7 +78,7 @@ def give_way(
             kept_other = _behind(other[j], second_pose, -found.normal, 0.5 * _GAP_M - middle)
             if kept_one is not None and kept_other is not None:
                 one[i], other[j], deepest = kept_one, kept_other, max(deepest, found.depth)
-                ours[i], theirs[j] = _in_world(kept_one, first_pose), _in_world(kept_other, second_pose)
+                ours[i], theirs[j] = in_world(kept_one, first_pose), in_world(kept_other, second_pose)
     return (tuple(one), tuple(other), deepest) if deepest > 0 else (first, second, 0.0)
 
 
@@ -88,14 +88,20 @@ def cut_out(
     second: tuple[ConvexPart, ...],
     second_pose: np.ndarray,
     tolerance_m: float,
+    clearance_m: float = 0.0,
 ) -> tuple[tuple[ConvexPart, ...], float]:
-    """Cut off all of the first thing's pieces that is in the second one: (what is left, the deepest overlap)."""
-    theirs = [_in_world(part, second_pose) for part in second]
+    """Cut off all of the first thing's pieces that is in the second one: (what is left, the deepest overlap).
+
+    With a clearance pieces that are nearer to each other than that are in each other, too, by how much nearer they are.
+    """
+    theirs = [in_world(part, second_pose) for part in second]
     left, deepest = [], 0.0
     for part in first:
         kept: ConvexPart | None = part
         for their in theirs:
-            found = overlap_of(_in_world(kept, first_pose), their, sideways_only=False)
+            found = overlap_of(
+                in_world(kept, first_pose), their, sideways_only=False, clearance_m=clearance_m
+            )
             if found is None or found.depth <= tolerance_m:
                 continue
             deepest = max(deepest, found.depth)
@@ -107,7 +113,11 @@ def cut_out(
 
 
 def overlap_of(
-    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray], *, sideways_only: bool
+    first: tuple[np.ndarray, np.ndarray],
+    second: tuple[np.ndarray, np.ndarray],
+    *,
+    sideways_only: bool,
+    clearance_m: float = 0.0,
 ) -> Overlap | None:
     """Return how two convex pieces overlap, None where they do not: separating axes over the normals of their faces.
 
@@ -115,13 +125,16 @@ def overlap_of(
         first: (v, 3) corners and (f, 3) outward normals of its faces, world space.
         second: of the other one.
         sideways_only: the way out must be rather level.
+        clearance_m: the second one is thicker by this on all sides.
     """
     (a, a_normals), (b, b_normals) = first, second
-    if np.any(a.min(axis=0) > b.max(axis=0)) or np.any(a.max(axis=0) < b.min(axis=0)):
+    if np.any(a.min(axis=0) > b.max(axis=0) + clearance_m):
+        return None
+    if np.any(a.max(axis=0) < b.min(axis=0) - clearance_m):
         return None
     ways = np.concatenate([-a_normals, b_normals])  # directions in which the first one may leave
     along_a, along_b = a @ ways.T, b @ ways.T
-    depth = along_b.max(axis=0) - along_a.min(axis=0)
+    depth = along_b.max(axis=0) + clearance_m - along_a.min(axis=0)
     if depth.min() <= 0:
         return None
     if sideways_only:
@@ -129,7 +142,7 @@ def overlap_of(
     k = int(np.argmin(depth))
     if not np.isfinite(depth[k]):
         return None
-    low, high = float(along_a[:, k].min()), float(along_b[:, k].max())
+    low, high = float(along_a[:, k].min()), float(along_b[:, k].max()) + clearance_m
     return Overlap(ways[k], low, high, float(np.ptp(along_a[:, k])), float(np.ptp(along_b[:, k])))
 
 
@@ -149,7 +162,7 @@ def _behind(part: ConvexPart, pose: np.ndarray, normal: np.ndarray, level: float
     return made[0] if made else None
 
 
-def _in_world(part: ConvexPart, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def in_world(part: ConvexPart, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = np.asarray(part.vertices, np.float32), np.asarray(part.faces, np.int32)
     return transform_points(pose, vertices), _face_normals(vertices.tobytes(), faces.tobytes()) @ pose[
         :3, :3

@@ -154,6 +154,7 @@ def _physics(bundle: SceneBundle, out: Evaluation) -> None:
         "max_moved_cm": max(moved_cm, default=0.0),
         "repaired": sum(bool(item["repair"]) for item in assembled),
         "fixed_objects": report["fixed_objects"],
+        "without_collision": report["without_collision"],
         "physics": report["objects"],
     }
 

@@ -66,6 +66,8 @@ def physics_section(g: Gathered) -> Section:
         f"All {physics['dynamic_objects']} movable objects together for {physics['duration_s']:.0f} s at "
         f"1/{1 / physics['timestep_s']:.0f} s, undamped, never asleep; {physics['fixed_objects']} objects are fixed."
     )
+    if unfelt := physics.get("without_collision"):  # bundles of before have no list
+        lead += f" No collision shape: {', '.join(name.replace('_', ' ') for name in unfelt)}."
     blocks: list[Block] = [Tiles(tiles, columns=-(-len(tiles) // 2) if len(tiles) > 5 else len(tiles))]
     if rows:
         blocks.append(Table(columns, rows, numeric=[1, 2, 3]))

@@ -177,7 +177,7 @@ def test_baselines_leave_shapes_as_they_are_and_are_measured_alike(method):
     config = AssemblyConfig(method=method, mcmc_sweeps=60)
     scene = assemble(assets, SceneGraph(edges), config)
     report, placed = scene.physics_report, {p.id: p for p in scene.placed}
-    assert all(p.collision == () and p.repair == "" for p in scene.placed)
+    assert all(p.collision is None and p.repair == "" for p in scene.placed)
     floating = {o["id"]: o["floating"] for o in report["objects"]}
     if method == "in-situ":
         assert max(p.moved_m for p in scene.placed) == 0
