@@ -353,9 +353,7 @@ class PlacedObject:
     turned_deg: float
     repair: str  # "" or what was done to make it stand
     stable: bool
-    collision: tuple[ConvexPart, ...] | None = (
-        None  # object space; in place of the asset's own where a repair changed it
-    )
+    collision: tuple[ConvexPart, ...] | None = None  # object space; what a repair made of the asset's own
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,8 @@ class Settler(Surroundings):
             if cleared is best:
                 self.back_to(before)
             return cleared.placement
+        if best.cost_mm >= _FAR_MM:
+            best = self._in_cleared_air(item, best)
         for band in self.config.foot_bands_mm:
             if best.cost_mm < _NEAR_ENOUGH_MM:
                 return best.placement
@@ -105,6 +107,16 @@ class Settler(Surroundings):
             if found.cost_mm < best.cost_mm:
                 return found
         self.commit(carrier)
+        return best
+
+    def _in_cleared_air(self, item: Placement, best: Tried) -> Tried:
+        """Try the place where a thing was seen, once what others' pieces fill there in air is hollowed out."""
+        before = dict(self.placed)
+        if self.clear_air(item):
+            found = self._try(item, item.pose)
+            if found.cost_mm < best.cost_mm:
+                return found
+        self.back_to(before)
         return best
 
     def _shifted(self, item: Placement) -> Iterator[Placement]:

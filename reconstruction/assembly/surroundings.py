@@ -189,6 +189,14 @@ class Surroundings:
             return item, 0.0
         return replace(item, parts=parts, unflattened=parts), depth
 
+    def clear_air(self, item: Placement) -> bool:
+        """Hollow out the neighbors whose pieces fill air where a thing was seen; tell whether there was one."""
+        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        tolerance_m = 0.5 * self.config.penetration_mm * 1e-3
+        met = [self.placed[i] for i in sorted(self.met(item)) if i in self.placed]
+        filling = [other for other in met if fills_air(other, item, tolerance_m)]
+        return any([self._make_room(other, item, 0.0) for other in filling])
+
     def _make_room(self, other: Placement, item: Placement, clearance_m: float) -> bool:
         """Hollow out what is placed already where a thing is; False where little would be left of it."""
         parts = hollowed(other, item, 0.5 * self.config.penetration_mm * 1e-3, clearance_m)
