@@ -1,7 +1,7 @@
 """Where the collision shape of one thing fills the place of another: that place is cut out of it.
 
 The convex pieces of a large thing span the niches in it and the air above it: of a counter four metres long they reach
-17 cm beyond its surface. What was seen to stand there proves that the place is not the counter's.
+15 cm beyond its surface. What was seen to stand there proves that the place is not the counter's.
 """
 
 from dataclasses import dataclass

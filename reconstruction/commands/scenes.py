@@ -257,6 +257,7 @@ def describe_physics(physics: dict) -> list[str]:
     lines += [
         f"  {e['child']} rests on {e['carrier']}, which is no edge" for e in contacts["supports_without_edge"]
     ]
+    lines += [f"  {name.replace('_', ' ')} has no collision shape" for name in physics["without_collision"]]
     return lines + [f"  {line}" for line in failures(physics)]
 
 

@@ -4,6 +4,7 @@ import json
 import shutil
 from types import SimpleNamespace
 
+import mujoco
 import pytest
 from boxes import box, room
 from exports_room import BOOK, HANDLE, KNOB, MUG, PICTURE, TABLE
@@ -11,9 +12,10 @@ from exports_room import BOOK, HANDLE, KNOB, MUG, PICTURE, TABLE
 from reconstruction.assembly import AssemblyConfig, assemble
 from reconstruction.cli import main
 from reconstruction.commands.scenes import describe_physics
-from reconstruction.publish import publish_scene
+from reconstruction.exports import export_scene
+from reconstruction.publish import _object, publish_scene
 from reconstruction.types import Edge, SceneGraph
-from registry import SceneRegistry
+from registry import SceneRegistry, seal_bundle
 from registry.errors import SimReconError
 
 
@@ -45,6 +47,33 @@ def test_verify_says_it_in_words(verified, capsys):
     assert "all files are as published" in said
     assert "physics: stable 100%" in said
     assert "edges are real" in said
+
+
+def test_what_has_no_collision_shape_is_named_and_loads(bundle, tmp_path, capsys):
+    folder = tmp_path / "bundle"
+    shutil.copytree(bundle.root, folder)
+    scene = json.loads((folder / "scene.json").read_text())
+    (picture,) = (item for item in scene["objects"] if item["id"] == PICTURE)
+    for path in picture["collision"]:
+        (folder / path).unlink()
+    picture |= {"collision": [], "dynamic": False}
+    seal_bundle(folder, scene)
+    root = tmp_path / "registry"
+    SceneRegistry(root, create=True).publish(folder, "bare")
+    assert main(["verify", "bare", "--registry", str(root), "--physics"]) == 0
+    assert f"picture {PICTURE} has no collision shape" in capsys.readouterr().out
+    exported = export_scene(SceneRegistry(root).load("bare"), ["mjcf"], tmp_path / "mjcf")
+    assert mujoco.MjModel.from_xml_path(str(exported.main["mjcf"])).nbody > 8
+
+
+def test_assembly_without_a_collision_shape_is_published_without_one(tmp_path):
+    """Not with the one that the asset has, as where nothing was changed."""
+    assets = room(box(10, (1.2, 0.6, 0.9), (0, 0, 0)), box(11, (1.2, 0.6, 0.9), (0, 0, 0)))
+    graph = SceneGraph(tuple(Edge(i, "supported_by", 1, 1.0, "") for i in (10, 11)))
+    placed = assemble(assets, graph, AssemblyConfig()).placed
+    entries = [_object(a, p, False, tmp_path) for a, p in zip(assets.objects, placed)]
+    assert [len(entry["collision"]) for entry in entries] == [1, 0]
+    assert not list((tmp_path / "objects" / "011").glob("collision*"))
 
 
 def test_a_scene_that_does_not_rest_is_not_published(tmp_path):
