@@ -10,7 +10,7 @@ from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, 
 
 __all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets", "outside_inputs", "wants_views")
 
-VERSION = 20
+VERSION = 21
 
 
 def build_assets(

@@ -43,6 +43,7 @@ from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
 
 _COVERED_SHARE = 0.75  # of what was seen, along each axis
+_FUSED_SHARE = 0.5  # of its fused surface, which has skirts
 _HUNG_SHARE = 0.9  # the fused surface of what hangs has no skirts behind it
 
 
@@ -269,11 +270,24 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
         fused = fused_points(item.id, frame, scene.surface, scene.found)
         if len(fused) and not _covers(body, fused, _HUNG_SHARE, outer=1.0):
             body, how = relief(fused, frame.wall_y, config), "observed+relief"
-    elif not furniture and not _covers(body, frame.points):
-        body, how = mound(frame.points, config), "observed+relief"
+    elif not furniture:
+        seen_points = _seen_of(item.id, body, frame, scene)
+        if not _covers(body, seen_points):
+            body, how = mound(seen_points, config), "observed+relief"
     if body is None:
         return box_fallback(item, seen.points)
     return Shape(body, frame, how + "+continued" * bool(sides), attempt)
+
+
+def _seen_of(item: int, body: Solid | None, frame: ObjectFrame, scene: Evidence) -> np.ndarray:
+    """Return the points (k, 3), grid frame, that a small thing's shape must cover.
+
+    Of a thing that is a few pixels in each frame, borders that snap to edges of color leave next to nothing: where its
+    shape is less than half as large as its fused surface, that counts.
+    """
+    fused = fused_points(item, frame, scene.surface, scene.found)
+    enough = len(fused) == 0 or _covers(body, fused, _FUSED_SHARE)
+    return frame.points if enough else fused
 
 
 def embedded_solid(
@@ -281,10 +295,10 @@ def embedded_solid(
 ) -> tuple[Solid | None, str]:
     """Return the embedded completion of what was seen, and how it was made; None where nothing solid comes of it."""
     field = completion.complete(volume, frame, config, furniture=furniture)
-    body = solid.extract(field)
+    body = solid.extract(field, frame.points)
     if field.symmetries and not _covers(body, frame.points):
         field = completion.complete(volume, frame, replace(config, symmetry=False), furniture=furniture)
-        body = solid.extract(field)
+        body = solid.extract(field, frame.points)
     if body is None or body.volume < 1e-7:
         return None, ""
     if frame.wall_y is None:

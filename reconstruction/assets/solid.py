@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _LEG_SHARE, _LEG_HEIGHT_SHARE = 0.003, 0.4  # of the largest body's volume, of the thing's height
 _LEG_GAP_M, _LEG_OVERLAP_M = 0.06, 0.003
+_MOST_POINTS = 5000
+_SEEN_SHARE = 0.01  # of a thing's seen points lie on a body that is no crumb, if it is as large as a leg
 _MAX_VOLUME_CHANGE = 0.1  # by decimation
 
 
@@ -34,8 +36,8 @@ class Solid:
         return np.ptp(self.vertices, axis=0)
 
 
-def extract(field: CompletedField) -> Solid | None:
-    """Return the zero surface of a field, its largest body and others of at least 4 % of its volume."""
+def extract(field: CompletedField, points: np.ndarray | None = None) -> Solid | None:
+    """Return the zero surface of a field, its largest body and others that are no crumbs (`without_crumbs`)."""
     from skimage.measure import marching_cubes
 
     if not (field.distance < 0).any():
@@ -44,13 +46,19 @@ def extract(field: CompletedField) -> Solid | None:
     solid = Solid(field.origin + (vertices + 0.5) * field.voxel_m, faces.astype(np.int32))
     if solid.volume < 0:
         solid = Solid(solid.vertices, solid.faces[:, ::-1].copy())
-    return without_crumbs(solid)
+    return without_crumbs(solid, points)
 
 
-def without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
+def without_crumbs(solid: Solid, points: np.ndarray | None = None, share: float = 0.04) -> Solid | None:
     """Drop small bodies, and bodies inside others (closed cavities); legs that lost their joint are kept and reach up.
 
     A leg is slim, so that its share of the volume says little: what stands as high as much of the thing belongs to it.
+    So does the rail of a chair's back, of which next to nothing is solid: many of the thing's points were seen on it.
+
+    Args:
+        solid: closed bodies.
+        points: float64 (k, 3) seen on the thing, in the same frame; None: volume alone decides.
+        share: of the largest body's volume, from which on a body is no crumb.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -67,7 +75,8 @@ def without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
     if volumes.max() <= 0:
         return None
     main = int(np.argmax(volumes))
-    keep = volumes > share * volumes.max()
+    keep = volumes > share * volumes[main]
+    keep |= (volumes > _LEG_SHARE * volumes[main]) & _well_seen(solid, label, count, points)
     vertices = solid.vertices.copy()
     height = float(np.ptp(vertices[:, 2]))
     for body in np.flatnonzero(volumes > _LEG_SHARE * volumes[main]):
@@ -77,6 +86,17 @@ def without_crumbs(solid: Solid, share: float = 0.04) -> Solid | None:
         keep[body] = True
         vertices[own, 2] = _reaching(vertices[own], vertices[label == main])
     return compact(Solid(vertices, f[keep[face_label]]))
+
+
+def _well_seen(solid: Solid, label: np.ndarray, count: int, points: np.ndarray | None) -> np.ndarray:
+    """Tell which of `count` bodies (`label` of each vertex) much of what was seen of a thing lies on."""
+    from scipy.spatial import cKDTree
+
+    if points is None or len(points) == 0:
+        return np.zeros(count, bool)
+    some = points[:: max(1, len(points) // _MOST_POINTS)]
+    nearest = cKDTree(solid.vertices).query(some)[1]
+    return np.bincount(label[nearest], minlength=count) > _SEEN_SHARE * len(some)
 
 
 def _reaching(leg: np.ndarray, main: np.ndarray) -> np.ndarray:

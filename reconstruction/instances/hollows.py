@@ -32,6 +32,7 @@ _SECTORS, _EVEN_M, _MIN_EVEN = 24, 0.012, 0.6  # directions in which the rim has
 _BULGE, _MAX_CONTENT = 0.42, 0.5  # of contents: shape, and share of the container's outline
 _MIN_CONTENT_M, _RIM_REACH_M, _MIN_INNER = 0.025, 0.025, 0.85
 _LOW_SHARE, _WIDER, _PLATE_M = 0.4, 1.35, 0.012  # of what a container stands on
+_OTHER_COLOR, _WIDER_OTHER = 20.0, 1.15  # CIELAB; skirts make the upper part wider than it is
 _TOUCH_M, _CLINGS_M, _OWN_BULGE = 0.015, 0.06, 0.6  # of a handle or a skirt
 _BESIDE_M, _ALIKE = 0.04, 7.0
 _MAX_FILLED = 0.75  # share of the outline that rises to the rim
@@ -163,16 +164,24 @@ def shell_and_contents(
     under = [k for k in own if np.median(graph.points[parts[k], 2]) < low + _LOW_SHARE * (high - low)]
     upper = [parts[k] for k in own if k not in under]
     narrow = _hull_m2(graph, np.concatenate(upper)) if upper else whole
+    main_lab = np.median(graph.lab[np.concatenate(upper)], axis=0) if upper else None
     under = [
         k
         for k in under
-        if _hull_m2(graph, parts[k]) > _WIDER * narrow and np.ptp(graph.points[parts[k], 2]) > _PLATE_M
+        if _hull_m2(graph, parts[k])
+        > narrow * (_WIDER if _alike(graph, parts[k], main_lab) else _WIDER_OTHER)
+        and np.ptp(graph.points[parts[k], 2]) > _PLATE_M
     ]
     own = [k for k in own if k not in under]
     if under and own:
         main = max(own, key=lambda k: graph.areas[parts[k]].sum())
         own = [k for k in own if k == main or is_within(graph, parts[k], parts[main])]
     return under, own, contents
+
+
+def _alike(graph: MeshGraph, part: np.ndarray, lab: np.ndarray | None) -> bool:
+    """Tell whether a part has the color (3,), CIELAB, of what is above it: a foot of the thing itself, perhaps."""
+    return lab is None or bool(np.linalg.norm(np.median(graph.lab[part], axis=0) - lab) < _OTHER_COLOR)
 
 
 def clings_to(graph: MeshGraph, part: np.ndarray, container: np.ndarray) -> bool:

@@ -7,10 +7,12 @@ import pytest
 from surfaces import frames_of, merged, sheet, solid_box, surface_from
 
 from reconstruction.assets import AssetsConfig
+from reconstruction.assets.build import gather_evidence, object_shape
 from reconstruction.assets.fused import fused_points, sample_surface, without_strays
 from reconstruction.assets.hanging_relief import mound, relief
 from reconstruction.assets.views import prepare_pixels
 from reconstruction.assets.volume import ObjectFrame
+from reconstruction.progress import NO_PROGRESS
 from reconstruction.types import Instance, InstanceSet
 
 RED = (200, 40, 40)
@@ -103,3 +105,18 @@ def test_a_mound_reaches_from_the_support_to_what_was_seen():
     assert body.vertices.max(axis=0) == pytest.approx([0.12, 0.12, 0.02], abs=0.006)
     assert body.volume == pytest.approx(np.pi * (0.12**2 * 0.01 + (0.12**2 - 0.1**2) * 0.01), rel=0.25)
     assert mound(np.zeros((0, 3)), AssetsConfig()) is None
+
+
+def test_a_thing_of_which_id_maps_leave_little_is_as_large_as_its_surface(room):
+    """Borders that snap to edges of color take most of what is a few pixels in each frame."""
+    surface, posed, depth, found = room
+    camera = depth.camera
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    left = found.id_maps.copy()
+    for ids, z, pose in zip(left, depth.depth, posed.world_from_camera):
+        local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+        ids[((local @ pose[:3, :3].T + pose[:3, 3])[..., :2] < 0.05).any(axis=-1)] = 1
+    assert 100 < (left == 2).sum() < 0.3 * (found.id_maps == 2).sum()
+    few = replace(found, id_maps=left)
+    scene = gather_evidence(posed, depth, surface, few, AssetsConfig(), NO_PROGRESS)
+    assert object_shape(BOX, scene).body.extents == pytest.approx([0.3, 0.3, 0.2], abs=0.03)

@@ -6,7 +6,7 @@ from fused_surfaces import box, can, fused, tray
 from surfaces import floor_sheet, frames_of, merged, sheet, solid_box, surface_from
 
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.instances.hollows import clings_to, hollows_on, looks_like
+from reconstruction.instances.hollows import clings_to, hollows_on, looks_like, shell_and_contents
 from reconstruction.instances.scraps import without_skirts
 from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.stacks import cut_stacks
@@ -146,3 +146,22 @@ def test_a_container_is_not_cut_into_stacks():
     after = cut_stacks(graph, surface, things, posed, depth, InstancesConfig(), NO_PROGRESS)
     assert len(after) == 2
     assert len(after[1].vertices) == before
+
+
+@pytest.mark.parametrize(
+    ("foot", "under"), [(WHITE, [0]), (RED, [])], ids=["a white plate", "a foot of the bowl's own color"]
+)
+def test_a_plate_below_a_bowl_is_told_from_a_foot_by_its_color(foot, under):
+    """The skirt that depth drapes around the bowl makes it nearly as wide as the plate that it stands on."""
+    bowl = tray((-0.10, -0.10, 0.02), (0.10, 0.10, 0.09), 0.012, RED)
+    graph = MeshGraph.from_surface(
+        fused(
+            [box((-0.112, -0.112, 0.0), (0.112, 0.112, 0.02), foot), *bowl],
+            voxel_m=0.006,
+            half_m=0.2,
+            top_m=0.2,
+        )
+    )
+    body = np.flatnonzero(graph.points[:, 2] > 0.003)
+    parts = [body[graph.points[body, 2] < 0.023], body[graph.points[body, 2] >= 0.023]]
+    assert shell_and_contents(graph, body, parts)[0] == under
