@@ -10,7 +10,7 @@ import torch
 
 import simrecon_envs
 from simrecon_envs import scene_env
-from simrecon_envs.direct import DirectDrive, _Tip
+from simrecon_envs.direct import DirectDrive, DirectReads, _Tip
 from simrecon_envs.measures import Measures
 from simrecon_envs.oracle import CONTROL_MODE, Oracle
 
@@ -106,6 +106,33 @@ def _read_as_sapien_has_them(scene: object) -> None:
     np.testing.assert_array_equal(scene.measures.poses[0], poses)
     tip = scene.agent.tcp._objs[0].entity_pose.__getstate__()
     np.testing.assert_array_equal(scene.measures.tcp[0], np.array(tip, np.float32))
+
+
+def test_contacts_are_asked_for_only_where_they_decide(
+    scenes_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = simrecon_envs.make("things", registry=scenes_root, task="rearrange", max_episode_steps=10_000)
+    contacts, asked = DirectReads._contacts, []
+
+    def counted(reads: DirectReads, row: int) -> list:
+        asked.append(row)
+        return contacts(reads, row)
+
+    monkeypatch.setattr(DirectReads, "_contacts", counted)
+    scene, still = env.unwrapped, np.zeros(env.action_space.shape, np.float32)
+    env.reset(seed=0)
+    stage = scene.task_object.stages[0]
+    row = scene.measures._row[stage.subject]
+    for _ in range(3):  # what was moved away is awake, and carried wherever it is
+        env.step(still)
+    assert row not in asked
+    body = scene.builder.objects[stage.subject].actor._bodies[0]
+    home = next(item for item in scene.bundle.objects if item.id == stage.subject).world_from_object
+    body.entity.pose = sapien.Pose(home)
+    info = env.step(still)[-1]
+    assert row in asked
+    assert int(info["things_done"]) == 1
+    env.close()
 
 
 @pytest.mark.parametrize(
