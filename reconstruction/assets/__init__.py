@@ -10,7 +10,7 @@ from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, 
 
 __all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets", "outside_inputs", "wants_views")
 
-VERSION = 21
+VERSION = 22
 
 
 def build_assets(

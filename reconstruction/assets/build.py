@@ -276,6 +276,10 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
             body, how = mound(seen_points, config), "observed+relief"
     if body is None:
         return box_fallback(item, seen.points)
+    if furniture and frame.wall_y is None:
+        fused = fused_points(item.id, frame, scene.surface, scene.found)
+        if len(fused) and not _covers(body, fused, _FUSED_SHARE):
+            return box_around(frame, fused)
     return Shape(body, frame, how + "+continued" * bool(sides), attempt)
 
 
@@ -323,6 +327,16 @@ def _covers(
         return False
     seen = np.ptp(np.percentile(points, [outer, 100 - outer], axis=0), axis=0)
     return bool((body.extents > share * seen).all())
+
+
+def box_around(frame: ObjectFrame, points: np.ndarray) -> Shape:
+    """Return the box, standing, of points (k, 3) on the fused surface of furniture, grid frame.
+
+    Of a shelf at the rim of a few frames, one post is all that id maps show; its edges tell how far it goes.
+    """
+    low, high = np.percentile(points, [1, 99], axis=0)
+    low[2] = min(low[2], 0.0) if frame.on_support else low[2]
+    return Shape(solid.box_solid(low, high), frame, "box-fallback", is_box=True)
 
 
 def box_fallback(item: Instance, points: np.ndarray) -> Shape:

@@ -107,16 +107,27 @@ def test_a_mound_reaches_from_the_support_to_what_was_seen():
     assert mound(np.zeros((0, 3)), AssetsConfig()) is None
 
 
-def test_a_thing_of_which_id_maps_leave_little_is_as_large_as_its_surface(room):
-    """Borders that snap to edges of color take most of what is a few pixels in each frame."""
-    surface, posed, depth, found = room
+def shown_beyond(room, low_m):
+    """Return the room's things with id maps that show the box only where x and y are at least `low_m`."""
+    _, posed, depth, found = room
     camera = depth.camera
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     left = found.id_maps.copy()
     for ids, z, pose in zip(left, depth.depth, posed.world_from_camera):
         local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
-        ids[((local @ pose[:3, :3].T + pose[:3, 3])[..., :2] < 0.05).any(axis=-1)] = 1
+        ids[((local @ pose[:3, :3].T + pose[:3, 3])[..., :2] < low_m).any(axis=-1)] = 1
     assert 100 < (left == 2).sum() < 0.3 * (found.id_maps == 2).sum()
-    few = replace(found, id_maps=left)
-    scene = gather_evidence(posed, depth, surface, few, AssetsConfig(), NO_PROGRESS)
-    assert object_shape(BOX, scene).body.extents == pytest.approx([0.3, 0.3, 0.2], abs=0.03)
+    return replace(found, id_maps=left)
+
+
+@pytest.mark.parametrize(
+    ("furniture_m", "how"), [(0.5, "observed+relief"), (0.15, "box-fallback")], ids=["small", "furniture"]
+)
+def test_a_thing_of_which_id_maps_leave_little_is_as_large_as_its_surface(room, furniture_m, how):
+    """Borders that snap to edges of color take most of what is a few pixels in each frame."""
+    surface, posed, depth, _ = room
+    config = AssetsConfig(furniture_m=furniture_m)
+    scene = gather_evidence(posed, depth, surface, shown_beyond(room, 0.05), config, NO_PROGRESS)
+    shape = object_shape(BOX, scene)
+    assert shape.how == how
+    assert shape.body.extents == pytest.approx([0.3, 0.3, 0.2], abs=0.03)
