@@ -121,7 +121,7 @@ def _own_colors(
         config: what a support is.
 
     Returns:
-        Weighted CIELAB (k, 3), None if no rim is sure.
+        Weighted CIELAB (k, 3), None if no rim is sure, or if it has so many colors that none is its own.
     """
     low, high = quantiles(graph.points[body, 2], graph.areas[body], (0.02, 0.98))
     clear = graph.points[body, 2] > low + _CLEAR * (high - low)
@@ -129,6 +129,8 @@ def _own_colors(
     if len(edge) < _MIN_VERTICES:
         return None
     colors = [main_colors(graph, edge)]
+    if len(colors[0]) == 0:
+        return None
     for support in find_supports(graph, body, config):
         inner = support.vertices[within[support.vertices] > _RIM_M]
         if support.height_m < low + _LOW * (high - low) and len(inner) >= _MIN_VERTICES:

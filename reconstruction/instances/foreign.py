@@ -74,7 +74,12 @@ class ColorView:
         return like >= np.where(seen > 0, _WALL_SHARE * seen, 0.0)
 
     def foreign(self, vertices: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """Return which vertices most frames see in none of some colors (k, 3), nor in that of the wall behind."""
+        """Return which vertices most frames see in none of some colors (k, 3), nor in that of the wall behind.
+
+        Of what has no color of its own (k = 0), since it has too many, nothing can be told.
+        """
+        if len(own) == 0:
+            return np.zeros(len(vertices), bool)
         points, up = self.graph.points[vertices], self.graph.normals[vertices, 2] > _UP
         seen, other = np.zeros(len(vertices)), np.zeros(len(vertices))
         for frame in self.frames:
@@ -181,7 +186,10 @@ def _own_colors(view: ColorView, vertices: np.ndarray) -> np.ndarray:
 
 
 def main_colors(graph: MeshGraph, vertices: np.ndarray) -> np.ndarray:
-    """Return the colors (k, 3), weighted CIELAB, that cover a good part of the area of some vertices."""
+    """Return the colors (k, 3), weighted CIELAB, that cover a good part of the area of some vertices.
+
+    None (k = 0) where no color does: on a print of many.
+    """
     nearest, means = palette(graph.lab[vertices] * LIGHTNESS_WEIGHT, _COLORS, _COLOR_GAP)
     area = np.bincount(nearest, weights=graph.areas[vertices], minlength=len(means))
     return means[area > _MOST_FOREIGN * area.sum()]

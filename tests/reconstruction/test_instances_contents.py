@@ -1,5 +1,8 @@
 """What is in a container is told from it by color, whole; its inside, prints and corners are its own."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from fused_surfaces import box, can, fused, tray
@@ -9,7 +12,7 @@ from reconstruction.instances import InstancesConfig
 from reconstruction.instances.contents import cut_contents
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.flush import merge_flush
-from reconstruction.instances.foreign import ColorView
+from reconstruction.instances.foreign import ColorView, main_colors
 from reconstruction.instances.scraps import without_skirts
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import sightings
@@ -156,3 +159,19 @@ def test_a_cut_through_one_top_is_undone(rise_m, color, parts):
     found = merge_flush(graph, things, NO_PROGRESS)
     assert len(found) == 1 + parts
     assert sum(len(thing.vertices) for thing in found) == len(points)
+
+
+def test_of_a_crate_of_all_colors_nothing_is_told_by_color():
+    """None of them covers a good part of its rim."""
+    surface = fused(CRATE, half_m=0.3, top_m=0.3)
+    turn = np.arctan2(surface.vertices[:, 1], surface.vertices[:, 0])
+    lab = np.stack([np.full(len(turn), 65.0), 40 * np.cos(turn), 40 * np.sin(turn)], axis=-1).astype(
+        np.float32
+    )
+    rgb = np.clip(255 * cv2.cvtColor(lab[None], cv2.COLOR_LAB2RGB)[0], 0, 255)
+    painted = replace(surface, colors=rgb.astype(np.uint8))
+    view, _ = seen(painted)
+    whole = Thing(np.flatnonzero(view.graph.points[:, 2] > 0.012), container=True)
+    assert len(main_colors(view.graph, whole.vertices)) == 0
+    assert not view.foreign(whole.vertices, np.zeros((0, 3))).any()
+    assert cut_contents(view, [whole], InstancesConfig(), NO_PROGRESS) == [whole]
