@@ -163,13 +163,13 @@ def shell_and_contents(
     low, high = np.percentile(z, [2, 98])
     under = [k for k in own if np.median(graph.points[parts[k], 2]) < low + _LOW_SHARE * (high - low)]
     upper = [parts[k] for k in own if k not in under]
-    narrow = _hull_m2(graph, np.concatenate(upper)) if upper else whole
-    main_lab = np.median(graph.lab[np.concatenate(upper)], axis=0) if upper else None
+    above = np.concatenate(upper) if upper else body
+    narrow = _hull_m2(graph, above)
+    color = np.median(graph.lab[above], axis=0)
     under = [
         k
         for k in under
-        if _hull_m2(graph, parts[k])
-        > narrow * (_WIDER if _alike(graph, parts[k], main_lab) else _WIDER_OTHER)
+        if _hull_m2(graph, parts[k]) > narrow * (_WIDER if _alike(graph, parts[k], color) else _WIDER_OTHER)
         and np.ptp(graph.points[parts[k], 2]) > _PLATE_M
     ]
     own = [k for k in own if k not in under]
@@ -179,9 +179,9 @@ def shell_and_contents(
     return under, own, contents
 
 
-def _alike(graph: MeshGraph, part: np.ndarray, lab: np.ndarray | None) -> bool:
+def _alike(graph: MeshGraph, part: np.ndarray, lab: np.ndarray) -> bool:
     """Tell whether a part has the color (3,), CIELAB, of what is above it: a foot of the thing itself, perhaps."""
-    return lab is None or bool(np.linalg.norm(np.median(graph.lab[part], axis=0) - lab) < _OTHER_COLOR)
+    return bool(np.linalg.norm(np.median(graph.lab[part], axis=0) - lab) < _OTHER_COLOR)
 
 
 def clings_to(graph: MeshGraph, part: np.ndarray, container: np.ndarray) -> bool:
