@@ -5,7 +5,6 @@ than reading them, and all of them together more than the physics does. What is 
 """
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,13 @@ from mani_skill.agents.robots import Fetch, Panda
 _MARGIN_M = 0.02  # more than PhysX keeps between bodies in contact
 _STILL = np.float32(0)
 _GRASP_N, _GRASP_DEG = 0.5, 85  # as in `is_grasping`
-# Inverse kinematics: ManiSkill's goes a tenth of the way to the goal a step, until 1e-4 are left. Here the first steps
-# go half of it, which decides where the elbow is, and the others all of it, where each leaves about the square of what
-# the one before left.
-_BOLD, _BOLD_STEPS, _NEWTON_STEPS, _POSE_TOLERANCE = 0.5, 3, 12, 1e-5
+# Inverse kinematics: ManiSkill's goes a tenth of the way to the goal a step, until 1e-4 are left. Here three steps go
+# half of it, which decides where the elbow is, and the others all of it, where each leaves about the square of what the
+# one before left. At last as ManiSkill's. A row: share of the way, at most so many steps, until so much is left.
+_PHASES = np.array([[0.5, 3, 1e-5], [1.0, 12, 1e-5], [0.1, 100, 1e-4]])
 # What is left after them (m, rad) where the hand cannot get: ManiSkill's steps end no nearer.
 _OUT_OF_REACH = 2e-3
+_HALF_TURN_RAD = 3.0  # from about which on the way to a goal is not one way any more
 
 
 class DirectReads:
@@ -223,17 +223,17 @@ class DirectDrive:
         )
         """Whether controllers have nothing to do between a control step's time steps."""
 
-    def set_action(self, action: torch.Tensor, numbers: list[float]) -> None:
-        """Give the controllers an action (1, k), whose numbers are (k,), as `controller.set_action` does."""
+    def set_action(self, action: torch.Tensor, numbers: np.ndarray, listed: list[float]) -> None:
+        """Give the controllers an action (1, k), whose numbers are (k,) twice, as `controller.set_action` does."""
         if self._targets is None:
             self.controller.set_action(action)
             return
         qpos = self._robot.qpos
         # In Python's numbers: right after the physics each operation of NumPy costs several of them.
         angles = qpos.tolist()
-        wanted = self._joints.targets(angles, numbers)
+        wanted = self._joints.targets(angles, listed)
         for tip in self._tips:
-            wanted += tip.targets(angles, numbers)
+            wanted += tip.targets(qpos, angles, numbers)
         self._targets.set(qpos, wanted)
         for share, child in self.foreign:
             child.set_action(action[:, share])
@@ -317,60 +317,52 @@ class _Tip:
         if type(controller) not in frames or controller.config.interpolate or controller.config.use_target:
             return False
         plain = controller.config.use_delta and controller._normalize_action
-        return plain and controller.config.frame == frames[type(controller)]
+        less = type(controller) is PDEEPosController or abs(controller.config.rot_lower) < _HALF_TURN_RAD
+        return plain and less and controller.config.frame == frames[type(controller)]
 
     def __init__(self, share: slice, controller: PDEEPosController) -> None:
-        self._controller = controller
+        from simrecon_envs import chains
+
+        self._follow = chains.follow
         self._share = share
         self._indices = controller.active_joint_indices.tolist()
-        self._root, self._tip = controller.root_link._objs[0], controller.ee_link._objs[0]
         low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
-        self._middle, self._half = (0.5 * (high + low)).tolist(), (0.5 * (high - low)).tolist()
-        self._turn = controller.config.rot_lower if type(controller) is PDEEPoseController else None
+        turn = controller.config.rot_lower if type(controller) is PDEEPoseController else 0.0
+        scale = np.array([0.5 * (high + low), 0.5 * (high - low), np.full(3, turn)], np.float64)
         kinematics = controller.kinematics
-        self._known = kinematics.pmodel_active_joint_indices.tolist()
-        self._solved = kinematics.pmodel_controlled_joint_indices.tolist()
-        # Of the types that are asked for, so that they need not be converted at every step.
-        self._mask = kinematics.qmask.numpy().astype(np.int32)
+        model, hand = kinematics.pmodel, kinematics.end_link_idx
+        straight = np.zeros(len(kinematics.qmask))
+        model.compute_forward_kinematics(straight)
+        home = model.get_link_pose(hand).to_transformation_matrix()[:3].astype(np.float64)
+        model.compute_full_jacobian(straight)
+        screws = model.get_link_jacobian(hand, local=False).T
+        free = kinematics.qmask.numpy()
+        chain = np.flatnonzero((screws != 0).any(axis=1) | free)  # not the fingers, nor the head
+        screws, free = np.ascontiguousarray(screws[chain]), free[chain]
+        known = kinematics.pmodel_active_joint_indices.numpy()[chain].astype(np.int64)
+        self._arm = (screws, chains.motions(screws), free, home, _PHASES, _OUT_OF_REACH, scale, known)
+        self._angles = np.zeros(len(chain))
+        self._found = [
+            chain.tolist().index(number) for number in kinematics.pmodel_controlled_joint_indices.tolist()
+        ]
+        # Compiled or loaded now, not at the first step.
+        width = share.stop - share.start
+        self._follow(
+            *self._arm, np.zeros(known.max() + 1, np.float32), np.zeros(width, np.float32), self._angles
+        )
 
-    def targets(self, angles: list[float], action: list[float]) -> list[float]:
+    def targets(self, qpos: np.ndarray, angles: list[float], action: np.ndarray) -> list[float]:
         """Return the targets of the joints that move and turn the hand by its share of an action.
 
         Args:
-            angles: Where all of the robot's joints are (d,).
+            qpos: Where all of the robot's joints are (d,).
+            angles: The same.
             action: The whole action (k,).
         """
-        *place, w, x, y, z = (self._root.entity_pose.inv() * self._tip.entity_pose).__getstate__()
-        wish = action[self._share]
-        for axis in (0, 1, 2):
-            place[axis] += self._middle[axis] + self._half[axis] * min(max(wish[axis], -1.0), 1.0)
-        turned = (w, x, y, z)
-        if self._turn is not None:
-            scale = 0.5 * self._turn / max(math.hypot(*wish[3:]), 1.0)
-            turned = _product(_turned(*(scale * angle for angle in wish[3:])), turned)
-        solution = self._solve(np.array([angles[k] for k in self._known]), sapien.Pose(place, turned))
-        if solution is None:
+        if not self._follow(*self._arm, qpos, action[self._share], self._angles):
             return [angles[k] for k in self._indices]
-        found = solution.tolist()
-        return [found[k] for k in self._solved]
-
-    def _solve(self, start: np.ndarray, goal: sapien.Pose) -> np.ndarray | None:
-        """Return joints (d,) with the hand at a goal, near those where they start (d,); None where there are none."""
-        solve = self._steps
-        bold, found, _ = solve(start, goal, dt=_BOLD, max_iterations=_BOLD_STEPS)
-        if not found:
-            bold, found, left = solve(bold, goal, dt=1.0, max_iterations=_NEWTON_STEPS)
-        if not found and math.hypot(*left.tolist()) < _OUT_OF_REACH:
-            bold, found, _ = solve(start, goal, eps=1e-4, dt=0.1, max_iterations=100)  # ManiSkill's
-        return bold if found else None
-
-    def _steps(
-        self, start: np.ndarray, goal: sapien.Pose, eps: float = _POSE_TOLERANCE, **options: float
-    ) -> tuple[np.ndarray, bool, np.ndarray]:
-        kinematics = self._controller.kinematics
-        return kinematics.pmodel.compute_inverse_kinematics(
-            kinematics.end_link_idx, goal, initial_qpos=start, active_qmask=self._mask, eps=eps, **options
-        )
+        found = self._angles.tolist()
+        return [found[k] for k in self._found]
 
 
 class _Targets:
@@ -395,23 +387,6 @@ class _Targets:
         self._target[:] = target
         for give, value in zip(self._set, target, strict=True):
             give(value)
-
-
-def _turned(x: float, y: float, z: float) -> list[float]:
-    """Return the quaternion of the turn about x, after that about y, after that about z, of half angles (rad)."""
-    (a, b, c), (d, e, f) = map(math.cos, (x, y, z)), map(math.sin, (x, y, z))
-    return [a * b * c - d * e * f, d * b * c + a * e * f, a * e * c - d * b * f, a * b * f + d * e * c]
-
-
-def _product(one: Iterable[float], other: Iterable[float]) -> list[float]:
-    """Return the quaternion of the turn `other`, then `one`."""
-    (a, b, c, d), (w, x, y, z) = one, other
-    return [
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    ]
 
 
 def _row(pose: sapien.Pose) -> np.ndarray:

@@ -30,6 +30,7 @@ from registry.errors import did_you_mean
 from simrecon_envs.arrays import Array, tensor, tensors
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
+from simrecon_envs.direct import DirectDrive
 from simrecon_envs.errors import SceneAssetsMissing
 from simrecon_envs.forgetting import renew_physics
 from simrecon_envs.measures import Measures
@@ -241,6 +242,8 @@ class SceneEnv(BaseEnv):
 
     def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, self._root_pose() if self.placement is not None else None)
+        if self.agent is not None and not self.gpu_sim_enabled:
+            DirectDrive(self.agent)  # loads what is compiled: that belongs to making, not to the first step
 
     def _load_scene(self, options: dict) -> None:
         pedestal = None

@@ -70,10 +70,10 @@ class DirectStep:
         self._numbers[:] = (action if isinstance(action, np.ndarray) else action.numpy(force=True)).reshape(
             -1
         )
-        numbers = self._numbers.tolist()
-        if not math.isfinite(sum(numbers)):
+        listed = self._numbers.tolist()
+        if not math.isfinite(sum(listed)):
             check_action(env, action)
-        drive.set_action(batched, numbers)
+        drive.set_action(batched, self._numbers, listed)
         if drive.idle and not self._hooked:
             step = env.scene.px.step
             for _ in range(env._sim_steps_per_control):

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sapien
+import scipy.linalg
 import torch
+from scipy.spatial.transform import Rotation
 
 import simrecon_envs
-from simrecon_envs import scene_env
-from simrecon_envs.direct import DirectDrive, DirectReads, _Tip
+from simrecon_envs import chains, scene_env
+from simrecon_envs.direct import _PHASES, DirectDrive, DirectReads
 from simrecon_envs.measures import Measures
 from simrecon_envs.oracle import CONTROL_MODE, Oracle
 
@@ -166,7 +168,7 @@ def test_joints_get_the_targets_of_the_controllers(
         agent.controller.set_action(torch.from_numpy(action)[None])
         theirs = _targets(joints)
         agent.controller.set_state(state)
-        drive.set_action(torch.from_numpy(action)[None], action.tolist())
+        drive.set_action(torch.from_numpy(action)[None], action, action.tolist())
         if "_ee_" in mode:
             # The hand goes to the same place, as far as ManiSkill solves for it; the elbow nearly does.
             ours = _targets(joints)
@@ -181,18 +183,12 @@ def test_joints_get_the_targets_of_the_controllers(
     env.close()
 
 
-def test_the_hand_gets_where_it_can_in_few_steps(scenes_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_hand_gets_where_it_can_in_few_steps(scenes_root: Path) -> None:
     env = simrecon_envs.make("room", registry=scenes_root, control_mode=CONTROL_MODE)
     env.reset(seed=0)
     agent = env.unwrapped.agent
     drive, arm = DirectDrive(agent), agent.controller.controllers["arm"]
-    solve, counts = _Tip._steps, []
-
-    def counted(*args: object, **options: float) -> tuple:
-        counts.append(options["max_iterations"])
-        return solve(*args, **options)
-
-    monkeypatch.setattr(_Tip, "_steps", counted)
+    tip = drive._tips[0]
     generator, moved, short = np.random.default_rng(0), [], 0
     for _ in range(60):
         action = generator.uniform(-1, 1, agent.single_action_space.shape).astype(np.float32)
@@ -200,18 +196,103 @@ def test_the_hand_gets_where_it_can_in_few_steps(scenes_root: Path, monkeypatch:
         agent.controller.set_action(torch.from_numpy(action)[None])
         theirs = arm._target_qpos.numpy().copy()
         agent.controller.set_state(state)
-        counts.clear()
-        drive.set_action(torch.from_numpy(action)[None], action.tolist())
+        drive.set_action(torch.from_numpy(action)[None], action, action.tolist())
         ours, here = arm._target_qpos.numpy(), arm._start_qpos.numpy()
         # Where the hand cannot get, both leave the arm where it is.
         assert np.array_equal(theirs, here) == np.array_equal(ours, here)
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=0.05)
         moved.append(not np.array_equal(ours, here))
-        short += sum(counts) <= 20
+        few = [_PHASES * [[1], [1], [0]] if part is _PHASES else part for part in tip._arm]
+        found = chains.follow(*few, drive._robot.qpos, action[tip._share], np.zeros(7))
+        short += found == moved[-1]
         env.step(action)
     assert sum(moved) > 30
     assert short > 55  # ManiSkill's takes a hundred
     env.close()
+
+
+@pytest.mark.parametrize("robot", ["panda", "fetch"])
+def test_arms_are_those_of_the_robots_model(scenes_root: Path, robot: str) -> None:
+    env = simrecon_envs.make("room", registry=scenes_root, robot_uids=robot, control_mode=CONTROL_MODE)
+    env.reset(seed=0)
+    agent = env.unwrapped.agent
+    kinematics = agent.controller.controllers["arm"].kinematics
+    model, hand, mask = kinematics.pmodel, kinematics.end_link_idx, kinematics.qmask.numpy()
+    tip = DirectDrive(agent)._tips[0]
+    screws, moving, free, home, _, _, _, known = tip._arm
+    here = agent.robot._objs[0].qpos
+    generator, base_from, tips = np.random.default_rng(0), np.empty((len(screws) + 1, 3, 4)), np.empty((3, 4))
+    off = []
+    for _ in range(50):
+        qpos = here + generator.normal(0, 0.3, len(here))
+        chains.place(moving, qpos[known], base_from)
+        chains.product(base_from[-1], home, tips)
+        angles = qpos[kinematics.pmodel_active_joint_indices.numpy()]
+        model.compute_forward_kinematics(angles)
+        pose = model.get_link_pose(hand)
+        np.testing.assert_allclose(tips, pose.to_transformation_matrix()[:3], rtol=0, atol=1e-6)
+
+        matrix = np.empty((6, len(screws)))
+        chains.jacobian(screws, np.ones(len(screws), bool), base_from, tips, matrix)
+        for joint in range(len(screws)):
+            turned, after = qpos[known] + 1e-5 * (np.arange(len(screws)) == joint), np.empty((3, 4))
+            chains.place(moving, turned, base_from)
+            chains.product(base_from[-1], home, after)
+            np.testing.assert_allclose(matrix[:, joint], 1e5 * _screw(tips, after), rtol=0, atol=1e-4)
+
+        # The same steps as the solver's that ManiSkill uses.
+        action = generator.uniform(-1, 1, 6).astype(np.float32)
+        turn = 0.2 * action[3:] / max(np.linalg.norm(action[3:]), 1)
+        goal = sapien.Pose(0.1 * action[:3]) * pose
+        goal.q = (sapien.Pose(q=_euler(turn)) * sapien.Pose(q=pose.q)).q
+        scale = np.array([np.zeros(3), np.full(3, 0.1), np.full(3, 0.2)])
+        for share, steps in ((0.5, 30), (1.0, 12), (0.1, 200)):
+            theirs, found, _ = model.compute_inverse_kinematics(
+                hand, goal, initial_qpos=angles, active_qmask=mask, eps=1e-6, dt=share, max_iterations=steps
+            )
+            phases, ours = np.array([[share, steps, 1e-6], [share, 0, 0]]), np.empty(len(known))
+            same = chains.follow(
+                screws, moving, free, home, phases, 0.0, scale, known, qpos.astype(np.float32), action, ours
+            )
+            assert same == found
+            if found:
+                solved = kinematics.pmodel_controlled_joint_indices.numpy()
+                off.append(np.abs(ours[tip._found] - theirs[solved]).max())
+    assert len(off) > 100
+    assert np.max(off) < 1e-3
+    assert np.median(off) < 1e-6
+    env.close()
+
+
+def test_the_way_to_a_goal_leads_there() -> None:
+    generator, way = np.random.default_rng(0), np.empty(6)
+    for angle in (0.0, 1e-9, 9e-5, 1.1e-4, 0.01, 1.0, 3.0):
+        axis = generator.normal(size=3)
+        screw = np.concatenate([generator.normal(size=3), angle * axis / np.linalg.norm(axis)])
+        here = np.column_stack(
+            [Rotation.from_rotvec(generator.normal(size=3)).as_matrix(), generator.normal(size=3)]
+        )
+        # What the screw motion, in the base's axes at the place, makes of the place.
+        local = np.zeros((4, 4))
+        local[:3, :3], local[:3, 3] = np.cross(np.eye(3), screw[3:]), screw[:3]
+        motion = scipy.linalg.expm(local)
+        goal = np.column_stack([motion[:3, :3] @ here[:, :3], here[:, 3] + motion[:3, 3]])
+        size = chains.away(here, goal, way)
+        np.testing.assert_allclose(way, screw, rtol=0, atol=1e-8)
+        assert size == pytest.approx(np.linalg.norm(screw), abs=1e-8)
+    half = np.column_stack([np.diag([1.0, -1.0, -1.0]), np.zeros(3)])
+    assert chains.away(np.eye(4)[:3], half, way) == np.inf  # not taken for being there
+
+
+def _euler(turn: np.ndarray) -> np.ndarray:
+    """Return the quaternion wxyz of the turn about z, after that y, after that x, of the base (3,) (rad)."""
+    return np.roll(Rotation.from_euler("XYZ", turn).as_quat(), 1)
+
+
+def _screw(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the small motion (6,) between two places (3, 4), in the base's axes."""
+    turned = Rotation.from_matrix(after[:, :3] @ before[:, :3].T).as_rotvec()
+    return np.concatenate([after[:, 3] - before[:, 3], turned])
 
 
 def _hand(kinematics: object, qpos: np.ndarray) -> np.ndarray:

@@ -1,0 +1,231 @@
+"""Where an arm's joints take its hand, and how they must stand for the hand to be at a goal; compiled, for the CPU.
+
+Importing this imports Numba: only environments do whose robot is driven by its hand. What is here is compiled at first
+use and kept for the next process; loops in place of long expressions, because they compile in half the time.
+
+Joints are screws in the base's space (Brockett's product of exponentials; Lynch and Park, Modern Robotics, chapters 4
+to 6): this is all that has to be known of an arm, whatever joints it has. A step is the one of ManiSkill's solver
+(pinocchio's closed loop with log6), except for how long it is: a share of the screw motion from where the hand is to
+the goal, by the least change of the joints.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+_DAMPING = 1e-6  # as in ManiSkill's solver
+_SMALL_RAD = 1e-4  # below this series are more exact than quotients
+
+
+def _compiled(function):
+    options = {"error_model": "numpy", "nogil": True}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except (
+        RuntimeError
+    ):  # Numba's "no locator available": no folder beside the file or at home can be written to
+        return numba.njit(**options)(function)
+
+
+def motions(screws: np.ndarray) -> np.ndarray:
+    """Return matrices (n, 3, 3, 4) S, C, L of screws (n, 6): the motion by q is I + sin q S + (1 - cos q) C + q L."""
+    along, about = screws[:, :3, None], screws[:, 3:]
+    cross = np.zeros((len(screws), 3, 3))
+    for row, column, axis in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[:, row, column], cross[:, column, row] = -about[:, axis], about[:, axis]
+    twice = cross @ cross
+    parts = (cross, -twice @ along), (twice, cross @ along), (0 * cross, along + twice @ along)
+    return np.stack([np.concatenate(part, axis=2) for part in parts], axis=1)
+
+
+@_compiled
+def place(moving, angles, base_from):
+    """Write where joints take what comes after them: base_from (n + 1, 3, 4), before the first, ..., after all.
+
+    Args:
+        moving: `motions` of the joints, in the chain's order.
+        angles: Of the joints (n,), rad or m.
+        base_from: Output.
+    """
+    for row in range(3):
+        for column in range(4):
+            base_from[0, row, column] = 1.0 if row == column else 0.0
+    for joint in range(len(angles)):
+        q = angles[joint]
+        s, c = math.sin(q), 1.0 - math.cos(q)
+        for row in range(3):
+            for column in range(4):
+                total = base_from[joint, row, column]
+                for k in range(3):
+                    total += base_from[joint, row, k] * (
+                        s * moving[joint, 0, k, column]
+                        + c * moving[joint, 1, k, column]
+                        + q * moving[joint, 2, k, column]
+                    )
+                base_from[joint + 1, row, column] = total
+
+
+@_compiled
+def product(one, other, out):
+    """Write the product (3, 4) of two rigid transforms (3, 4); `out` is none of them."""
+    for row in range(3):
+        for column in range(4):
+            total = one[row, 3] if column == 3 else 0.0
+            for k in range(3):
+                total += one[row, k] * other[k, column]
+            out[row, column] = total
+
+
+@_compiled
+def away(here, goal, twist):
+    """Write the screw motion (6,) from a place to a goal (3, 4), in the base's axes at the place; return its norm."""
+    trace = 0.0
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        turn = 0.0  # of goal @ here's inverse, what is antisymmetric
+        for k in range(3):
+            turn += goal[j, k] * here[i, k] - goal[i, k] * here[j, k]
+            trace += goal[axis, k] * here[axis, k]
+        twist[3 + axis] = 0.5 * turn
+    s, c = math.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2), 0.5 * (trace - 1.0)
+    angle = math.atan2(s, c)
+    scale, bend = 1.0, 1.0 / 12.0
+    if c < 0.0 and s <= _SMALL_RAD:
+        return np.inf  # half a turn, about who knows what
+    if s > _SMALL_RAD:
+        scale = angle / s
+        half = (1.0 + c) / s if c > 0.0 else s / (1.0 - c)  # the half angle's cotangent
+        bend = (1.0 - 0.5 * angle * half) / (angle * angle)
+    size, dot, squared = 0.0, 0.0, 0.0
+    for axis in range(3):
+        twist[3 + axis] *= scale
+        dot += twist[3 + axis] * (goal[axis, 3] - here[axis, 3])
+        squared += twist[3 + axis] ** 2
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        p = goal[axis, 3] - here[axis, 3]
+        across = twist[3 + i] * (goal[j, 3] - here[j, 3]) - twist[3 + j] * (goal[i, 3] - here[i, 3])
+        twist[axis] = p - 0.5 * across + bend * (dot * twist[3 + axis] - squared * p)
+        size += twist[axis] ** 2
+    return math.sqrt(size + squared)
+
+
+@_compiled
+def jacobian(screws, free, base_from, tip, out):
+    """Write how joints move and turn the hand, in the base's axes at the hand: (6, n), 0 where they are not free."""
+    for joint in range(len(screws)):
+        for row in range(6):
+            total = 0.0
+            if free[joint]:
+                for k in range(3):
+                    total += base_from[joint, row % 3, k] * screws[joint, k + 3 * (row // 3)]
+            out[row, joint] = total
+        for row in range(3):
+            i, j = (row + 1) % 3, (row + 2) % 3
+            out[row, joint] += out[3 + i, joint] * (tip[j, 3] - base_from[joint, j, 3]) - out[
+                3 + j, joint
+            ] * (tip[i, 3] - base_from[joint, i, 3])
+
+
+@_compiled
+def move(matrix, twist, share, angles, factor):
+    """Change joints (n,) by the least that moves the hand by a share of a screw motion (6,), damped.
+
+    Args:
+        matrix: The Jacobian (6, n).
+        twist: The motion; overwritten.
+        share: Of the motion.
+        angles: The joints, changed in place.
+        factor: Overwritten (6, 6): Cholesky's, of the Jacobian times itself.
+    """
+    for row in range(6):
+        for column in range(row + 1):
+            total = _DAMPING if row == column else 0.0
+            for k in range(len(angles)):
+                total += matrix[row, k] * matrix[column, k]
+            for k in range(column):
+                total -= factor[row, k] * factor[column, k]
+            factor[row, column] = math.sqrt(total) if row == column else total / factor[column, column]
+    for row in range(6):
+        for k in range(row):
+            twist[row] -= factor[row, k] * twist[k]
+        twist[row] /= factor[row, row]
+    for row in range(5, -1, -1):
+        for k in range(row + 1, 6):
+            twist[row] -= factor[k, row] * twist[k]
+        twist[row] /= factor[row, row]
+    for joint in range(len(angles)):
+        for row in range(6):
+            angles[joint] += share * matrix[row, joint] * twist[row]
+
+
+@_compiled
+def aim(scale, action, tip, goal):
+    """Write where an action wants a hand (3, 4) that is at `tip` (3, 4).
+
+    Args:
+        scale: Middles (m) and halves (m) of shifts, and thrice the largest turn (rad): (3, 3).
+        action: The shift (3,), and the turn (3,) or not: about the base's z, after that y, after that x.
+        tip: The hand.
+        goal: Output.
+    """
+    size = 1.0
+    if len(action) > 3:
+        size = max(1.0, math.sqrt(action[3] * action[3] + action[4] * action[4] + action[5] * action[5]))
+    for row in range(3):
+        for column in range(3):
+            goal[row, column] = tip[row, column]
+        goal[row, 3] = tip[row, 3] + scale[0, row] + scale[1, row] * min(max(action[row], -1.0), 1.0)
+    for axis in range(len(action) - 4, -1, -1):  # z, y, x; none of an action of three numbers
+        i, j, angle = (axis + 1) % 3, (axis + 2) % 3, scale[2, axis] * action[3 + axis] / size
+        s, c = math.sin(angle), math.cos(angle)
+        for column in range(3):
+            one, other = goal[i, column], goal[j, column]
+            goal[i, column], goal[j, column] = c * one - s * other, s * one + c * other
+
+
+@_compiled
+def follow(screws, moving, free, home, phases, within, scale, known, qpos, action, angles):
+    """Write how joints must stand (n,) for a hand to follow an action; return whether they can.
+
+    Args:
+        screws: Of the joints (n, 6), in the chain's order: along (m a rad, or unit), about (unit, or zeros).
+        moving: Their `motions`.
+        free: Whether a joint may be moved (n,).
+        home: Where the hand is (3, 4) with all joints at 0.
+        phases: Of steps (p, 3): which share of the way each goes, at most how many, and how near is enough. Each phase
+            starts from the nearest place of the one before, the last one from where the joints started.
+        within: How near the hand has to have come for the last one.
+        scale: As in `aim`.
+        known: Which of the robot's joints these are (n,).
+        qpos: Where all of the robot's joints are (d,).
+        action: As in `aim`.
+        angles: Output.
+    """
+    n, last = len(screws), len(phases) - 1
+    base_from, tip, goal = np.empty((n + 1, 3, 4)), np.empty((3, 4)), np.empty((3, 4))
+    twist, matrix, factor, nearest = np.empty(6), np.empty((6, n)), np.empty((6, 6)), np.empty(n)
+    left, least = 0.0, np.inf
+    for phase in range(last + 1):
+        if phase == last and least > within:
+            break
+        for joint in range(n):
+            angles[joint] = qpos[known[joint]] if phase in (0, last) else nearest[joint]
+        least = np.inf
+        for step in range(int(phases[phase, 1]) + 1):
+            if step > 0:
+                jacobian(screws, free, base_from, tip, matrix)
+                move(matrix, twist, phases[phase, 0], angles, factor)
+            place(moving, angles, base_from)
+            product(base_from[n], home, tip)
+            if phase == 0 and step == 0:
+                aim(scale, action, tip, goal)
+            left = away(tip, goal, twist)
+            if left < least:
+                least = left
+                for joint in range(n):
+                    nearest[joint] = angles[joint]
+            if left < phases[phase, 2]:
+                return True
+    return False
