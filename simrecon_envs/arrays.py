@@ -17,6 +17,8 @@ _NUMBERS = frozenset({np.float32, np.bool_, np.int64})
 
 def tensor(x: Array) -> torch.Tensor:
     """Return an array as a tensor of its own, a number as one of shape (1,); doubles become floats."""
+    if type(x) in _NUMBERS:
+        return torch.from_numpy(np.array([x]))
     if isinstance(x, torch.Tensor):
         return x
     if isinstance(x, np.generic):

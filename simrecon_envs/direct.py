@@ -41,7 +41,7 @@ class DirectReads:
         """
         self._env = env
         self._entities = [actor._objs[0] for actor in actors]
-        self._bodies = [actor._bodies[0] for actor in actors]
+        self.bodies = [actor._bodies[0] for actor in actors]
         self._centers = [sapien.Pose(center) for center in centers]
         self._links = set() if env.agent is None else {id(link._objs[0]) for link in env.agent.robot.links}
         self.poses = np.zeros((1, len(actors), 7), np.float32)
@@ -101,7 +101,7 @@ class DirectReads:
 
     def speeds(self, row: int) -> tuple[np.float32, np.float32]:
         """Return the linear (m/s) and angular (rad/s) speed of a thing."""
-        body = self._bodies[row]
+        body = self.bodies[row]
         if body.is_sleeping:  # which PhysX stops
             return _STILL, _STILL
         linear, angular = body.linear_velocity.tolist(), body.angular_velocity.tolist()
@@ -132,7 +132,7 @@ class DirectReads:
 
     def _may_touch(self, row: int) -> bool:
         """Return whether the box around the thing meets those around both fingers: asking for contacts is slow."""
-        return all(self._meet(self._bodies[row], finger) for finger in self._fingers)
+        return all(self._meet(self.bodies[row], finger) for finger in self._fingers)
 
     def _meet(self, one: Any, other: Any) -> bool:
         """Return whether the boxes around two bodies meet."""
@@ -161,7 +161,7 @@ class DirectReads:
     def force(self, row: int, others: list) -> np.ndarray:
         """Return the force (3,) (N) of other actors on a thing."""
         bodies = [other._bodies[0] for other in others]
-        near = {id(body) for body in bodies if self._meet(self._bodies[row], body)}
+        near = {id(body) for body in bodies if self._meet(self.bodies[row], body)}
         return self._force(row, near) if near else np.zeros(3, np.float32)
 
     def _force(self, row: int, wanted: set[int]) -> np.ndarray:
@@ -180,7 +180,7 @@ class DirectReads:
         if row not in self._touching:
             if self._all_contacts is None:
                 self._all_contacts = self._env.scene.px.get_contacts()
-            self._touching[row], mine = [], self._bodies[row]
+            self._touching[row], mine = [], self.bodies[row]
             # There may be a hundred, of all pairs of shapes: most are only asked whether they are this thing's.
             for contact in [each for each in self._all_contacts if mine in each.bodies]:
                 first, second = contact.bodies
@@ -258,10 +258,13 @@ class _Joints:
             angles: Where all of the robot's joints are (d,).
             action: The whole action (k,).
         """
-        return [
-            delta * angles[source] + middle + half * min(max(action[number], -bound), bound)
-            for source, number, bound, delta, middle, half in self._rows
-        ]
+        wanted = []
+        for source, number, bound, delta, middle, half in self._rows:
+            told = action[number]
+            if not -bound <= told <= bound:
+                told = bound if told > 0 else -bound
+            wanted.append(delta * angles[source] + middle + half * told)
+        return wanted
 
 
 def _rows(

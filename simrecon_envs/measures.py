@@ -209,12 +209,28 @@ class Measures:
         """Return the pose (b, 7) of one of the robot's links."""
         return link.pose.raw_pose if self._direct is None else self._direct.link_pose(link)
 
+    def _near_hand(self, key: int) -> Array:
+        """Return whether the hand is so near that it may hold a thing (b,)."""
+        return self.tcp_distance(key) <= self._half_diagonal[key] + _GRASP_REACH_M
+
+    def undisturbed(
+        self, name: Hashable, subject: int, keys: tuple[int, ...], compute: Callable[[], Any]
+    ) -> Any:
+        """Return what `compute` makes of things, once while they sleep and the hand is too far to hold the subject.
+
+        Its result must not depend on anything that changes meanwhile. Of many environments it is always computed.
+        """
+        bodies = () if self._direct is None else self._direct.bodies
+        if bodies and not self._near_hand(subject) and all(bodies[self._row[k]].is_sleeping for k in keys):
+            return self.while_still(name, keys, compute)
+        self._placed.pop(name, None)
+        return compute()
+
     def held(self, key: int) -> Array:
         """Return whether the robot holds a thing between its fingers (b,)."""
         name = ("held", key)
         if name not in self._cache:
-            near = self.tcp_distance(key) <= self._half_diagonal[key] + _GRASP_REACH_M
-            row = self._row[key]
+            near, row = self._near_hand(key), self._row[key]
             if self._direct is None:
                 self._cache[name] = self._env.agent.is_grasping(self._actors[row]) & near
             else:

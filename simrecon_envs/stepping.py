@@ -67,9 +67,7 @@ class DirectStep:
         env, drive, batched = self._env, self._drive, self._action
         if drive is None or action.shape not in self._shapes:
             check_action(env, action)
-        self._numbers[:] = (action if isinstance(action, np.ndarray) else action.numpy(force=True)).reshape(
-            -1
-        )
+        self._numbers[:] = action if isinstance(action, np.ndarray) else action.numpy(force=True)
         listed = self._numbers.tolist()
         if not math.isfinite(sum(listed)):
             check_action(env, action)
@@ -92,7 +90,7 @@ class DirectStep:
     def outcome(self, action: torch.Tensor | None) -> tuple:
         """Return observation, reward, terminated, truncated and info after the simulation."""
         env = self._env
-        self._count += 1
+        self._count[0] = self._count.item() + 1  # in place, but not by NumPy's slow "+="
         info = env.get_info()
         flat = self._observe() if self._flat else None
         obs = env.get_obs(info, unflattened=True) if flat is None else flat

@@ -95,6 +95,15 @@ class Task:
         """
         return self.env.measures.while_still((id(self), name), self._concerned, compute)
 
+    def _undisturbed(self, compute: Callable[[], Info]) -> Info:
+        """Return what `compute` makes of subject and place, once while they sleep and the hand is not at the subject.
+
+        The exception is `tcp_to_target_m`, which is that of now.
+        """
+        measures = self.env.measures
+        info = measures.undisturbed((id(self), "undisturbed"), self.subject, self._concerned, compute)
+        return {**info, "tcp_to_target_m": measures.tcp_distance(self.subject)}
+
     def _zeros(self, width: int) -> Array:
         return self.env.measures.array(np.zeros((self.env.num_envs, width)))
 

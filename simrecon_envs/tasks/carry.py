@@ -71,6 +71,9 @@ class Carry(Task):
         raise NotImplementedError
 
     def evaluate(self) -> Info:
+        return self._undisturbed(self._judge)
+
+    def _judge(self) -> Info:
         measures = self.env.measures
         held = measures.held(self.subject)
         rest = measures.at_rest(self.subject)
@@ -85,11 +88,13 @@ class Carry(Task):
         }
 
     def reward(self, info: Info) -> Array:
+        near = (info["target_to_goal_m"] <= _NEAR_GOAL_M) | info["is_there"]
+        if surely_not(info["is_grasped"] | near):
+            return nearness(info["tcp_to_target_m"])
         held = real(info["is_grasped"])
         reward = nearness(info["tcp_to_target_m"]) * (1 - held)
         if not surely_not(info["is_grasped"]):
             reward = reward + held * (2 + 2 * nearness(self._way()))
-        near = (info["target_to_goal_m"] <= _NEAR_GOAL_M) | info["is_there"]
         if not surely_not(near):
             reward = where(near, 4.0 + (1 - held) * (0.5 + 0.5 * real(info["is_at_rest"])), reward)
         return where(info["success"], self.max_reward, reward)

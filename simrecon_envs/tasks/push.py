@@ -102,6 +102,9 @@ class Push(Task):
         self.goal[env_idx] = goal
 
     def evaluate(self) -> Info:
+        return self._undisturbed(self._judge)
+
+    def _judge(self) -> Info:
         measures = self.env.measures
         away, near, upright = self._while_still("place", self._place)
         rest, held = measures.at_rest(self.subject), measures.held(self.subject)
