@@ -1,7 +1,8 @@
 """Where an arm's joints take its hand, and how they must stand for the hand to be at a goal; compiled, for the CPU.
 
-Importing this imports Numba: only environments do whose robot is driven by its hand. What is here is compiled at first
-use and kept for the next process; loops in place of long expressions, because they compile in half the time.
+Importing this imports Numba: only environments do whose robot is driven by its hand. What is here is compiled at its
+first use and kept for the next process. It has loops in place of expressions of slices and powers, because a first
+`gym.make` waits for the compiler, which takes seconds for those.
 
 Joints are screws in the base's space (Brockett's product of exponentials; Lynch and Park, Modern Robotics, chapters 4
 to 6): this is all that has to be known of an arm, whatever joints it has. A step is the one of ManiSkill's solver
@@ -19,12 +20,11 @@ _SMALL_RAD = 1e-4  # below this series are more exact than quotients
 
 
 def _compiled(function):
-    options = {"error_model": "numpy", "nogil": True}
+    # Inlined by Numba, so that LLVM sees everything once.
+    options = {"error_model": "numpy", "nogil": True, "inline": "always"}
     try:
         return numba.njit(cache=True, **options)(function)
-    except (
-        RuntimeError
-    ):  # Numba's "no locator available": no folder beside the file or at home can be written to
+    except RuntimeError:  # "no locator available": no folder, beside the file or at home, can be written to
         return numba.njit(**options)(function)
 
 
@@ -88,7 +88,7 @@ def away(here, goal, twist):
             turn += goal[j, k] * here[i, k] - goal[i, k] * here[j, k]
             trace += goal[axis, k] * here[axis, k]
         twist[3 + axis] = 0.5 * turn
-    s, c = math.sqrt(twist[3] ** 2 + twist[4] ** 2 + twist[5] ** 2), 0.5 * (trace - 1.0)
+    s, c = math.sqrt(twist[3] * twist[3] + twist[4] * twist[4] + twist[5] * twist[5]), 0.5 * (trace - 1.0)
     angle = math.atan2(s, c)
     scale, bend = 1.0, 1.0 / 12.0
     if c < 0.0 and s <= _SMALL_RAD:
@@ -101,13 +101,13 @@ def away(here, goal, twist):
     for axis in range(3):
         twist[3 + axis] *= scale
         dot += twist[3 + axis] * (goal[axis, 3] - here[axis, 3])
-        squared += twist[3 + axis] ** 2
+        squared += twist[3 + axis] * twist[3 + axis]
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         p = goal[axis, 3] - here[axis, 3]
         across = twist[3 + i] * (goal[j, 3] - here[j, 3]) - twist[3 + j] * (goal[i, 3] - here[i, 3])
         twist[axis] = p - 0.5 * across + bend * (dot * twist[3 + axis] - squared * p)
-        size += twist[axis] ** 2
+        size += twist[axis] * twist[axis]
     return math.sqrt(size + squared)
 
 

@@ -220,23 +220,27 @@ def _boxes_apart(first: np.ndarray, second: np.ndarray) -> bool:
 def _outside(points: np.ndarray, hull: np.ndarray) -> np.ndarray:
     """Return how far (n,) (m) points (n, 2) are outside of a convex outline (h, 2), at least; negative within."""
     normals = _normals(hull)
-    return (points @ normals.T - (hull * normals).sum(axis=1)).max(axis=1)
+    # Along the long axis, because NumPy takes the largest of few numbers slowly.
+    return (normals @ points.T - (hull * normals).sum(axis=1)[:, None]).max(axis=0)
 
 
 def _normals(hull: np.ndarray) -> np.ndarray:
     """Return the normals (h, 2) of the edges of an outline that goes counterclockwise, outwards."""
-    edges = np.roll(hull, -1, axis=0) - hull
-    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+    edges = _ends(hull) - hull
+    normals = np.column_stack([edges[:, 1], -edges[:, 0]])
+    return normals / np.sqrt((normals * normals).sum(axis=1, keepdims=True)).clip(1e-9)
 
 
 def _along(hull: np.ndarray) -> np.ndarray:
     """Return points (k, 2) on a convex outline, no farther apart than a cell."""
-    ends = np.roll(hull, -1, axis=0)
-    counts = np.maximum(np.ceil(np.linalg.norm(ends - hull, axis=1) / CELL_M).astype(int), 1)
-    return np.concatenate(
-        [
-            a + (b - a) * np.arange(count)[:, None] / count
-            for a, b, count in zip(hull, ends, counts, strict=True)
-        ]
-    )
+    edges = _ends(hull) - hull
+    counts = np.maximum(np.ceil(np.sqrt((edges * edges).sum(axis=1)) / CELL_M).astype(int), 1)
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)  # on its edge
+    return np.repeat(hull, counts, axis=0) + np.repeat(edges, counts, axis=0) * (
+        number / np.repeat(counts, counts)
+    ).reshape(-1, 1)
+
+
+def _ends(hull: np.ndarray) -> np.ndarray:
+    """Return where (h, 2) the edges of an outline end."""
+    return np.concatenate([hull[1:], hull[:1]])

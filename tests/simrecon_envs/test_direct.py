@@ -15,6 +15,7 @@ from simrecon_envs import chains, scene_env
 from simrecon_envs.direct import _PHASES, DirectDrive, DirectReads
 from simrecon_envs.measures import Measures
 from simrecon_envs.oracle import CONTROL_MODE, Oracle
+from simrecon_envs.tasks.put import Put
 
 TASKS = (
     "push_block",
@@ -134,6 +135,47 @@ def test_contacts_are_asked_for_only_where_they_decide(
     info = env.step(still)[-1]
     assert row in asked
     assert int(info["things_done"]) == 1
+    env.close()
+
+
+def test_what_sleeps_far_from_the_hand_is_judged_once(
+    scenes_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = simrecon_envs.make(
+        "things", registry=scenes_root, task="put_cube_in_crate", max_episode_steps=10_000
+    )
+    scene, still, judged = env.unwrapped, np.zeros(env.action_space.shape, np.float32), []
+    judge = Put._judge
+    monkeypatch.setattr(Put, "_judge", lambda task: judged.append(1) or judge(task))
+    subject = scene.builder.objects[scene.task_object.subject].actor._bodies[0]
+    place = scene.builder.objects[scene.task_object.spec.place].actor._bodies[0]
+
+    def judgements() -> tuple[int, dict]:
+        judged.clear()
+        for _ in range(3):
+            info = env.step(still)[-1]
+        return len(judged), info
+
+    env.reset(seed=0)
+    env.step(still)
+    for body in (subject, place):
+        body.put_to_sleep()
+    assert judgements()[0] <= 1
+    for body in (subject, place):  # not where they were told, and not both
+        body.wake_up()
+        assert judgements()[0] == 3
+        body.put_to_sleep()
+    env.step(still)
+    subject.entity.pose = sapien.Pose([0, 0, 1]) * subject.entity.pose
+    subject.put_to_sleep()
+    count, info = judgements()
+    assert count >= 1
+    assert float(info["target_to_goal_m"]) > 0.8
+    tip = scene.agent.tcp._objs[0].entity_pose.p
+    subject.entity.pose = sapien.Pose(tip)  # where the hand may hold it
+    subject.put_to_sleep()
+    monkeypatch.setattr(scene, "_sim_steps_per_control", 0)
+    assert judgements()[0] == 3
     env.close()
 
 
