@@ -66,6 +66,24 @@ class _Workers:
                 progress.advance()
 
 
+def _sweep(i, gray, posed, camera: Camera, plan: ViewPlan, rhos: np.ndarray, noise: float) -> np.ndarray:
+    """Return the cost uint8 (h, w, planes) of every inverse depth at every pixel, each part by its own sources."""
+    from reconstruction.depth.sweep import REACH_PX, sweep_costs
+
+    cost = np.full((camera.height, camera.width, len(rhos)), 127, np.uint8)
+    for (top, bottom, left, right), sources in plan.parts_with_sources(i, camera.height, camera.width):
+        # Windows at the border of a part reach into the next one.
+        y, x = max(0, top - REACH_PX), max(0, left - REACH_PX)
+        wide = np.ascontiguousarray(gray[i, y : bottom + REACH_PX, x : right + REACH_PX])
+        h_inf, shift = _warps(posed, camera, i, sources)
+        h_inf[:, :, 2] += h_inf[:, :, 0] * x + h_inf[:, :, 1] * y  # pixels are counted from the part's corner
+        own = np.empty((len(rhos), *wide.shape), np.uint8)
+        sweep_costs(wide, gray[sources], h_inf, shift, rhos, noise, own)
+        own = own[:, top - y : bottom - y, left - x : right - x]
+        cost[top:bottom, left:right] = np.moveaxis(own, 0, 2)
+    return cost
+
+
 def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers, progress):
     """Sweep, aggregate and refine every frame; return inverse depth and correlation (n, h, w)."""
     import cv2
@@ -73,7 +91,6 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
     from reconstruction.depth.edges import sharpen_edges
     from reconstruction.depth.refine import fit_slopes, refine
     from reconstruction.depth.sgm import aggregate, winner
-    from reconstruction.depth.sweep import sweep_costs
 
     small = sized_camera(camera, config.sweep_side_px)
     fine_gray, small_gray = _gray(posed.images, camera), _gray(posed.images, small)
@@ -84,37 +101,26 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
     p2 = np.int32(round(127 * config.smooth_large))
 
     def work(i: int) -> None:
-        sources = plan.sources[i][plan.sources[i] >= 0]
-        if len(sources) == 0:
+        parts = list(plan.parts_with_sources(i, *shape))
+        if not parts:
             return
         rhos = np.linspace(1.0 / plan.far[i], 1.0 / plan.near[i], config.planes)
-        h_inf, shift = _warps(posed, small, i, sources)
-        cost = np.empty((config.planes, small.height, small.width), np.uint8)
-        sweep_costs(small_gray[i], small_gray[sources], h_inf, shift, rhos, config.noise_gray, cost)
-        cost = np.ascontiguousarray(np.moveaxis(cost, 0, 2))
+        cost = _sweep(i, small_gray, posed, small, plan, rhos, config.noise_gray)
         total = np.zeros(cost.shape, np.uint16)
         aggregate(cost, small_gray[i], p1, p2, p1 + np.int32(1), 8.0, total)
         coarse = np.empty((small.height, small.width), np.float32)
         winner(total, rhos, coarse)
         rho = cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
-        h_inf, shift = _warps(posed, camera, i, sources)
-        fitted, gx, gy, score = (np.empty(shape, np.float32) for _ in range(4))
+        warps = [(fine_gray[sources], *_warps(posed, camera, i, sources)) for _, sources in parts]
+        fitted, gx, gy = (np.empty(shape, np.float32) for _ in range(3))
+        score = np.full(shape, -1.0, np.float32)
         # The first step covers the spacing of the sweep's planes, later ones go for fractions of a pixel.
         for step_px in (0.7, 0.35, 0.2, 0.2)[: config.refine_rounds]:
             fit_slopes(rho, 0.012, fitted, gx, gy)
-            refine(
-                fine_gray[i],
-                fine_gray[sources],
-                h_inf,
-                shift,
-                fitted,
-                gx,
-                gy,
-                step_px,
-                config.noise_gray,
-                rho,
-                score,
-            )
+            for (bounds, _), (seen, h_inf, shift) in zip(parts, warps):
+                refine(
+                    fine_gray[i], seen, h_inf, shift, fitted, gx, gy, step_px, config.noise_gray, bounds, rho, score
+                )  # fmt: skip
         fit_slopes(rho, 0.012, fitted, gx, gy)
         sharpen_edges(rho, gx, gy, score, _small_color(posed.images[i], camera), rho_all[i])
         score_all[i] = score
@@ -161,11 +167,11 @@ def _resolve(
     doubts = np.zeros(depth.shape, bool)
 
     def work(i: int) -> None:
-        sources = plan.sources[i][plan.sources[i] >= 0]
         moved[i] = depth[i]
-        if len(sources) == 0:
+        parts = list(plan.parts_with_sources(i, *shape))
+        if not parts:
             return
-        h_inf, shift = _warps(posed, camera, i, sources)
+        warps = [(gray[sources], *_warps(posed, camera, i, sources)) for _, sources in parts]
         color = _small_color(posed.images[i], camera)
         rho = np.where(depth[i] > 0, 1.0 / np.maximum(depth[i], 1e-12), 0).astype(np.float32)
         sure = np.choose(confidence[i], [np.float32(0), np.float32(_COMPLETED_SAY), score[i]]).astype(
@@ -178,22 +184,12 @@ def _resolve(
             fit_slopes(rho, 0.012, fitted, gx, gy)
             doubt = np.empty(shape, bool)
             mark_doubt(rho, gx, gy, 0.025, band, doubt)
-            out, out_sure = np.empty_like(rho), np.empty_like(sure)
-            resolve_edges(
-                gray[i],
-                color,
-                gray[sources],
-                h_inf,
-                shift,
-                rho,
-                gx,
-                gy,
-                sure,
-                doubt,
-                config.noise_gray,
-                out,
-                out_sure,
-            )
+            out, out_sure = rho.copy(), sure.copy()
+            for (bounds, _), (seen, h_inf, shift) in zip(parts, warps):
+                resolve_edges(
+                    gray[i], color, seen, h_inf, shift, rho, gx, gy, sure, doubt, config.noise_gray, bounds,
+                    out, out_sure,
+                )  # fmt: skip
             rho, sure = out, out_sure
             doubts[i] |= doubt
         changed = rho != before

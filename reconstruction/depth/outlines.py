@@ -181,7 +181,7 @@ def _seen(
 
 @numba.njit(cache=True, nogil=True)
 def resolve_edges(
-    reference, color, sources, h_inf, shift, rho, gx, gy, score, doubt, noise, out, out_score
+    reference, color, sources, h_inf, shift, rho, gx, gy, score, doubt, noise, part, out, out_score
 ):  # pragma: no cover - compiled
     """Let pixels in doubt choose among the surfaces around them; where nothing was known they need good evidence.
 
@@ -197,10 +197,10 @@ def resolve_edges(
         score: (h, w) how sure each pixel is, 0 to 1.
         doubt: bool (h, w).
         noise: Image noise in gray levels.
+        part: Top, bottom, left and right of the part of the frame that is written: the sources are those of the part.
         out: (h, w), written.
         out_score: (h, w), written: the correlation, for pixels that moved.
     """
-    h, w = rho.shape
     zero = np.float32(noise * noise)
     s, sh, sw = sources.shape
     flat = sources.reshape(s, sh * sw)
@@ -209,8 +209,8 @@ def resolve_edges(
     weight, centered = np.empty(_SAMPLES, np.float32), np.empty(_SAMPLES, np.float32)
     candidates = np.empty((_MAX_CANDIDATES, 3), np.float32)
     votes = np.empty(_MAX_CANDIDATES, np.float32)
-    for y in range(h):
-        for x in range(w):
+    for y in range(part[0], part[1]):
+        for x in range(part[2], part[3]):
             known = rho[y, x] > 0.0
             out[y, x], out_score[y, x] = rho[y, x], score[y, x]
             if not doubt[y, x]:

@@ -106,14 +106,13 @@ def _disparity_rate(maps, r):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def refine(
-    reference, sources, h_inf, shift, rho, gx, gy, px_step, noise, out_rho, out_score
+    reference, sources, h_inf, shift, rho, gx, gy, px_step, noise, part, out_rho, out_score
 ):  # pragma: no cover
     """Try inverse depths around `rho` (h, w) in steps of `px_step` pixels of disparity; keep the best, by parabola.
 
-    A try's worth is the mean correlation with the two sources that see the unmoved window best: the others may not
+    Only `part` (top, bottom, left, right) of the frame is written: the sources are those of the part. A try's worth is the mean correlation with the two sources that see the unmoved window best: the others may not
     see it at all.
     """
-    h, w = reference.shape
     s, sh, sw = sources.shape
     flat = sources.reshape(s, sh * sw)
     zero, half, none = np.float32(noise * noise), np.float32(0.5), np.float32(-2.0)
@@ -123,8 +122,8 @@ def refine(
     weight = np.full(_SAMPLES, 1.0 / _SAMPLES).astype(np.float32)
     centered = np.empty(_SAMPLES, np.float32)
     dx, dy = _DX.copy(), _DY.copy()
-    for y in range(h):
-        for x in range(w):
+    for y in range(part[0], part[1]):
+        for x in range(part[2], part[3]):
             r, a, b = rho[y, x], gx[y, x], gy[y, x]
             project(h_inf, y, x, maps)
             step = px_step / _disparity_rate(maps, r)

@@ -13,6 +13,7 @@ from reconstruction.depth.vector_memory import load_only_read, store_apart
 from reconstruction.depth.windows import FAST
 
 _RADIUS = 2  # 5x5 windows
+REACH_PX = _RADIUS  # so far from its pixel a window reaches
 _ROWS = 2 * _RADIUS + 1
 
 

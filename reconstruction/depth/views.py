@@ -5,19 +5,40 @@ from dataclasses import dataclass
 import numpy as np
 
 from reconstruction.depth.config import DepthConfig
-from reconstruction.types import PosedFrames
+from reconstruction.types import Camera, PosedFrames
 from registry.errors import InputError
 from registry.geometry import invert_rigid
+
+
+# No four frames see all of another one well: each part of a frame has its own sources.
+_ROWS, _COLUMNS = 2, 2
+# Where a part, or a frame, is asked who else sees it, as shares of its width and height.
+_GRID = (0.06, 0.94, 5)
+# A point needs two good sources, as others may not see it, and a handful of neighbors to agree.
+_SOURCES_ENOUGH, _NEIGHBORS_ENOUGH = 0.8, 3.0
 
 
 @dataclass(frozen=True)
 class ViewPlan:
     """What the sweep needs to know of each frame before it looks at pixels."""
 
-    sources: np.ndarray  # int32 (n, s) frames to compare with, best first, -1 = none
+    sources: np.ndarray  # int32 (n, parts, s) frames to compare each part with, best first, -1 = none
     neighbors: np.ndarray  # int32 (n, k) frames that check consistency, best first, -1 = none
     near: np.ndarray  # float64 (n,) nearest depth to try
     far: np.ndarray  # float64 (n,)
+
+    def parts_with_sources(self, i: int, height: int, width: int):
+        """Yield bounds, int64 (4,): top, bottom, left, right, and sources (k,) of the parts of frame i that have any."""
+        for bounds, row in zip(frame_parts(height, width), self.sources[i]):
+            if row[0] >= 0:
+                yield np.array(bounds), row[row >= 0]
+
+
+def frame_parts(height: int, width: int) -> list[tuple[int, int, int, int]]:
+    """Return top, bottom, left and right of the parts of a frame, in the order of `ViewPlan.sources`."""
+    y = [height * row // _ROWS for row in range(_ROWS + 1)]
+    x = [width * column // _COLUMNS for column in range(_COLUMNS + 1)]
+    return [(y[j], y[j + 1], x[i], x[i + 1]) for j in range(_ROWS) for i in range(_COLUMNS)]
 
 
 def _frame_depths(posed: PosedFrames) -> list[np.ndarray]:
@@ -55,36 +76,32 @@ def depth_ranges(posed: PosedFrames) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plan_views(posed: PosedFrames, config: DepthConfig) -> ViewPlan:
-    """Choose sources and neighbours by triangulation angle and overlap at the depths that the frame sees."""
+    """Choose sources and neighbours by triangulation angle at the depths that a frame sees, so that all of it is seen.
+
+    Raises:
+        InputError: If most frames have no other that sees the same things from another place.
+    """
     near, far = depth_ranges(posed)
     n, camera = len(posed.images), posed.camera
     camera_from_world = invert_rigid(posed.world_from_camera)
-    grid_x, grid_y = np.meshgrid(np.linspace(0.08, 0.92, 6), np.linspace(0.08, 0.92, 5))
-    rays = np.stack(
-        [
-            (grid_x.ravel() * camera.width - camera.cx) / camera.fx,
-            (grid_y.ravel() * camera.height - camera.cy) / camera.fy,
-            np.ones(grid_x.size),
-        ],
-        1,
-    )
-    sources = np.full((n, config.sources), -1, np.int32)
+    rays = [_rays(camera, *part) for part in frame_parts(camera.height, camera.width)]
+    sources = np.full((n, len(rays), config.sources), -1, np.int32)
     neighbors = np.full((n, config.neighbors), -1, np.int32)
+    ideal = np.radians(config.best_angle_deg)
     for i in range(n):
         # Sample points at two depths inside the range, in the harmonic middle where most of a room lies.
         middle = 2.0 / (1.0 / (near[i] / 0.65) + 1.0 / (far[i] / 1.5))
-        local = np.concatenate([rays * middle * 0.8, rays * middle * 1.4])
+        local = np.concatenate([np.concatenate([r * middle * 0.8, r * middle * 1.4]) for r in rays])
         world = local @ posed.world_from_camera[i, :3, :3].T + posed.world_from_camera[i, :3, 3]
-        overlap, angle, offset = _relation(world, i, posed, camera_from_world)
-        ideal = np.radians(config.best_angle_deg)
+        inside, angle, offset = _relation(world, i, posed, camera_from_world)
+        inside[i] = False
         spread = np.where(angle < ideal, 0.45 * ideal, 1.0 * ideal)
-        score = overlap * np.exp(-0.5 * ((angle - ideal) / spread) ** 2)
-        score[i] = 0.0
-        _pick(score, offset, sources[i], min_overlap=0.3, overlap=overlap, repulsion=0.6)
-        wide = overlap * np.exp(-0.5 * ((angle - 1.2 * ideal) / (1.5 * ideal)) ** 2)
-        wide[i] = 0.0
-        _pick(wide, offset, neighbors[i], min_overlap=0.3, overlap=overlap, repulsion=0.3)
-    if (sources[:, 0] < 0).mean() > 0.5:
+        worth = inside * np.exp(-0.5 * ((angle - ideal) / spread) ** 2)
+        for part, own in enumerate(np.split(worth, len(rays), axis=1)):
+            _pick(own, offset, sources[i, part], enough=_SOURCES_ENOUGH, repulsion=0.3)
+        wide = inside * np.exp(-0.5 * ((angle - 1.2 * ideal) / (1.5 * ideal)) ** 2)
+        _pick(wide, offset, neighbors[i], enough=_NEIGHBORS_ENOUGH, repulsion=0.3)
+    if (sources[..., 0] < 0).mean() > 0.5:
         raise InputError(
             "depth: most frames have no other frame that sees the same things from another place. "
             "Film while walking sideways, not while standing and turning."
@@ -92,8 +109,17 @@ def plan_views(posed: PosedFrames, config: DepthConfig) -> ViewPlan:
     return ViewPlan(sources, neighbors, near, far)
 
 
+def _rays(camera: Camera, top: int, bottom: int, left: int, right: int) -> np.ndarray:
+    """Return rays (p, 3) with z = 1 spread over a part of a frame."""
+    share = np.linspace(*_GRID)
+    x, y = np.meshgrid(left + share * (right - left), top + share * (bottom - top))
+    return np.stack(
+        [(x.ravel() - camera.cx) / camera.fx, (y.ravel() - camera.cy) / camera.fy, np.ones(x.size)], 1
+    )
+
+
 def _relation(world: np.ndarray, i: int, posed: PosedFrames, camera_from_world: np.ndarray):
-    """Return for every frame its overlap with frame i, the median triangulation angle, and the baseline direction."""
+    """Return which points every frame has inside and their angle to frame i (n, p), and the baselines (n, 3)."""
     camera = posed.camera
     local = np.einsum("nij,pj->npi", camera_from_world[:, :3, :3], world) + camera_from_world[:, None, :3, 3]
     z = np.maximum(local[..., 2], 1e-12)
@@ -105,20 +131,24 @@ def _relation(world: np.ndarray, i: int, posed: PosedFrames, camera_from_world: 
     cosine = np.einsum("pk,npk->np", a, b) / np.maximum(
         np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=2), 1e-12
     )
-    angle = np.median(np.arccos(np.clip(cosine, -1, 1)), axis=1)
     offset = (centers - centers[i]) @ posed.world_from_camera[i, :3, :3]
-    return inside.mean(1), angle, offset
+    return inside, np.arccos(np.clip(cosine, -1, 1)), offset
 
 
-def _pick(score, offset, out, *, min_overlap, overlap, repulsion) -> None:
-    """Fill `out` greedily; those beside a chosen one lose score, so that both sides are used."""
-    score = np.where(overlap >= min_overlap, score, 0.0)
+def _pick(worth: np.ndarray, offset: np.ndarray, out: np.ndarray, *, enough: float, repulsion: float) -> None:
+    """Fill `out` greedily with the frames that add most at the points (n, p); points seen well `enough` count little.
+
+    Those beside a chosen frame lose, so that both sides are used.
+    """
+    seen, keen = np.zeros(worth.shape[1]), np.ones(len(worth))
     for k in range(len(out)):
+        score = keen * (worth @ np.exp(-0.5 * (seen / enough) ** 2))
         best = int(np.argmax(score))
-        if score[best] < 1e-3:
+        if score[best] < 1e-3 * worth.shape[1]:
             return
         out[k] = best
+        seen += worth[best]
         gap = np.linalg.norm(offset - offset[best], axis=1)
         reach = 0.5 * np.linalg.norm(offset[best]) + 1e-12
-        score = score * (1.0 - repulsion * np.exp(-((gap / reach) ** 2)))
-        score[best] = 0.0
+        keen *= 1.0 - repulsion * np.exp(-((gap / reach) ** 2))
+        keen[best] = 0.0
