@@ -110,8 +110,8 @@ def refine(
 ):  # pragma: no cover
     """Try inverse depths around `rho` (h, w) in steps of `px_step` pixels of disparity; keep the best, by parabola.
 
-    Only `part` (top, bottom, left, right) of the frame is written: the sources are those of the part. A try's worth is the mean correlation with the two sources that see the unmoved window best: the others may not
-    see it at all.
+    Only `part` (top, bottom, left, right) of the frame is written: the sources are those of the part. A try's worth
+    is the mean correlation with the two sources that see the unmoved window best: the others may not see it at all.
     """
     s, sh, sw = sources.shape
     flat = sources.reshape(s, sh * sw)

@@ -9,7 +9,6 @@ from reconstruction.types import Camera, PosedFrames
 from registry.errors import InputError
 from registry.geometry import invert_rigid
 
-
 # No four frames see all of another one well: each part of a frame has its own sources.
 _ROWS, _COLUMNS = 2, 2
 # Where a part, or a frame, is asked who else sees it, as shares of its width and height.
@@ -28,7 +27,7 @@ class ViewPlan:
     far: np.ndarray  # float64 (n,)
 
     def parts_with_sources(self, i: int, height: int, width: int):
-        """Yield bounds, int64 (4,): top, bottom, left, right, and sources (k,) of the parts of frame i that have any."""
+        """Yield bounds (4,), top, bottom, left, right, and sources (k,) of the parts of frame i that have any."""
         for bounds, row in zip(frame_parts(height, width), self.sources[i]):
             if row[0] >= 0:
                 yield np.array(bounds), row[row >= 0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reconstruction.depth import DepthConfig, estimate_depth
-from reconstruction.depth.views import depth_ranges, plan_views
+from reconstruction.depth.views import depth_ranges, frame_parts, plan_views
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import Camera, PosedFrames, VideoSource
 from registry.errors import InputError
@@ -182,10 +182,66 @@ def test_result_does_not_depend_on_threads(corner, estimate) -> None:
 def test_sources_have_baseline_and_overlap(corner) -> None:
     plan = plan_views(corner[0], CONFIG)
     for i, row in enumerate(plan.sources):
-        chosen = row[row >= 0]
-        assert len(chosen) >= 2
-        assert i not in chosen
-        assert len(set(chosen)) == len(chosen)
+        for part in row:
+            chosen = part[part >= 0]
+            assert len(chosen) >= 2
+            assert i not in chosen
+            assert len(set(chosen)) == len(chosen)
+
+
+def seen_twice(posed: PosedFrames, truth: np.ndarray, plan) -> np.ndarray:
+    """Return for each frame the share of pixels that two of their part's sources have inside, 2 to 16 degrees off."""
+    out, camera = [], posed.camera
+    for i, z in enumerate(truth):
+        pose, count = posed.world_from_camera[i], np.zeros(z.shape, int)
+        y, x = np.mgrid[: z.shape[0], : z.shape[1]]
+        local = np.stack(
+            [(x + 0.5 - camera.cx) / camera.fx * z, (y + 0.5 - camera.cy) / camera.fy * z, z], -1
+        )
+        world = local @ pose[:3, :3].T + pose[:3, 3]
+        for (top, bottom, left, right), sources in zip(frame_parts(*z.shape), plan.sources[i]):
+            part = world[top:bottom, left:right]
+            for s in sources[sources >= 0]:
+                other = posed.world_from_camera[s]
+                u, v, w = np.moveaxis((part - other[:3, 3]) @ other[:3, :3] @ camera.matrix.T, -1, 0)
+                a, b = part - pose[:3, 3], part - other[:3, 3]
+                length = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+                cosine = (a * b).sum(-1) / np.maximum(length, 1e-9)
+                good = (w > 0) & (u > 0) & (v > 0) & (u < camera.width * w) & (v < camera.height * w)
+                good &= (cosine < np.cos(np.radians(2))) & (cosine > np.cos(np.radians(16)))
+                count[top:bottom, left:right] += good
+        out.append((count >= 2)[z > 0].mean())
+    return np.array(out)
+
+
+def test_margins_of_turning_frames_have_sources_of_their_own() -> None:
+    # The camera walks around a corner and turns by 8 degrees a frame: no four frames see all of another one.
+    rng = np.random.default_rng(0)
+    images, truth, poses, points, seen, count = [], [], [], [], [], 0
+    for i, angle in enumerate(np.radians(np.arange(-48, 49, 8))):
+        eye = np.array([0.5 * np.sin(angle), -1.3 + 0.2 * np.cos(angle), 0.9])
+        pose = look_at(eye, eye + np.array([np.sin(angle), np.cos(angle), -0.35]))
+        image, z = render(pose, 1.0, rng)
+        y, x = rng.integers(0, CAMERA.height, 120), rng.integers(0, CAMERA.width, 120)
+        y, x = y[z[y, x] > 0], x[z[y, x] > 0]
+        ray = np.stack(
+            [(x + 0.5 - CAMERA.cx) / CAMERA.fx, (y + 0.5 - CAMERA.cy) / CAMERA.fy, np.ones(len(x))], 1
+        )
+        points.append((ray * z[y, x, None]) @ pose[:3, :3].T + pose[:3, 3])
+        seen.append(np.stack([np.full(len(x), i), count + np.arange(len(x))], 1))
+        count += len(x)
+        images.append(image)
+        truth.append(z)
+        poses.append(pose)
+    template, n = make_posed()[0], len(images)
+    posed = replace(
+        template, images=np.stack(images), indices=np.arange(n, dtype=np.int32), times_s=np.arange(n) / 30,
+        world_from_camera=np.stack(poses), sharpness=np.ones(n, np.float32), points=np.concatenate(points),
+        point_colors=np.zeros((count, 3), np.uint8), point_errors_px=np.ones(count, np.float32),
+        observations=np.concatenate(seen).astype(np.int32),
+    )  # fmt: skip
+    middle = seen_twice(posed, np.stack(truth), plan_views(posed, CONFIG))[3:-3]
+    assert middle.min() > 0.9
 
 
 def test_range_covers_the_true_depth(corner) -> None:

@@ -1,11 +1,16 @@
 """The vectorized kernels of the depth stage against plain NumPy."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from reconstruction.depth.refine import fit_slopes
+from reconstruction.depth.estimate import _sweep, _warps
+from reconstruction.depth.refine import fit_slopes, refine
 from reconstruction.depth.sweep import sweep_costs
+from reconstruction.depth.views import ViewPlan, frame_parts
 from reconstruction.depth.windows import make_correlate, offsets, project, source_maps
+from reconstruction.types import Camera
 
 H, W = 30, 41
 K = np.array([[40.0, 0, W / 2], [0, 40.0, H / 2], [0, 0, 1]])
@@ -58,6 +63,47 @@ def test_sweep_is_the_mean_of_the_two_best_correlations(images, warps) -> None:
             weight = np.full(images[0][box].shape, 1.0 / images[0][box].size)
             score = np.mean([correlation(images[0][box], b[box], weight) for b in warped])
             assert cost[d, row, column] == pytest.approx(127 * (1 - score), abs=1.1)
+
+
+def test_parts_with_the_same_sources_are_the_whole(images) -> None:
+    camera = Camera(W, H, 40.0, 40.0, W / 2, H / 2)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1:, 0, 3] = 0.2, -0.15
+    posed = SimpleNamespace(world_from_camera=poses)
+    rhos = np.array([0.2, 0.6, 0.9])
+    plan = ViewPlan(np.tile(np.array([1, 2]), (3, 4, 1)), np.zeros((3, 0)), np.ones(3), np.ones(3))
+    parts = _sweep(0, images, posed, camera, plan, rhos, NOISE)
+    whole = np.empty((3, H, W), np.uint8)
+    h_inf, shift = _warps(posed, camera, 0, np.array([1, 2]))
+    sweep_costs(images[0], images[1:], h_inf, shift, rhos, NOISE, whole)
+    # Windows at the frame's border are clipped alike, sums run in another order.
+    assert np.abs(parts.astype(int) - np.moveaxis(whole, 0, 2)).max() <= 1
+    fitted, slope = np.full((H, W), 0.5, np.float32), np.zeros((H, W), np.float32)
+    bounds = [np.array(part) for part in frame_parts(H, W)]
+    assert np.add.reduce([(b[1] - b[0]) * (b[3] - b[2]) for b in bounds]) == H * W
+    refined = []
+    for parts in ([np.array([0, H, 0, W])], bounds):
+        rho, score = np.full((H, W), -1, np.float32), np.full((H, W), -9, np.float32)
+        for part in parts:
+            refine(
+                images[0], images[1:], h_inf, shift, fitted, slope, slope, 0.7, NOISE, part, rho, score
+            )  # fmt: skip
+        refined.append((rho, score))
+    assert np.array_equal(refined[0], refined[1])
+
+
+def test_part_without_sources_has_no_evidence(images) -> None:
+    camera = Camera(W, H, 40.0, 40.0, W / 2, H / 2)
+    sources = np.array([[[1, 2], [-1, -1], [1, -1], [2, 1]]])
+    plan = ViewPlan(sources, np.zeros((1, 0)), np.ones(1), np.ones(1))
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1:, 0, 3] = 0.2, -0.15
+    cost = _sweep(
+        0, images, SimpleNamespace(world_from_camera=poses), camera, plan, np.array([0.2, 0.9]), NOISE
+    )
+    top, bottom, left, right = frame_parts(H, W)[1]
+    assert (cost[top:bottom, left:right] == 127).all()
+    assert cost[: H // 2, : W // 2].std() > 10
 
 
 def test_slanted_window_correlates_as_written_out(images, warps) -> None:
