@@ -14,7 +14,7 @@ _ROWS, _COLUMNS = 2, 2
 # Where a part, or a frame, is asked who else sees it, as shares of its width and height.
 _GRID = (0.06, 0.94, 5)
 # A point needs two good sources, as others may not see it, and a handful of neighbors to agree.
-_SOURCES_ENOUGH, _NEIGHBORS_ENOUGH = 0.8, 3.0
+_SOURCES_ENOUGH, _NEIGHBORS_ENOUGH = 2.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def plan_views(posed: PosedFrames, config: DepthConfig) -> ViewPlan:
         spread = np.where(angle < ideal, 0.45 * ideal, 1.0 * ideal)
         worth = inside * np.exp(-0.5 * ((angle - ideal) / spread) ** 2)
         for part, own in enumerate(np.split(worth, len(rays), axis=1)):
-            _pick(own, offset, sources[i, part], enough=_SOURCES_ENOUGH, repulsion=0.3)
+            _pick(own, offset, sources[i, part], enough=_SOURCES_ENOUGH, repulsion=0.6)
         wide = inside * np.exp(-0.5 * ((angle - 1.2 * ideal) / (1.5 * ideal)) ** 2)
         _pick(wide, offset, neighbors[i], enough=_NEIGHBORS_ENOUGH, repulsion=0.3)
     if (sources[..., 0] < 0).mean() > 0.5:

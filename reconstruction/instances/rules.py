@@ -18,7 +18,7 @@ from reconstruction.instances.segmentation import Thing, segment
 from reconstruction.instances.side_by_side import cut_side_by_side
 from reconstruction.instances.sightings import Sighting
 from reconstruction.instances.skirt_colors import mark_unlike
-from reconstruction.instances.smears import without_smears
+from reconstruction.instances.smears import without_smears, without_wall_bumps
 from reconstruction.instances.stacks import cut_stacks
 from reconstruction.instances.stands import merge_stands
 from reconstruction.progress import Progress
@@ -50,7 +50,8 @@ def cut_by_rules(
     for vertices, number in crumbs:
         owner[vertices] = number
     owner[hung] = 0
-    things = _merge_attached(graph, things + _mark_attached(graph, segmented, planes))
+    standing = without_wall_bumps(shell, _mark_attached(graph, segmented, planes), owner, frames)
+    things = _merge_attached(graph, things + standing)
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)

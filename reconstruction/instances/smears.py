@@ -27,6 +27,7 @@ _ON_WALL_M, _ON_WALL = 0.015, 0.01  # depth this near shows the wall: metres, sh
 _LEAST_M2 = 5e-4  # of a smear
 _SCRAP_SHARE = 0.1  # of the largest piece that is left
 _MOST_SHARE = 0.6  # of a thing's area: one of the wall's color cannot be told from the wall
+_BUMP_M = 0.08  # so far a bump of a wall stands out
 
 
 def without_smears(
@@ -68,6 +69,41 @@ def without_smears(
     if cleaned:
         progress.note(f"{cleaned} things are freed of surface that is smeared to the wall behind them")
     return things
+
+
+def without_wall_bumps(
+    shell: Shell, things: list[Thing], owner: np.ndarray, frames: list[Sighting]
+) -> list[Thing]:
+    """Give walls what hangs on them, hardly stands out and looks as they do: depth that few frames measured wrong.
+
+    Args:
+        shell: the surface and its base.
+        things: what was found, pictures excluded: those are told by their looks.
+        owner: int32 (v,) base entity of each vertex; bumps are written into it.
+        frames: keyframes, the surface drawn into them.
+
+    Returns:
+        The things that are left.
+    """
+    kept = []
+    for thing in things:
+        row = _bumped_wall(shell, thing, frames) if thing.attached else None
+        if row is None:
+            kept.append(thing)
+        else:
+            owner[thing.vertices] = shell.entity_id(row)
+    return kept
+
+
+def _bumped_wall(shell: Shell, thing: Thing, frames: list[Sighting]) -> int | None:
+    points, areas = shell.graph.points[thing.vertices], shell.graph.areas[thing.vertices]
+    for row, wall in enumerate(shell.planes):
+        if wall.label != "wall" or quantiles(wall.distance(points), areas, (0.9,))[0] > _BUMP_M:
+            continue
+        shows = _shows(points, WallPicture(shell.graph, wall, frames), frames)
+        if areas[shows].sum() > _SURE_SHARE * areas.sum():
+            return row
+    return None
 
 
 def _reaches(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
@@ -116,19 +152,23 @@ class WallPicture:
         return np.where(there[:, None], self.at(frame.eye + reach[:, None] * rays), np.nan)
 
 
+def _shows(points: np.ndarray, picture: WallPicture, frames: list[Sighting]) -> np.ndarray:
+    """Return which points (n, 3) have, in most frames that see them, the color of the wall behind them."""
+    like, seen = np.zeros(len(points)), np.zeros(len(points))
+    for frame in frames:
+        row, column, z = frame.seen_at(points)
+        at = np.flatnonzero(frame.shown(row, column, z))
+        gap = np.linalg.norm(frame.lab[row[at], column[at]] - picture.behind(points[at], frame), axis=1)
+        like[at] += gap < _ALIKE
+        seen[at] += 1
+    return (seen >= _MIN_SEEN) & (like >= _SURE_SHARE * seen)
+
+
 def _smear(
     graph: MeshGraph, body: np.ndarray, wall: FittedPlane, picture: WallPicture, frames: list[Sighting]
 ) -> np.ndarray:  # fmt: skip
     """Return the vertices of a body that show the wall and go on to it."""
-    points = graph.points[body]
-    like, seen = np.zeros(len(body)), np.zeros(len(body))
-    for frame in frames:
-        row, column, z = frame.seen_at(points)
-        shown = frame.shown(row, column, z)
-        gap = np.linalg.norm(frame.lab[row, column] - picture.behind(points, frame), axis=1)
-        like += shown & (gap < _ALIKE)
-        seen += shown
-    shows = body[(seen >= _MIN_SEEN) & (like >= _SURE_SHARE * seen)]
+    shows = body[_shows(graph.points[body], picture, frames)]
     reaching = [
         piece
         for piece in pieces(graph, shows)
