@@ -86,8 +86,10 @@ def without_wall_bumps(
         The things that are left.
     """
     kept = []
+    carriers = {id(thing.rests_on) for thing in things}
     for thing in things:
-        row = _bumped_wall(shell, thing, frames) if thing.attached else None
+        alone = thing.attached and id(thing) not in carriers
+        row = _bumped_wall(shell, thing, frames) if alone else None
         if row is None:
             kept.append(thing)
         else:

@@ -7,7 +7,7 @@ from reconstruction.instances import InstancesConfig
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import sightings
-from reconstruction.instances.smears import without_smears
+from reconstruction.instances.smears import without_smears, without_wall_bumps
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.types import Camera
 
@@ -68,3 +68,47 @@ def test_what_has_the_color_of_the_wall_is_not_taken_apart():
     assert any(base.label == "wall" for base in shell.base)
     assert len(smear) > 200
     np.testing.assert_array_equal(before, after)
+
+
+def hung_box(color, seen, carries=False):
+    """Return a box that hangs on a striped wall in the surface, and in the film only if it is `seen`; who owns it."""
+    wall = sheet((-1.0, WALL_Y, 0.0), (2.0, 0, 0), (0, 0, 1.8), (200, 200, 190), 0.02)
+    floor = sheet((-1.0, -1.0, 0.0), (2.0, 0, 0), (0, 1.0 + WALL_Y, 0), (120, 100, 80), 0.025)
+    box = solid_box((-0.1, WALL_Y - 0.06, 0.5), (0.1, WALL_Y - 0.01, 0.7), color)
+    surface, truth = surface_from(merged(floor, wall, box)), merged(floor, wall, *([box] if seen else []))
+    paint = truth.colors.copy()
+    on_wall = truth.vertices[:, 1] > WALL_Y - 1e-3
+    paint[on_wall & (np.floor(truth.vertices[:, 0] / 0.2) % 2 == 0)] = (90, 150, 120)
+    middle = np.array([0.0, WALL_Y, 0.6])
+    places = [(x, -1.3, z) for z in (-0.1, 0.2) for x in (-0.5, -0.25, 0.0, 0.25, 0.5)]
+    poses = np.stack([looking_at(middle + place, middle) for place in places])
+    posed, depth = filmed(truth, paint, surface, poses, Camera(240, 180, 220.0, 220.0, 120.0, 90.0))
+    shell = Shell.of(surface, NO_PROGRESS)
+    points, owner = shell.graph.points, shell.owner.copy()
+    hung = np.flatnonzero((points[:, 1] < WALL_Y - 0.005) & (points[:, 2] > 0.4))
+    owner[hung] = 0
+    things = [Thing(hung, attached=True)]
+    if carries:
+        things.append(Thing(hung[:10], rests_on=things[0]))
+    left = without_wall_bumps(shell, things, owner, sightings(surface, posed, depth))
+    return shell, hung, owner, left
+
+
+def test_bump_that_looks_like_the_wall_is_the_walls():
+    shell, hung, owner, left = hung_box((150, 150, 150), seen=False)
+    wall = next(base.id for base in shell.base if base.label == "wall")
+    assert len(hung) > 100
+    assert not left
+    assert (owner[hung] == wall).all()
+
+
+def test_hung_thing_of_its_own_color_stays():
+    _, hung, owner, left = hung_box((180, 40, 40), seen=True)
+    assert [len(thing.vertices) for thing in left] == [len(hung)]
+    assert (owner[hung] == 0).all()
+
+
+def test_bump_that_carries_something_stays():
+    _, hung, owner, left = hung_box((150, 150, 150), seen=False, carries=True)
+    assert len(left) == 2
+    assert (owner[hung] == 0).all()
