@@ -16,6 +16,7 @@ from reconstruction.types import Camera, PosedFrames
 from registry.geometry import invert_rigid
 
 _MAX_LABELS = 20
+_RIM_SHARE = 0.15  # of the rim of a blank region that has to lie on one plane; much of it is skirts of what stands there
 _LIMITS = (66, 16)
 
 
@@ -64,7 +65,7 @@ def _fill_regions(label: np.ndarray, cost: np.ndarray, measured: np.ndarray, col
         inlier[objection > 0.1] = 0.0
         order = np.argsort(-inlier, kind="stable")
         best = int(order[0])
-        if inlier[best] < max(12.0, 0.2 * weight.sum()):
+        if inlier[best] < max(12.0, _RIM_SHARE * weight.sum()):
             continue
         # A rival counts only if it is another surface: pixels on both planes vote for both.
         both = ((cost[box][ring][:, :-1] < 30) & (cost[box][ring][:, best : best + 1] >= 30)) * weight[
