@@ -16,7 +16,7 @@ from reconstruction.types import Camera, PosedFrames
 from registry.geometry import invert_rigid
 
 _MAX_LABELS = 20
-_RIM_SHARE = 0.15  # of the rim of a blank region that has to lie on one plane; much of it is skirts of what stands there
+_RIM_SHARE = 0.15  # of a blank region's rim that has to lie on one plane: much is skirts of what stands there
 _LIMITS = (66, 16)
 
 
