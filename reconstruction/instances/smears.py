@@ -85,27 +85,26 @@ def without_wall_bumps(
     Returns:
         The things that are left.
     """
-    kept = []
     carriers = {id(thing.rests_on) for thing in things}
-    for thing in things:
-        alone = thing.attached and id(thing) not in carriers
-        row = _bumped_wall(shell, thing, frames) if alone else None
-        if row is None:
-            kept.append(thing)
-        else:
-            owner[thing.vertices] = shell.entity_id(row)
-    return kept
-
-
-def _bumped_wall(shell: Shell, thing: Thing, frames: list[Sighting]) -> int | None:
-    points, areas = shell.graph.points[thing.vertices], shell.graph.areas[thing.vertices]
+    alone = [thing for thing in things if thing.attached and id(thing) not in carriers]
+    bumps: set[int] = set()
     for row, wall in enumerate(shell.planes):
-        if wall.label != "wall" or quantiles(wall.distance(points), areas, (0.9,))[0] > _BUMP_M:
+        flat = [thing for thing in alone if wall.label == "wall" and _hugs(shell.graph, thing, wall)]
+        if not flat:
             continue
-        shows = _shows(points, WallPicture(shell.graph, wall, frames), frames)
-        if areas[shows].sum() > _SURE_SHARE * areas.sum():
-            return row
-    return None
+        picture = WallPicture(shell.graph, wall, frames)
+        for thing in flat:
+            areas = shell.graph.areas[thing.vertices]
+            shows = _shows(shell.graph.points[thing.vertices], picture, frames)
+            if id(thing) not in bumps and areas[shows].sum() > _SURE_SHARE * areas.sum():
+                owner[thing.vertices] = shell.entity_id(row)
+                bumps.add(id(thing))
+    return [thing for thing in things if id(thing) not in bumps]
+
+
+def _hugs(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
+    distance = wall.distance(graph.points[thing.vertices])
+    return bool(quantiles(distance, graph.areas[thing.vertices], (0.9,))[0] <= _BUMP_M)
 
 
 def _reaches(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
