@@ -71,12 +71,11 @@ def without_skirts(graph: MeshGraph, things: list[Thing], progress: Progress) ->
 def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
     points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
     low, middle, high = quantiles(points[:, 2], areas, (0.02, 0.5, 0.98))
-    if high - low > SKIRT_M or bulge(graph, thing.vertices) > _SKIRT_BULGE:
+    if not is_low(graph, thing, _SKIRT_TOP):
         return False
-    hull = cv2.convexHull(points[:, :2].astype(np.float32))
-    top = (graph.normals[thing.vertices, 2] > _UP) & (points[:, 2] > high - _TOP_M)
-    if areas[top].sum() > _SKIRT_TOP * cv2.contourArea(hull):
-        return False
+    if thing.sheet:
+        return True
+    beyond = np.full(len(points), np.inf)  # of all larger ones that it touches
     for other in things:
         if other is thing or other.attached:
             continue
@@ -91,9 +90,19 @@ def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
         if not np.isfinite(gap).any():
             continue
         outline = cv2.convexHull(graph.points[other.vertices, :2].astype(np.float32))
-        if quantiles(-inset(outline, points[:, :2]), areas, (0.8,))[0] < _BESIDE_M:
-            return True
-    return False
+        beyond = np.minimum(beyond, -inset(outline, points[:, :2]))
+    return bool(np.isfinite(beyond[0]) and quantiles(beyond, areas, (0.8,))[0] < _BESIDE_M)
+
+
+def is_low(graph: MeshGraph, thing: Thing, most_top: float) -> bool:
+    """Tell whether a thing is low and hardly bulges, and a top covers at most such a share of its outline."""
+    points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
+    low, high = quantiles(points[:, 2], areas, (0.02, 0.98))
+    if high - low > SKIRT_M or bulge(graph, thing.vertices) > _SKIRT_BULGE:
+        return False
+    hull = cv2.convexHull(points[:, :2].astype(np.float32))
+    top = (graph.normals[thing.vertices, 2] > _UP) & (points[:, 2] > high - _TOP_M)
+    return bool(areas[top].sum() <= most_top * cv2.contourArea(hull))
 
 
 def _stands_in(graph: MeshGraph, other: Thing, low: float, high: float) -> bool:

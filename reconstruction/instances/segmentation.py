@@ -33,6 +33,7 @@ class Thing:
         False  # an open one, whole by its rim: slats and rims of other colors are no things on it
     )
     foreign: bool = False  # told from what carries it by its color: no skirt of it, however low
+    sheet: bool = False  # low, without a top, and of the colors of what carries it: smeared surface
     notes: list[str] = field(default_factory=list)
 
 

@@ -9,12 +9,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.instances.foreign import ColorView, main_colors
-from reconstruction.instances.scraps import SKIRT_M, TOUCH_M
+from reconstruction.instances.scraps import SKIRT_M, TOUCH_M, is_low
 from reconstruction.instances.segmentation import Thing
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _MOST_SAMPLES = 4000  # vertices that tell the colors of the floor or a wall
 _MOST = 0.6  # share of a thing that is of another color
+_SHEET_TOP, _SHEET_OTHER = 0.15, 0.3  # of a sheet: share of its outline that is a top, and of another color
+_FURNITURE_M = 0.45
 
 
 def mark_unlike(view: ColorView, things: list[Thing], owner: np.ndarray) -> None:
@@ -43,6 +45,17 @@ def mark_unlike(view: ColorView, things: list[Thing], owner: np.ndarray) -> None
         other = view.foreign(thing.vertices, np.concatenate([*room, *around]))
         areas = graph.areas[thing.vertices]
         thing.foreign = bool(areas[other].sum() > _MOST * areas.sum())
+        if not thing.foreign and is_low(graph, thing, _SHEET_TOP):
+            odd = view.foreign(thing.vertices, main_colors(graph, _furniture(graph, thing).vertices))
+            thing.sheet = bool(areas[odd].sum() < _SHEET_OTHER * areas.sum())
+
+
+def _furniture(graph: MeshGraph, thing: Thing) -> Thing:
+    """Return what carries a thing, and what carries that, up to furniture: sheets seem to lie on one another."""
+    carrier = thing.rests_on
+    while carrier.rests_on is not None and np.ptp(graph.points[carrier.vertices], axis=0).max() < _FURNITURE_M:
+        carrier = carrier.rests_on
+    return carrier
 
 
 def _around(graph: MeshGraph, thing: Thing, things: list[Thing]) -> list[Thing]:
