@@ -22,6 +22,7 @@ from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import Sighting, unconfirmed
 from reconstruction.instances.smears import WallPicture
 from reconstruction.instances.supports import SupportRegion, find_supports
+from reconstruction.instances.two_colors import solidity
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
@@ -30,6 +31,7 @@ _MOST_SAMPLES = 4000  # vertices that tell a carrier's colors
 _COLORS, _COLOR_GAP = 24, 4.0
 _MOST_FOREIGN = 0.08  # of a carrier's area: a color with more than that is its own
 _FOREIGN, _LIKE_WALL = 12.0, 8.0  # CIELAB, lightness at half weight
+_MIXTURE = 6.0  # from the line between a color of the furniture and that of the wall behind: pixels of both
 _MIN_SEEN, _SURE_SHARE, _WALL_SHARE = 3, 0.6, 0.4  # frames, and of them
 _UP = 0.7  # of a normal's z: smears are steeper than tops
 _ABOVE_M, _REACH_M = 0.004, 0.4  # over a support
@@ -37,6 +39,7 @@ _BOARD_M, _CLEAR_M = 0.12, 0.03  # the next board is as far above, and what is o
 _BRIDGE_M = 0.025
 _MIN_VERTICES = 15
 _MIN_BULGE = 0.12
+_BOWL_M, _ROUND, _SOLID = 0.1, 0.7, 0.75  # of an open thing: width, share of its length, share of its hull
 _LOW_M, _RISE_M, _SLIM_M, _MOST_M = 0.025, 0.02, 0.025, 0.45
 _BESIDE_M, _BESIDE_SHARE = 0.05, 0.35  # of a larger one: its own fringe
 
@@ -73,7 +76,7 @@ class ColorView:
             like[rows] += self.shows_wall(frame, points[rows], frame.lab[row[rows], column[rows]])
         return like >= np.where(seen > 0, _WALL_SHARE * seen, 0.0)
 
-    def foreign(self, vertices: np.ndarray, own: np.ndarray) -> np.ndarray:
+    def foreign(self, vertices: np.ndarray, own: np.ndarray, *, mixed: bool = False) -> np.ndarray:
         """Return which vertices most frames see in none of some colors (k, 3), nor in that of the wall behind.
 
         Of what has no color of its own (k = 0), since it has too many, nothing can be told.
@@ -88,11 +91,23 @@ class ColorView:
             lab = frame.lab[row, column]
             gap = np.linalg.norm(lab[:, None] - own[None], axis=2).min(axis=1)
             odd = shown & (gap > _FOREIGN)
-            asked = np.flatnonzero(odd & ~up)
-            odd[asked] = ~self.shows_wall(frame, points[asked], lab[asked])
+            asked = np.flatnonzero(odd if mixed else odd & ~up)
+            shows = self.shows_mixed(frame, points[asked], lab[asked], own) if mixed else self.shows_wall(frame, points[asked], lab[asked])
+            odd[asked] = ~shows
             seen += shown
             other += odd
         return (seen >= _MIN_SEEN) & (other >= _SURE_SHARE * seen)
+
+    def shows_mixed(self, frame: Sighting, points: np.ndarray, lab: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """Return which points, of colors (n, 3) in a frame, have a mixture of one of some colors (k, 3) and the wall's."""
+        out = np.zeros(len(points), bool)
+        for wall in self.walls:
+            across = wall.behind(points, frame)[:, None] - own[None]
+            from_own = lab[:, None] - own[None]
+            share = (from_own * across).sum(axis=2) / np.maximum((across**2).sum(axis=2), 1e-9)
+            rest = from_own - np.clip(share, 0.0, 1.0)[..., None] * across
+            out |= (np.linalg.norm(rest, axis=2) < _MIXTURE).any(axis=1)
+        return out
 
 
 def cut_foreign(
@@ -154,11 +169,19 @@ def _foreign_on(
         pool = pool[~used[pool]]
         odd = pool[view.foreign(pool, own)]
         odd = odd[~unconfirmed(graph.points[odd], graph.normals[odd], view.frames)]
-        parts = [part for part in pieces(graph, odd, _BRIDGE_M) if _is_thing(graph, part, support, config)]
+        # Along edges before a wall pixels show both; what they join is looked at without them first.
+        pure = odd[view.foreign(odd, own, mixed=True)]
+        parts = _things_in(graph, pure, support, config)
+        used[np.concatenate([pure[:0], *parts])] = True
+        parts.extend(_things_in(graph, odd[~used[odd]], support, config))
         for part in _without_fringes(graph, parts):
             used[part] = True
             found.append(np.sort(part))
     return found
+
+
+def _things_in(graph: MeshGraph, odd: np.ndarray, support: SupportRegion, config: InstancesConfig) -> list[np.ndarray]:
+    return [part for part in pieces(graph, odd, _BRIDGE_M) if _is_thing(graph, part, support, config)]
 
 
 def _above(
@@ -205,7 +228,17 @@ def _is_thing(graph: MeshGraph, part: np.ndarray, support: SupportRegion, config
     slim = min(size[:2]) < _SLIM_M or np.sort(size)[1] < config.min_object_m
     if slim or size.max() > _MOST_M or low[2] - support.height_m > _LOW_M:
         return False
-    return bool(high[2] - support.height_m > _RISE_M and bulge(graph, part) > _MIN_BULGE)
+    if high[2] - support.height_m < _RISE_M:
+        return False
+    return bool(bulge(graph, part) > _MIN_BULGE or _is_bowl(graph, part, size))
+
+
+def _is_bowl(graph: MeshGraph, part: np.ndarray, size: np.ndarray) -> bool:
+    """Tell an open thing, whose inside does not bulge: about as long as wide, without bays in its outline."""
+    if min(size[:2]) < _BOWL_M or min(size[:2]) < _ROUND * max(size[:2]):
+        return False
+    flat = graph.points[part, :2]
+    return solidity(flat) > _SOLID
 
 
 def _without_fringes(graph: MeshGraph, parts: list[np.ndarray]) -> list[np.ndarray]:

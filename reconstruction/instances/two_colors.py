@@ -52,8 +52,8 @@ def meeting_line(
     for side in (first, ~first):
         if not (side & high).any() or points[side, 2].min() > bottom + _GROUND_M:
             return None
-    solid = min(_solidity(points[side & high, :2]) for side in (first, ~first))
-    bay = solid >= _SOLID and solid - _solidity(points[high, :2]) >= _BAY
+    solid = min(solidity(points[side & high, :2]) for side in (first, ~first))
+    bay = solid >= _SOLID and solid - solidity(points[high, :2]) >= _BAY
     return (axis, at) if bay or (solid >= _BLOCK and _steps(samples, axis, at, clear)) else None
 
 
@@ -102,7 +102,7 @@ def _level_top(samples: SurfaceSamples) -> float | None:
     return float(height) if level > _TOP_SHARE * hull else None
 
 
-def _solidity(flat: np.ndarray) -> float:
+def solidity(flat: np.ndarray) -> float:
     """Return how much of the convex hull of points (n, 2) they cover."""
     cells = np.floor((flat - flat.min(axis=0)) / _CELL_M).astype(int) + 2
     mask = np.zeros(cells.max(axis=0) + 3, bool)
