@@ -19,6 +19,7 @@ from reconstruction.surface.base_planes import FittedPlane, plane_axes
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 _LARGEST_M = 0.6  # furniture stands along walls and may have their color
+_LARGEST_GROUP_M = 1.2  # what lies on furniture is none, but smears join things there
 _REACHES_M = 0.06  # a smear goes on to the wall
 _MIN_SEEN, _SURE_SHARE = 2, 0.6
 _ALIKE = 6.0
@@ -109,7 +110,8 @@ def _hugs(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
 
 def _reaches(graph: MeshGraph, thing: Thing, wall: FittedPlane) -> bool:
     points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
-    if thing.attached or np.ptp(points, axis=0).max() > _LARGEST_M:
+    largest = _LARGEST_M if thing.rests_on is None else _LARGEST_GROUP_M
+    if thing.attached or np.ptp(points, axis=0).max() > largest:
         return False
     return bool(quantiles(wall.distance(points), areas, (0.02,))[0] < _REACHES_M)
 
