@@ -41,6 +41,7 @@ _MIN_VERTICES = 15
 _MIN_BULGE = 0.12
 _BOWL_M, _ROUND, _SOLID = 0.1, 0.7, 0.75  # of an open thing: width, share of its length, share of its hull
 _LOW_M, _RISE_M, _SLIM_M, _MOST_M = 0.025, 0.02, 0.025, 0.45
+_LID_M = 0.05  # what is over a thing may be its lid, in a color that the furniture has
 _BESIDE_M, _BESIDE_SHARE = 0.05, 0.35  # of a larger one: its own fringe
 
 
@@ -175,9 +176,21 @@ def _foreign_on(
         used[np.concatenate([pure[:0], *parts])] = True
         parts.extend(_things_in(graph, odd[~used[odd]], support, config))
         for part in _without_fringes(graph, parts):
+            part = _with_column(view, part, pool[~used[pool]])
             used[part] = True
             found.append(np.sort(part))
     return found
+
+
+def _with_column(view: ColorView, part: np.ndarray, pool: np.ndarray) -> np.ndarray:
+    """Add what is right over and under a thing, but for what shows the wall: sides in its shade, its lid."""
+    graph = view.graph
+    beside = np.setdiff1d(pool, part, assume_unique=True)
+    outline = cv2.convexHull(graph.points[part, :2].astype(np.float32))
+    high = graph.points[part, 2].max() + _LID_M
+    within = (inset(outline, graph.points[beside, :2]) > 0.0) & (graph.points[beside, 2] < high)
+    beside = beside[within]
+    return np.concatenate([part, beside[~view.of_wall(beside)]])
 
 
 def _things_in(graph: MeshGraph, odd: np.ndarray, support: SupportRegion, config: InstancesConfig) -> list[np.ndarray]:
