@@ -16,16 +16,18 @@ from scipy import ndimage
 
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.foreign import main_colors
 from reconstruction.instances.image_colors import SurfaceSamples, surface_samples, with_colors
 from reconstruction.instances.merging import nearest_of
 from reconstruction.instances.outlines import filled_hull
 from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.towers import tower_parts
 from reconstruction.instances.two_colors import meeting_line
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import DepthMaps, PosedFrames, Surface
 
-_LARGEST_M = 0.6
+_LARGEST_M, _LARGEST_PAIR_M = 0.6, 0.8  # a tray with a carton beside it is longer than either
 _CELL_M = 0.005
 _LEVELS = (0.25, 0.45, 0.65, 0.8)  # of the height: skirts are below, and a top of one thing has no waist
 _AXES = np.radians(np.arange(0.0, 180.0, 10.0))
@@ -77,7 +79,7 @@ def cut_side_by_side(
     small = [
         thing
         for thing in things
-        if not thing.attached and np.ptp(graph.points[thing.vertices], axis=0).max() <= _LARGEST_M
+        if not thing.attached and np.ptp(graph.points[thing.vertices], axis=0).max() <= _LARGEST_PAIR_M
     ]
     if not small:
         return out
@@ -88,9 +90,12 @@ def cut_side_by_side(
         inside[:] = False
         inside[thing.vertices] = True
         own = samples.of(inside[samples.vertex])
-        parts = None if thing.container else _parts(graph, thing.vertices, own, config)
-        if parts is None:
+        large = np.ptp(graph.points[thing.vertices], axis=0).max() > _LARGEST_M
+        parts = None if thing.container or large else _parts(graph, thing.vertices, own, config)
+        if parts is None and not large:
             parts = _colored_parts(graph, thing.vertices, own, config)
+        if parts is None:
+            parts = tower_parts(graph, thing.vertices, own, _ground(graph, thing), config)
         if parts is None:
             continue
         thing.vertices = parts[0]
@@ -104,6 +109,11 @@ def cut_side_by_side(
             f"{len(out) - len(things)} things are cut off what they touch from the side, by their outline"
         )
     return out
+
+
+def _ground(graph: MeshGraph, thing: Thing) -> np.ndarray:
+    """Return the colors (k, 3) of what carries a thing; none for what stands on the floor."""
+    return np.zeros((0, 3)) if thing.rests_on is None else main_colors(graph, thing.rests_on.vertices)
 
 
 def _parts(

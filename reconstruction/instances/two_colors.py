@@ -26,6 +26,7 @@ _SOLID, _BAY = 0.93, 0.025  # of the hull of each side; and more than of the hul
 _BLOCK, _STEP_UP_M = 0.9, 0.015  # solidity of what has a level top, and a step between two tops
 _LEVEL, _TOP_M, _TOP_SHARE = 0.7, 0.006, 0.33  # of a top: z of normals, half its spread, share of the hull
 _MIN_SAMPLES, _MOST_SAMPLES = 200, 3000
+_MIN_SIDE = 40  # samples
 _GROUND_M = 0.025  # both stand on the same
 
 
@@ -61,10 +62,8 @@ def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
     """Return the line whose sides have least color in common, None where that is too much."""
     if len(samples.points) < _MIN_SAMPLES:
         return None
-    lab = samples.lab * LIGHTNESS_WEIGHT
-    means = palette(lab[:: max(1, len(lab) // _MOST_SAMPLES)], _COLORS, _COLOR_GAP)[1]
-    color = np.argmin(((lab[:, None] - means[None]) ** 2).sum(axis=2), axis=1)
-    whole = np.bincount(color, weights=samples.areas, minlength=len(means))
+    color, count = _painted(samples)
+    whole = np.bincount(color, weights=samples.areas, minlength=count)
     best, line = _MOST_COMMON, None
     for angle in _AXES:
         axis = np.array([np.cos(angle), np.sin(angle)])
@@ -72,7 +71,7 @@ def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
         low, high = np.percentile(along, [1, 99])
         for at in np.arange(low + 3 * _STEP_M, high - 3 * _STEP_M, _STEP_M):
             side = along < at
-            one = np.bincount(color[side], weights=samples.areas[side], minlength=len(means))
+            one = np.bincount(color[side], weights=samples.areas[side], minlength=count)
             two = whole - one
             share = one.sum() / whole.sum()
             if min(share, 1.0 - share) < _LEAST_SHARE:
@@ -81,6 +80,25 @@ def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
             if common < best:
                 best, line = common, (axis, float(at))
     return line
+
+
+def common_colors(samples: SurfaceSamples, side: np.ndarray) -> float:
+    """Return the share of the area of samples on one side (mask) and the other whose color the other side has, too.
+
+    1 where either side is too little to tell.
+    """
+    if min(side.sum(), (~side).sum()) < _MIN_SIDE:
+        return 1.0
+    color, count = _painted(samples)
+    one, two = (np.bincount(color[s], weights=samples.areas[s], minlength=count) for s in (side, ~side))
+    return float(np.minimum(one / one.sum(), two / two.sum()).sum())
+
+
+def _painted(samples: SurfaceSamples) -> tuple[np.ndarray, int]:
+    """Return for each sample the row of its typical color, and how many there are."""
+    lab = samples.lab * LIGHTNESS_WEIGHT
+    means = palette(lab[:: max(1, len(lab) // _MOST_SAMPLES)], _COLORS, _COLOR_GAP)[1]
+    return np.argmin(((lab[:, None] - means[None]) ** 2).sum(axis=2), axis=1), len(means)
 
 
 def _steps(samples: SurfaceSamples, axis: np.ndarray, at: float, clear: float) -> bool:
