@@ -8,6 +8,7 @@ their noise pinches them: so the sides of what is cut must turn towards each oth
 and no face runs straight on there. Where there is no waist, colors may tell (`two_colors`).
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -86,16 +87,12 @@ def cut_side_by_side(
     chosen = np.concatenate([thing.vertices for thing in small])
     samples = with_colors(surface_samples(graph, surface, chosen), posed, depth)
     inside = np.zeros(len(graph.points), bool)
-    for thing in small:
+    asked = deque(small)
+    while asked:
+        thing = asked.popleft()
         inside[:] = False
         inside[thing.vertices] = True
-        own = samples.of(inside[samples.vertex])
-        large = np.ptp(graph.points[thing.vertices], axis=0).max() > _LARGEST_M
-        parts = None if thing.container or large else _parts(graph, thing.vertices, own, config)
-        if parts is None and not large:
-            parts = _colored_parts(graph, thing.vertices, own, config)
-        if parts is None:
-            parts = tower_parts(graph, thing.vertices, own, _ground(graph, thing), config)
+        parts = _two_things(graph, thing, samples.of(inside[samples.vertex]), config)
         if parts is None:
             continue
         thing.vertices = parts[0]
@@ -104,11 +101,26 @@ def cut_side_by_side(
             if other.rests_on is thing and nearest_of(graph, other, (thing, beside)) is beside:
                 other.rests_on = beside
         out.append(beside)
+        asked.extend((thing, beside))  # each may be two again
     if len(out) > len(things):
         progress.note(
             f"{len(out) - len(things)} things are cut off what they touch from the side, by their outline"
         )
     return out
+
+
+def _two_things(
+    graph: MeshGraph, thing: Thing, samples: SurfaceSamples, config: InstancesConfig
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the vertices of two things that touch, the larger first; None if there is but one."""
+    parts = None
+    if np.ptp(graph.points[thing.vertices], axis=0).max() <= _LARGEST_M:
+        parts = None if thing.container else _parts(graph, thing.vertices, samples, config)
+        if parts is None:
+            parts = _colored_parts(graph, thing.vertices, samples, config)
+    if parts is None:
+        parts = tower_parts(graph, thing.vertices, samples, _ground(graph, thing), config)
+    return parts
 
 
 def _ground(graph: MeshGraph, thing: Thing) -> np.ndarray:
