@@ -132,6 +132,20 @@ def test_a_ragged_sheet_beside_a_box_is_a_skirt_and_a_small_box_there_is_none():
     assert len(without_skirts(graph, [ground, things["sheet"], covering], NO_PROGRESS)) == 3
 
 
+@pytest.mark.parametrize(("boxes", "kept"), [(("left", "right"), False), (("left",), True)])
+def test_a_sheet_across_the_gap_between_two_boxes_is_a_skirt(boxes, kept):
+    """It is near to both, though most of it is far from either one; it has not the color of the ground."""
+    parts = {
+        "left": solid_box((-0.2, -0.1, 0.0), (-0.06, 0.1, 0.12), RED),
+        "right": solid_box((0.06, -0.1, 0.0), (0.2, 0.1, 0.12), RED),
+        "sheet": sheet((-0.059, -0.02, 0.003), (0.118, 0, 0), (0, 0.04, 0.055), RED),
+    }
+    graph = MeshGraph.from_surface(surface_from(merged(floor_sheet(WOOD), *parts.values())))
+    ground = Thing(np.flatnonzero(graph.points[:, 2] < 1e-3))
+    things = [ground, *(Thing(_vertices_of(graph, parts[name]), ground) for name in (*boxes, "sheet"))]
+    assert len(without_skirts(graph, things, NO_PROGRESS)) == len(things) - (not kept)
+
+
 def test_a_container_is_not_cut_into_stacks():
     """Its rim may be narrower than its lower part, and of another color."""
     lower = tray((-0.13, -0.11, 0.4), (0.13, 0.11, 0.44), 0.022, WOOD)

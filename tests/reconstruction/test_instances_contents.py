@@ -140,6 +140,67 @@ def test_a_slanted_low_thing_is_no_skirt_if_nothing_around_has_its_color(color, 
     assert len(without_skirts(view.graph, things, NO_PROGRESS)) == 2 + kept
 
 
+def ramp(low_x, high_x, color, bottom_m=0.003, rise_m=0.065):
+    """Return a steep sheet, as smeared depth makes them, that bulges nowhere and has no top."""
+    return sheet((low_x, -0.05, bottom_m), (high_x - low_x, 0, 0), (0, 0.045, rise_m), color)
+
+
+def skirts_left_out(carried_by=None, **parts):
+    """Return names of parts on a cream ground that are taken for skirts, and what each of the others rests on."""
+    view, shell = seen(surface_from(merged(floor_sheet(CREAM, 0.4), *parts.values())))
+    points = view.graph.points
+    ground = Thing(np.flatnonzero((points[:, 2] < 1e-3) & (np.abs(points[:, :2]) < 0.25).all(axis=1)))
+    things = {"ground": ground}
+    for name, part in parts.items():
+        low, high = part.vertices.min(axis=0) - 1e-4, part.vertices.max(axis=0) + 1e-4
+        inside = ((points > low) & (points < high)).all(axis=1) & (points[:, 2] > 1e-3)
+        things[name] = Thing(np.flatnonzero(inside), ground)
+    for upper, lower in (carried_by or {}).items():
+        things[upper].rests_on = things[lower]
+    mark_unlike(view, list(things.values()), shell.owner)
+    kept = {id(thing) for thing in without_skirts(view.graph, list(things.values()), NO_PROGRESS)}
+    names = {id(thing): name for name, thing in things.items()}
+    rests = {name: names[id(thing.rests_on)] for name, thing in things.items() if thing is not ground}
+    return {name for name, thing in things.items() if id(thing) not in kept}, rests
+
+
+@pytest.mark.parametrize(("color", "gone"), [(CREAM, {"sheet"}), (WOOD, set())])
+def test_a_sheet_between_two_things_is_a_skirt_if_it_has_the_color_of_what_carries_it(color, gone):
+    """It is farther from each than a skirt may be; that of wood has the color of the two."""
+    first, second = (solid_box((x, -0.06, 0.0), (x + 0.06, 0.06, 0.12), WOOD) for x in (-0.16, 0.1))
+    assert skirts_left_out(sheet=ramp(-0.1, 0.1, color), first=first, second=second)[0] == gone
+
+
+@pytest.mark.parametrize(("color", "gone"), [(CREAM, True), (GREEN, False)])
+def test_what_seems_to_rest_on_a_sheet_in_the_furnitures_color_rests_on_the_furniture(color, gone):
+    thing = solid_box((-0.05, -0.04, 0.05), (0.05, 0.04, 0.14), WOOD)
+    out, rests = skirts_left_out({"thing": "sheet"}, sheet=ramp(-0.15, 0.15, color), thing=thing)
+    assert out == ({"sheet"} if gone else set())
+    assert rests["thing"] == ("ground" if gone else "sheet")
+
+
+def test_a_sheet_that_seems_to_lie_on_something_small_may_have_the_color_of_what_carries_that():
+    book = solid_box((-0.1, -0.1, 0.0), (0.1, 0.1, 0.02), WOOD)
+    upper = ramp(-0.08, 0.02, CREAM, bottom_m=0.022)
+    assert skirts_left_out({"sheet": "book"}, book=book, sheet=upper)[0] == {"sheet"}
+
+
+LEVEL = sheet((-0.1, -0.005, 0.068), (0.03, 0, 0), (0, 0.03, 0), CREAM)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        solid_box((-0.1, -0.08, 0.0), (0.1, 0.08, 0.02), CREAM),
+        merged(ramp(-0.1, 0.0, CREAM), LEVEL),
+        ramp(-0.1, 0.0, CREAM, rise_m=0.095),
+    ],
+    ids=["a board", "a good part of it is a level top", "higher than smears"],
+)
+def test_what_has_the_color_of_the_furniture_is_no_skirt_for_that(part):
+    assert skirts_left_out(part=part)[0] == set()
+
+
 @pytest.mark.parametrize(
     ("rise_m", "color", "parts"),
     [(0.0, GREEN, 1), (0.0, WOOD, 2), (0.03, GREEN, 2)],
