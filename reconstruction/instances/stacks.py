@@ -42,6 +42,7 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.image_colors import SurfaceSamples, surface_samples, with_colors
 from reconstruction.instances.lying_across import is_flat, score_of_flat, without_sides
 from reconstruction.instances.merging import nearest_of
+from reconstruction.instances.saucers import on_saucer
 from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
@@ -106,21 +107,29 @@ def cut_stacks(
     small = [
         thing
         for thing in things
-        if not (thing.attached or thing.container)
-        and np.ptp(graph.points[thing.vertices], axis=0).max() < _LARGEST_M
+        if not thing.attached and np.ptp(graph.points[thing.vertices], axis=0).max() < _LARGEST_M
     ]
     if not small:
         return things
     chosen = np.concatenate([thing.vertices for thing in small])
     samples = with_colors(surface_samples(graph, surface, chosen), posed, depth)
+    inside = np.zeros(len(graph.points), bool)
     out, waiting = list(things), list(small)
     while waiting:
         lower = waiting.pop()
-        seam = _best_seam(graph, lower.vertices, samples, config, flats)
-        if seam is None:
+        inside[:] = False
+        inside[lower.vertices] = True
+        own = samples.of(inside[samples.vertex])
+        if lower.container:
+            above = on_saucer(graph, lower.vertices, own, config)
+        else:
+            seam = _best_seam(graph, lower.vertices, own, config, flats)
+            above = None if seam is None else seam.upper
+        if above is None:
             continue
-        upper = Thing(seam.upper, lower, lower.depth + 1)
-        lower.vertices = np.setdiff1d(lower.vertices, seam.upper, assume_unique=True)
+        upper = Thing(above, lower, lower.depth + 1, container=lower.container)
+        lower.vertices = np.setdiff1d(lower.vertices, above, assume_unique=True)
+        lower.container = False
         for other in out:
             if other.rests_on is lower and nearest_of(graph, other, (lower, upper)) is upper:
                 other.rests_on = upper
@@ -134,12 +143,10 @@ def cut_stacks(
 
 
 def _best_seam(
-    graph: MeshGraph, body: np.ndarray, samples: SurfaceSamples, config: InstancesConfig, with_flats: bool
+    graph: MeshGraph, body: np.ndarray, own: SurfaceSamples, config: InstancesConfig, with_flats: bool
 ) -> _Seam | None:
-    """Return the surest seam of a body, None if none is sure enough."""
+    """Return the surest seam of a body of which samples are given, None if none is sure enough."""
     inside = np.zeros(len(graph.points), bool)
-    inside[body] = True
-    own = samples.of(inside[samples.vertex])
     z = graph.points[body, 2]
     best: _Seam | None = None
     flats: list[_Seam] = []
