@@ -80,6 +80,8 @@ class ColorView:
     def foreign(self, vertices: np.ndarray, own: np.ndarray, *, mixed: bool = False) -> np.ndarray:
         """Return which vertices most frames see in none of some colors (k, 3), nor in that of the wall behind.
 
+        Where `mixed`, nor in a mixture of the two: along edges before a wall pixels show both.
+
         Of what has no color of its own (k = 0), since it has too many, nothing can be told.
         """
         if len(own) == 0:
@@ -93,14 +95,20 @@ class ColorView:
             gap = np.linalg.norm(lab[:, None] - own[None], axis=2).min(axis=1)
             odd = shown & (gap > _FOREIGN)
             asked = np.flatnonzero(odd if mixed else odd & ~up)
-            shows = self.shows_mixed(frame, points[asked], lab[asked], own) if mixed else self.shows_wall(frame, points[asked], lab[asked])
+            shows = (
+                self.shows_mixed(frame, points[asked], lab[asked], own)
+                if mixed
+                else self.shows_wall(frame, points[asked], lab[asked])
+            )
             odd[asked] = ~shows
             seen += shown
             other += odd
         return (seen >= _MIN_SEEN) & (other >= _SURE_SHARE * seen)
 
-    def shows_mixed(self, frame: Sighting, points: np.ndarray, lab: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """Return which points, of colors (n, 3) in a frame, have a mixture of one of some colors (k, 3) and the wall's."""
+    def shows_mixed(
+        self, frame: Sighting, points: np.ndarray, lab: np.ndarray, own: np.ndarray
+    ) -> np.ndarray:
+        """Return which points, of colors (n, 3) in a frame, mix one of some colors (k, 3) with that of the wall behind."""
         out = np.zeros(len(points), bool)
         for wall in self.walls:
             across = wall.behind(points, frame)[:, None] - own[None]
@@ -193,7 +201,9 @@ def _with_column(view: ColorView, part: np.ndarray, pool: np.ndarray) -> np.ndar
     return np.concatenate([part, beside[~view.of_wall(beside)]])
 
 
-def _things_in(graph: MeshGraph, odd: np.ndarray, support: SupportRegion, config: InstancesConfig) -> list[np.ndarray]:
+def _things_in(
+    graph: MeshGraph, odd: np.ndarray, support: SupportRegion, config: InstancesConfig
+) -> list[np.ndarray]:
     return [part for part in pieces(graph, odd, _BRIDGE_M) if _is_thing(graph, part, support, config)]
 
 

@@ -53,7 +53,9 @@ def mark_unlike(view: ColorView, things: list[Thing], owner: np.ndarray) -> None
 def _furniture(graph: MeshGraph, thing: Thing) -> Thing:
     """Return what carries a thing, and what carries that, up to furniture: sheets seem to lie on one another."""
     carrier = thing.rests_on
-    while carrier.rests_on is not None and np.ptp(graph.points[carrier.vertices], axis=0).max() < _FURNITURE_M:
+    while (
+        carrier.rests_on is not None and np.ptp(graph.points[carrier.vertices], axis=0).max() < _FURNITURE_M
+    ):
         carrier = carrier.rests_on
     return carrier
 
