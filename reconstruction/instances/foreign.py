@@ -108,7 +108,7 @@ class ColorView:
     def shows_mixed(
         self, frame: Sighting, points: np.ndarray, lab: np.ndarray, own: np.ndarray
     ) -> np.ndarray:
-        """Return which points, of colors (n, 3) in a frame, mix one of some colors (k, 3) with that of the wall behind."""
+        """Return which points, of colors (n, 3) in a frame, mix one of some colors (k, 3) with the wall behind."""
         out = np.zeros(len(points), bool)
         for wall in self.walls:
             across = wall.behind(points, frame)[:, None] - own[None]

@@ -18,7 +18,7 @@ _LOWEST_M, _HIGHEST_M, _HIGHEST = 0.01, 0.05, 0.5  # of a saucer: its top, in me
 _STEP_M = 0.003  # between the heights tried
 _BAND_M = 0.02  # of the container's side above a height, whose width counts
 _RIM_PERCENT = 90.0  # of radii in a direction: how far it reaches
-_OUT_M, _OUT = 0.008, 0.6  # how far it reaches beyond that, in what share of directions
+_OUT_M, _OUT = 0.015, 0.6  # how far it reaches beyond that, more than ledges do, in what share of directions
 _MOST_COMMON = 0.25  # share of either's area in colors that the other has, too
 
 
