@@ -1,6 +1,7 @@
 """Surface that is smeared from a thing to the wall behind it goes to the wall; a thing of the wall's color stays."""
 
 import numpy as np
+import pytest
 from surfaces import filmed, looking_at, merged, sheet, solid_box, surface_from
 
 from reconstruction.instances import InstancesConfig
@@ -15,20 +16,21 @@ LOW, HIGH = (-0.08, 0.3, 0.0), (0.08, 0.42, 0.25)
 WALL_Y = 0.6
 
 
-def carton_before_wall(color, striped):
-    """A carton before a wall, as fused with smears from its sides to the wall, and films of the truth."""
+def carton_before_wall(color, striped, at_x=(0.0,)):
+    """Cartons before a wall, as fused with smears from their sides to the wall, and films of the truth."""
     room = (
         sheet((-1.0, -1.0, 0.0), (2.0, 0, 0), (0, 1.0 + WALL_Y, 0), (120, 100, 80), 0.025),
         sheet((-1.0, WALL_Y, 0.0), (2.0, 0, 0), (0, 0, 1.8), (200, 200, 190), 0.02),
     )
-    carton = solid_box(LOW, HIGH, color)
     away = WALL_Y - 0.02 - HIGH[1]
-    smears = (
-        sheet((LOW[0] - 0.1, HIGH[1] + away, 0.0), (0.1, -away, 0), (0, 0, 0.25), (170, 170, 165)),
-        sheet((HIGH[0], HIGH[1], 0.0), (0.1, away, 0), (0, 0, 0.25), (170, 170, 165)),
-    )
-    surface = surface_from(merged(*room, carton, *smears))
-    truth = merged(*room, carton)
+    cartons, smears = [], []
+    for x in at_x:
+        cartons.append(solid_box(np.add(LOW, (x, 0, 0)), np.add(HIGH, (x, 0, 0)), color))
+        left, right = x + LOW[0] - 0.1, x + HIGH[0]
+        smears.append(sheet((left, HIGH[1] + away, 0.0), (0.1, -away, 0), (0, 0, 0.25), (170, 170, 165)))
+        smears.append(sheet((right, HIGH[1], 0.0), (0.1, away, 0), (0, 0, 0.25), (170, 170, 165)))
+    surface = surface_from(merged(*room, *cartons, *smears))
+    truth = merged(*room, *cartons)
     paint = truth.colors.copy()
     stripes = (
         striped & (truth.vertices[:, 1] > WALL_Y - 1e-3) & (np.floor(truth.vertices[:, 0] / 0.2) % 2 == 0)
@@ -41,12 +43,14 @@ def carton_before_wall(color, striped):
     return surface, *filmed(truth, paint, surface, poses, camera)
 
 
-def cleaned(color, striped=True):
+def cleaned(color, striped=True, at_x=(0.0,), on_furniture=False):
     """Return the shell, the thing's vertices before and after, who owns what, and what of it is smear."""
-    surface, posed, depth = carton_before_wall(color, striped)
+    surface, posed, depth = carton_before_wall(color, striped, at_x)
     shell = Shell.of(surface, NO_PROGRESS)
     points = shell.graph.points
     thing = Thing(np.flatnonzero((shell.owner == 0) & (points[:, 2] > 0.02)))
+    if on_furniture:
+        thing.rests_on = Thing(np.flatnonzero(points[:, 2] < 1e-3))
     before, owner = thing.vertices, shell.owner.copy()
     without_smears(shell, [thing], owner, sightings(surface, posed, depth), InstancesConfig(), NO_PROGRESS)
     smear = before[points[before, 1] > HIGH[1] + 0.02]
@@ -68,6 +72,22 @@ def test_what_has_the_color_of_the_wall_is_not_taken_apart():
     assert any(base.label == "wall" for base in shell.base)
     assert len(smear) > 200
     np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize(
+    ("half_m", "on_furniture", "freed"),
+    [(0.35, True, True), (0.35, False, False), (0.45, True, False)],
+    ids=["1.06 m on furniture", "1.06 m on the floor", "1.26 m on furniture"],
+)
+def test_smears_of_a_long_group_go_to_the_wall_if_it_lies_on_furniture(half_m, on_furniture, freed):
+    """What stands on the floor and is as long is furniture itself, and may have the wall's color."""
+    _, before, after, _, smear = cleaned((180, 40, 40), at_x=(-half_m, half_m), on_furniture=on_furniture)
+    assert len(smear) > 400
+    if freed:
+        assert np.isin(smear, after).mean() < 0.35
+        assert np.isin(np.setdiff1d(before, smear), after).mean() > 0.8
+    else:
+        np.testing.assert_array_equal(before, after)
 
 
 def hung_box(color, seen, carries=False):
