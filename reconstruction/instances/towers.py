@@ -67,10 +67,18 @@ def tower_parts(
             common = common_colors(seen, upright)
             if common < best and not _is_sheet(points, areas, ~column, seen.of(~upright), ground):
                 best, found = common, column
-    if found is None:
+    if (
+        found is None
+        or min(_width(points[side], areas[side]) for side in (found, ~found)) < config.min_object_m
+    ):
         return None
     first, second = sorted((body[found], body[~found]), key=lambda part: -graph.areas[part].sum())
     return first, second
+
+
+def _width(points: np.ndarray, areas: np.ndarray) -> float:
+    """Return the lesser of the extents in plan: slivers are no things."""
+    return min(float(np.ptp(quantiles(points[:, k], areas, (0.02, 0.98)))) for k in range(2))
 
 
 def _is_sheet(

@@ -258,3 +258,15 @@ def test_a_tray_and_a_carton_at_its_end_may_be_longer_than_either(length_m, thin
     surface = fused([board, carton], half_m=end + 0.14, top_m=0.25)
     graph = MeshGraph.from_surface(surface)
     assert len(cut(surface, graph, [Thing(np.flatnonzero(graph.points[:, 2] > 0.012))])) == things
+
+
+def test_slivers_between_things_of_three_heights_are_no_things():
+    """The tray is cut between the cans first; what is left beside them later is too slim to be a thing."""
+    smears = [
+        box((-0.11, 0.09, 0.0), (-0.07, 0.12, RIM_M), BLUE),
+        box((0.07, 0.09, 0.0), (0.11, 0.12, RIM_M), GREEN),
+    ]
+    cans = [can((-0.09, 0.145), 0.035, 0.0, 0.15, BLUE), can((0.09, 0.145), 0.035, 0.0, 0.08, GREEN)]
+    surface, graph, above = scene(*TRAY, *cans, *smears)
+    for thing in cut(surface, graph, [Thing(above, container=True)]):
+        assert np.ptp(graph.points[thing.vertices, :2], axis=0).min() > InstancesConfig().min_object_m
