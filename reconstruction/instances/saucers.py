@@ -11,7 +11,7 @@ from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.columns import MIN_KNOWN, MIN_SAMPLES, medians, polar
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.image_colors import SurfaceSamples
-from reconstruction.instances.two_colors import common_colors
+from reconstruction.instances.two_colors import Paint
 from reconstruction.surface.mesh_graph import MeshGraph
 
 _LOWEST_M, _HIGHEST_M, _HIGHEST = 0.01, 0.05, 0.5  # of a saucer: its top, in metres and of the whole height
@@ -36,6 +36,7 @@ def on_saucer(
     seen = samples.of(np.isfinite(samples.lab[:, 0]))
     if not len(seen.points):
         return None
+    paint = Paint.of(seen)
     bottom, top = quantiles(graph.points[body, 2], graph.areas[body], (0.01, 0.99))
     best, found = _MOST_COMMON, None
     for rise in np.arange(_LOWEST_M, min(_HIGHEST_M, _HIGHEST * (top - bottom)), _STEP_M):
@@ -43,7 +44,7 @@ def on_saucer(
         low = seen.points[:, 2] < height
         if not _reaches_out(seen, low, height):
             continue
-        common = common_colors(seen, low)
+        common = paint.common(low)
         if common < best:
             best, found = common, height
     if found is None:

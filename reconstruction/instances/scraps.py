@@ -15,11 +15,8 @@ from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import InstanceSet
 
-SKIRT_M, _SKIRT_BULGE, _SKIRT_TOP = (
-    0.08,
-    0.45,
-    0.4,
-)  # at most: height, shape, share of the outline that is a top
+SKIRT_M, _SKIRT_BULGE = 0.08, 0.45  # at most: height, shape
+_SKIRT_TOP = 0.4  # at most: share of the outline that is a top
 _UP, _TOP_M = 0.6, 0.012
 _COLLAR_M = 0.02  # how far a skirt rises around the foot of what seems to lie on it: plates rise less
 TOUCH_M, _BESIDE_M = 0.015, 0.06  # from a larger thing: its nearest, and four fifths of it
@@ -70,11 +67,11 @@ def without_skirts(graph: MeshGraph, things: list[Thing], progress: Progress) ->
 
 def _is_skirt(graph: MeshGraph, thing: Thing, things: list[Thing]) -> bool:
     points, areas = graph.points[thing.vertices], graph.areas[thing.vertices]
-    low, middle, high = quantiles(points[:, 2], areas, (0.02, 0.5, 0.98))
     if not is_low(graph, thing, _SKIRT_TOP):
         return False
     if thing.sheet:
         return True
+    low, middle, high = quantiles(points[:, 2], areas, (0.02, 0.5, 0.98))
     beyond = np.full(len(points), np.inf)  # of all larger ones that it touches
     for other in things:
         if other is thing or other.attached:

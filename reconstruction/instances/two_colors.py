@@ -6,6 +6,8 @@ neither has alone, or level tops of two heights. One thing of two colors has no 
 and spouts are of the thing's own colors.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from scipy import ndimage
@@ -53,17 +55,28 @@ def meeting_line(
     for side in (first, ~first):
         if not (side & high).any() or points[side, 2].min() > bottom + _GROUND_M:
             return None
+    if _goes_across(samples, axis, at, (bottom + 0.005, clear)):
+        return None
     solid = min(solidity(points[side & high, :2]) for side in (first, ~first))
     bay = solid >= _SOLID and solid - solidity(points[high, :2]) >= _BAY
     return (axis, at) if bay or (solid >= _BLOCK and _steps(samples, axis, at, clear)) else None
+
+
+def _goes_across(samples: SurfaceSamples, axis: np.ndarray, at: float, between: tuple[float, float]) -> bool:
+    """Tell whether something low, between two heights, has the same colors on both sides of a line: a tray under it."""
+    seen = samples.of(np.isfinite(samples.lab[:, 0]) & (samples.points[:, 2] > between[0]))
+    paint, low = Paint.of(seen), seen.points[:, 2] < between[1]
+    first = seen.points[:, :2] @ axis < at
+    shared = np.minimum(paint.area(low & first), paint.area(low & ~first)).sum()
+    return bool(shared > _LEAST_SHARE * seen.areas[~low].sum())
 
 
 def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
     """Return the line whose sides have least color in common, None where that is too much."""
     if len(samples.points) < _MIN_SAMPLES:
         return None
-    color, count = _painted(samples)
-    whole = np.bincount(color, weights=samples.areas, minlength=count)
+    paint = Paint.of(samples)
+    whole = paint.area(np.ones(len(samples.points), bool))
     best, line = _MOST_COMMON, None
     for angle in _AXES:
         axis = np.array([np.cos(angle), np.sin(angle)])
@@ -71,7 +84,7 @@ def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
         low, high = np.percentile(along, [1, 99])
         for at in np.arange(low + 3 * _STEP_M, high - 3 * _STEP_M, _STEP_M):
             side = along < at
-            one = np.bincount(color[side], weights=samples.areas[side], minlength=count)
+            one = paint.area(side)
             two = whole - one
             share = one.sum() / whole.sum()
             if min(share, 1.0 - share) < _LEAST_SHARE:
@@ -82,23 +95,47 @@ def _least_common(samples: SurfaceSamples) -> tuple[np.ndarray, float] | None:
     return line
 
 
+@dataclass(frozen=True)
+class Paint:
+    """The typical color of each of some samples.
+
+    Args:
+        color: int (n,) its number.
+        areas: float64 (n,) of the samples, in square metres.
+        count: how many typical colors there are.
+    """
+
+    color: np.ndarray
+    areas: np.ndarray
+    count: int
+
+    @classmethod
+    def of(cls, samples: SurfaceSamples) -> "Paint":
+        """Return the paint of samples that all have a color."""
+        lab = samples.lab * LIGHTNESS_WEIGHT
+        means = palette(lab[:: max(1, len(lab) // _MOST_SAMPLES)], _COLORS, _COLOR_GAP)[1]
+        return cls(
+            np.argmin(((lab[:, None] - means[None]) ** 2).sum(axis=2), axis=1), samples.areas, len(means)
+        )
+
+    def area(self, rows: np.ndarray) -> np.ndarray:
+        """Return how much area (count,) of some samples (mask) is of each color."""
+        return np.bincount(self.color[rows], weights=self.areas[rows], minlength=self.count)
+
+    def common(self, side: np.ndarray) -> float:
+        """Return the share of the area of samples on one side (mask) and the other that is of colors that both have."""
+        one, two = self.area(side), self.area(~side)
+        return float(np.minimum(one / one.sum(), two / two.sum()).sum())
+
+
 def common_colors(samples: SurfaceSamples, side: np.ndarray) -> float:
-    """Return the share of the area of samples on one side (mask) and the other whose color the other side has, too.
+    """Return the share of the area of samples on one side (mask) and the other that is of colors that both have.
 
     1 where either side is too little to tell.
     """
     if min(side.sum(), (~side).sum()) < _MIN_SIDE:
         return 1.0
-    color, count = _painted(samples)
-    one, two = (np.bincount(color[s], weights=samples.areas[s], minlength=count) for s in (side, ~side))
-    return float(np.minimum(one / one.sum(), two / two.sum()).sum())
-
-
-def _painted(samples: SurfaceSamples) -> tuple[np.ndarray, int]:
-    """Return for each sample the row of its typical color, and how many there are."""
-    lab = samples.lab * LIGHTNESS_WEIGHT
-    means = palette(lab[:: max(1, len(lab) // _MOST_SAMPLES)], _COLORS, _COLOR_GAP)[1]
-    return np.argmin(((lab[:, None] - means[None]) ** 2).sum(axis=2), axis=1), len(means)
+    return Paint.of(samples).common(side)
 
 
 def _steps(samples: SurfaceSamples, axis: np.ndarray, at: float, clear: float) -> bool:

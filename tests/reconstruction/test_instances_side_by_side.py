@@ -260,13 +260,17 @@ def test_a_tray_and_a_carton_at_its_end_may_be_longer_than_either(length_m, thin
     assert len(cut(surface, graph, [Thing(np.flatnonzero(graph.points[:, 2] > 0.012))])) == things
 
 
-def test_slivers_between_things_of_three_heights_are_no_things():
-    """The tray is cut between the cans first; what is left beside them later is too slim to be a thing."""
+@pytest.mark.parametrize("second_top_m", [0.08, 0.15], ids=["of two heights", "of one height"])
+def test_two_cans_at_one_side_of_a_tray_are_three_things(second_top_m):
+    """A line between the cans has other colors on either side, but the tray goes on below them."""
     smears = [
         box((-0.11, 0.09, 0.0), (-0.07, 0.12, RIM_M), BLUE),
         box((0.07, 0.09, 0.0), (0.11, 0.12, RIM_M), GREEN),
     ]
-    cans = [can((-0.09, 0.145), 0.035, 0.0, 0.15, BLUE), can((0.09, 0.145), 0.035, 0.0, 0.08, GREEN)]
+    cans = [can((-0.09, 0.145), 0.035, 0.0, 0.15, BLUE), can((0.09, 0.145), 0.035, 0.0, second_top_m, GREEN)]
     surface, graph, above = scene(*TRAY, *cans, *smears)
-    for thing in cut(surface, graph, [Thing(above, container=True)]):
-        assert np.ptp(graph.points[thing.vertices, :2], axis=0).min() > InstancesConfig().min_object_m
+    things = cut(surface, graph, [Thing(above, container=True)])
+    assert len(things) == 3
+    np.testing.assert_allclose(
+        bounds(graph, things[0]), [(-0.15, -0.1, 0.01), (0.15, 0.1, RIM_M)], atol=0.015
+    )
