@@ -98,12 +98,19 @@ def load_frames(video: Path, config: FramesConfig, *, progress: Progress = NO_PR
 def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSet:
     reader = VideoReader(path)
     stats, times, smeared = _measure_video(reader, config, progress)
-    _note_decoding(reader, len(times), progress)
-    usable = _usable_frames(stats, len(times), config, str(path), progress)
-    usable, smeared = _without_smeared(stats, usable, smeared, config, progress)
-    usable = _without_held_out(stats, usable, config, progress)
-    chosen = choose_keyframes(stats, usable, _spacing(config))
-    _require_enough(len(chosen), config, str(path))
+    damage = _note_decoding(reader, len(times), progress)
+    try:
+        usable = _usable_frames(stats, len(times), config, str(path), progress)
+        usable, smeared = _without_smeared(stats, usable, smeared, config, progress)
+        usable = _without_held_out(stats, usable, config, progress)
+        chosen = choose_keyframes(stats, usable, _spacing(config))
+        _require_enough(len(chosen), config, str(path))
+    except InputError as error:
+        if not damage:
+            raise
+        raise InputError(
+            f"{error} But the file is damaged or cut off: {damage}; copy it again first."
+        ) from error
     keep = [stats.indices[row] for row in chosen]
     held = [i for i in range(0, len(times), HELD_OUT_EVERY) if i not in smeared]
     held = _spread(np.array(held, int), config.max_held_out)
@@ -207,19 +214,18 @@ def _decode_chosen(
     return images
 
 
-def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> None:
-    """Tell what the decoder had to work around; refuse files with nothing in them."""
+def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> str:
+    """Tell what the decoder had to work around, and return what is damaged; refuse files with nothing in them."""
     if decoded == 0:
         raise InputError(
             f"frames: no frame of {reader.path} can be decoded. It was cut off or damaged, or its codec "
             "is not supported: copy it again, or convert it to H.264 mp4."
         )
+    damage = ""
     if reader.damaged_packets or decoded < 0.98 * reader.announced_frames:
         announced = f" of {reader.announced_frames} announced" if reader.announced_frames else ""
-        progress.note(
-            f"the file is damaged or cut off: {decoded} frames{announced} could be decoded; "
-            "going on with them"
-        )
+        damage = f"{decoded} frames{announced} could be decoded"
+        progress.note(f"the file is damaged or cut off: {damage}; going on with them")
     if reader.interlaced:
         progress.note("interlaced video: one field of every frame is used")
     if reader.high_dynamic_range:
@@ -228,6 +234,7 @@ def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> Non
         progress.note(
             f"rotated by {360 - 90 * reader.quarter_turns} degrees clockwise, as the file's metadata says"
         )
+    return damage
 
 
 # --- Folders of images ------------------------------------------------------------------------------------

@@ -156,6 +156,14 @@ def test_cut_off_file_works_with_what_is_there(tmp_path):
     assert any("cut off" in n for n in notes)
 
 
+def test_of_a_file_with_hardly_anything_left_the_cut_is_told_first_to_mend(tmp_path):
+    path = tmp_path / "film.mp4"
+    HARD_VIDEOS["cut_off"](path)
+    path.write_bytes(path.read_bytes()[: int(0.2 * path.stat().st_size)])
+    with pytest.raises(InputError, match=r"damaged or cut off: \d+ frames of \d+ announced .* copy it again"):
+        load_frames(path, FramesConfig())
+
+
 def test_frames_after_damage_are_left_out(tmp_path):
     found, notes = hard("damaged", tmp_path)
     check_invariants(found)
