@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from reconstruction.instances.along_walls import bridges_along_walls
 from reconstruction.instances.base import base_skirts
 from reconstruction.instances.boxes import quantiles
 from reconstruction.instances.config import InstancesConfig
@@ -45,6 +46,9 @@ def cut_by_rules(
     rest = np.flatnonzero((owner == 0) & ~hung & ~shell.behind)
     for vertices, number in base_skirts(graph, rest, planes, config.bridge_gap_m):
         owner[vertices] = number
+    view = ColorView.of(shell, frames)
+    for vertices, number in bridges_along_walls(shell, rest[owner[rest] == 0], view, config):
+        owner[vertices] = number
     rest = rest[owner[rest] == 0]
     segmented, crumbs = _without_base_crumbs(graph, segment(graph, rest, config), planes)
     for vertices, number in crumbs:
@@ -55,7 +59,6 @@ def cut_by_rules(
     things = merge_insides(graph, merge_feet(graph, things, progress), progress)
     things = merge_stands(graph, things, progress)
     things = cut_flats(graph, surface, things, posed, depth, config, progress)
-    view = ColorView.of(shell, frames)
     things = cut_foreign(shell, things, owner, view, config, progress)
     things = merge_flush(graph, cut_contents(view, things, config, progress), progress)
     things = without_smears(shell, things, owner, frames, config, progress)

@@ -96,7 +96,7 @@ def without_wall_bumps(
         picture = WallPicture(shell.graph, wall, frames)
         for thing in flat:
             areas = shell.graph.areas[thing.vertices]
-            shows = _shows(shell.graph.points[thing.vertices], picture, frames)
+            shows = shows_wall(shell.graph.points[thing.vertices], picture, frames)
             if id(thing) not in bumps and areas[shows].sum() > _SURE_SHARE * areas.sum():
                 owner[thing.vertices] = shell.entity_id(row)
                 bumps.add(id(thing))
@@ -155,7 +155,7 @@ class WallPicture:
         return np.where(there[:, None], self.at(frame.eye + reach[:, None] * rays), np.nan)
 
 
-def _shows(points: np.ndarray, picture: WallPicture, frames: list[Sighting]) -> np.ndarray:
+def shows_wall(points: np.ndarray, picture: WallPicture, frames: list[Sighting]) -> np.ndarray:
     """Return which points (n, 3) have, in most frames that see them, the color of the wall behind them."""
     like, seen = np.zeros(len(points)), np.zeros(len(points))
     for frame in frames:
@@ -171,7 +171,7 @@ def _smear(
     graph: MeshGraph, body: np.ndarray, wall: FittedPlane, picture: WallPicture, frames: list[Sighting]
 ) -> np.ndarray:  # fmt: skip
     """Return the vertices of a body that show the wall and go on to it."""
-    shows = body[_shows(graph.points[body], picture, frames)]
+    shows = body[shows_wall(graph.points[body], picture, frames)]
     reaching = [
         piece
         for piece in pieces(graph, shows)
