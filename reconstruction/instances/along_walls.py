@@ -55,7 +55,7 @@ def bridges_along_walls(
 def _gaps(
     graph: MeshGraph, body: np.ndarray, shows: np.ndarray, along: np.ndarray, config: InstancesConfig
 ) -> list[tuple[float, float]]:
-    """Return from where to where along a wall there is nothing of a body but what shows the wall, between large parts."""
+    """Return from where to where along a wall a body has, between large parts, nothing but what shows the wall."""
     left = pieces(graph, np.setdiff1d(body, shows, assume_unique=True), config.bridge_gap_m)
     least, ground = _PART_SHARE * graph.areas[body].sum(), graph.points[body, 2].min() + _GROUND_M
     spans = sorted(
