@@ -19,6 +19,7 @@ from reconstruction.surface.mesh_graph import MeshGraph
 _RIMS_M = (0.08, 0.055, 0.035, 0.022, 0.014)  # heights above the support at which a closed ring is looked for
 _RAISED_M = 0.006
 _MAX_RISE_M = 0.3
+_TALL, _COVERED = 0.8, 0.5  # walls of a stack that rises beyond that, as a share of it; share of the inside under its top
 _GAP_M = 0.03  # in a rim, bridged
 _MIN_HOLE_M2 = 0.003
 _MAX_SIDE_M, _MAX_SHARE = 0.8, 0.5  # of a container, and of its support's outline
@@ -69,6 +70,8 @@ class _Plan:
         self.rise = np.full(shape, -1.0)  # of the highest surface in each cell; -1 = none was seen
         low = (self.height < _MAX_RISE_M) & (self.height > -0.03)
         np.maximum.at(self.rise, (self.cells[low, 0], self.cells[low, 1]), self.height[low])
+        self.higher = np.zeros(shape, bool)  # cells with something above what is looked at
+        self.higher[tuple(self.cells[self.height >= _MAX_RISE_M].T)] = True
 
     def containers(self, rim_m: float) -> list[np.ndarray]:
         """Return the outlines, as masks of cells, of what has a closed rim at a height."""
@@ -76,7 +79,7 @@ class _Plan:
         high = self.rise > rim_m
         ring = ndimage.binary_closing(high, _disc(radius)) | high
         filled = ndimage.binary_fill_holes(ring)
-        hollow = filled & ~ring
+        hollow = filled & ~ring & ~self._cut_open(filled & ~ring)
         out = []
         label, count = ndimage.label(filled)
         for number in range(1, count + 1):
@@ -95,6 +98,18 @@ class _Plan:
                 if outline is not None and self._is_container(outline, inside):
                     out.append(outline)
                     break
+        return out
+
+    def _cut_open(self, hollow: np.ndarray) -> np.ndarray:
+        """Return which hollows are the inside of something that rises beyond what is looked at: its top is missing."""
+        label, count = ndimage.label(hollow)
+        out = np.zeros(hollow.shape, bool)
+        for number in range(1, count + 1):
+            hole = label == number
+            around = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~hollow & (self.rise > -1.0)
+            walls = around.any() and np.median(self.rise[around]) > _TALL * _MAX_RISE_M
+            if walls and self.higher[hole].mean() > _COVERED:
+                out |= hole
         return out
 
     def _outline(self, hull: np.ndarray) -> np.ndarray | None:
