@@ -1,6 +1,7 @@
 """Flat things on walls: regions of another color in the wall's fused texture, or slabs just in front of it.
 
-A picture is 1 to 3 cm thick, which is within the noise of the depth; its color is what tells it from the wall.
+A picture is 1 to 3 cm thick, which is within the noise of the depth; its color is what tells it from the wall. It has
+an outline: where the color fades, there is a stain, or light.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from registry.geometry import invert_rigid
 
 _FADED_CELLS = 8
 _DEPTH_M = 0.06  # how far in front of the wall a picture may reach
+_EDGE_M, _LEAST_STEP = 0.03, 0.65  # how wide an outline is, and how much of the contrast is gained across it
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def find_pictures(
     found = []
     for index in range(1, count + 1):
         region = _picture_region(labels == index, texture, hidden, config)
-        if region is None:
+        if region is None or _fades(labels == index, contrast, texture):
             continue
         inside = region[texture.cells[:, 0], texture.cells[:, 1]]
         found.append(np.sort(texture.used[inside]))
@@ -192,6 +194,17 @@ def _picture_region(
     grid = np.zeros(region.shape, np.uint8)
     cv2.fillConvexPoly(grid, np.ascontiguousarray(hull[..., ::-1]), 1)
     return _to_the_edge(ndimage.binary_dilation(grid.astype(bool), iterations=1), texture.seen)
+
+
+def _fades(region: np.ndarray, contrast: np.ndarray, texture: _WallTexture) -> bool:
+    """Tell whether a region has no outline of its own: a stain, or light, whose color fades into the wall's."""
+    reach = max(2, round(_EDGE_M / texture.cell_m))
+    border = region & ~ndimage.binary_erosion(region) & ndimage.binary_erosion(texture.seen, iterations=reach)
+    around = texture.seen & ~region
+    inner = ndimage.maximum_filter(np.where(region, contrast, 0.0), 2 * reach + 1)
+    outer = ndimage.minimum_filter(np.where(around, contrast, np.inf), 2 * reach + 1)
+    step = (inner - outer)[border & np.isfinite(outer)]
+    return bool(len(step)) and float(np.median(step)) < _LEAST_STEP * float(np.median(contrast[region]))
 
 
 def _to_the_edge(region: np.ndarray, seen: np.ndarray) -> np.ndarray:

@@ -20,9 +20,9 @@ TABLE = box((-0.4, -0.35, 0.0), (0.4, 0.35, 0.4), WOOD)
 LOW_TRAY = tray((-0.16, -0.12, 0.4), (0.16, 0.12, 0.44), 0.012, WOOD)
 
 
-def hollows_in(solids):
+def hollows_in(solids, top_m=0.6):
     """Return the hollows on the table, and the graph."""
-    graph = MeshGraph.from_surface(fused([TABLE, *solids], voxel_m=0.007, half_m=0.45, top_m=0.6))
+    graph = MeshGraph.from_surface(fused([TABLE, *solids], voxel_m=0.007, half_m=0.45, top_m=top_m))
     body = np.flatnonzero(graph.points[:, 2] > 0.01)
     top = max(find_supports(graph, body, InstancesConfig()), key=lambda one: one.footprint.area_m2)
     return hollows_on(graph, body, top), graph
@@ -50,6 +50,21 @@ def test_a_low_tray_in_the_color_of_its_table_is_a_container_with_what_is_in_it(
 )
 def test_what_has_no_closed_rim_is_no_container(solids):
     assert hollows_in(solids)[0] == []
+
+
+@pytest.mark.parametrize("tower_top_m", [0.65, 0.8])
+def test_a_tall_stack_beside_a_tray_is_no_hollow(tower_top_m):
+    """Its top may be higher than what is looked at, so that its sides seem to be a rim."""
+    deep = tray((-0.16, -0.12, 0.4), (0.16, 0.12, 0.5), 0.012, WOOD)
+    tower = box((0.165, 0.0, 0.4), (0.3, 0.2, tower_top_m), RED)
+    (found,), graph = hollows_in([*deep, tower], top_m=0.9)
+    low, high = graph.points[found].min(axis=0), graph.points[found].max(axis=0)
+    np.testing.assert_allclose([*low[:2], *high[:2]], [-0.16, -0.12, 0.16, 0.12], atol=0.03)
+
+
+def test_a_bin_under_nothing_is_a_container():
+    (found,), graph = hollows_in(tray((-0.1, -0.1, 0.4), (0.1, 0.1, 0.66), 0.012, GREEN), top_m=0.9)
+    assert np.ptp(graph.points[found, 2]) > 0.2
 
 
 def test_a_tray_is_one_thing_and_carries_what_is_in_it():
