@@ -19,10 +19,8 @@ from reconstruction.surface.mesh_graph import MeshGraph
 _RIMS_M = (0.08, 0.055, 0.035, 0.022, 0.014)  # heights above the support at which a closed ring is looked for
 _RAISED_M = 0.006
 _MAX_RISE_M = 0.3
-_TALL, _COVERED = (
-    0.8,
-    0.5,
-)  # walls of a stack that rises beyond that, as a share of it; share of the inside under its top
+_TALL = 0.8  # of that: the sides of a stack that rises beyond it
+_COVERED = 0.5  # of what they enclose: under the top of the stack
 _GAP_M = 0.03  # in a rim, bridged
 _MIN_HOLE_M2 = 0.003
 _MAX_SIDE_M, _MAX_SHARE = 0.8, 0.5  # of a container, and of its support's outline

@@ -21,6 +21,7 @@ from reconstruction.instances.patches import palette
 _CELL_M = 0.01
 _STEP_M, _AXES = 0.01, np.radians(np.arange(0.0, 180.0, 15.0))
 _CLEAR = 0.3  # of the height: below it are skirts, and the colors of the ground
+_FOOT_M = 0.005  # above it, what goes on across a line is no ground
 _COLORS, _COLOR_GAP = 16, 6.0
 _MOST_COMMON = 0.3  # share of either side's area whose color the other side has, too
 _LEAST_SHARE = 0.12  # of the whole on either side
@@ -55,7 +56,7 @@ def meeting_line(
     for side in (first, ~first):
         if not (side & high).any() or points[side, 2].min() > bottom + _GROUND_M:
             return None
-    if _goes_across(samples, axis, at, (bottom + 0.005, clear)):
+    if _goes_across(samples, axis, at, (bottom + _FOOT_M, clear)):
         return None
     solid = min(solidity(points[side & high, :2]) for side in (first, ~first))
     bay = solid >= _SOLID and solid - solidity(points[high, :2]) >= _BAY
