@@ -7,7 +7,7 @@ from reconstruction.instances.outside import backends, outside_inputs
 from reconstruction.instances.overrides import apply_overrides
 from reconstruction.instances.stage import make_instances
 
-VERSION = 23
+VERSION = 24
 
 __all__ = [
     "INSTANCES_PRESETS",

@@ -45,6 +45,8 @@ def bridges_along_walls(
         for row, picture in zip(walls, view.walls):
             near = body[shell.planes[row].distance(points) < _DEEP_M]
             shows = near[shows_wall(graph.points[near], picture, view.frames)]
+            if not len(shows):
+                continue
             along = graph.points @ plane_axes(shell.planes[row].plane)[0]
             for low, high in _gaps(graph, body, shows, along, config):
                 between = (along[shows] > low - _MARGIN_M) & (along[shows] < high + _MARGIN_M)

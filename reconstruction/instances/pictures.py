@@ -63,8 +63,9 @@ def find_pictures(
     hidden = _hidden_by_furniture(graph, wall, rest, texture)
     found = []
     for index in range(1, count + 1):
-        region = _picture_region(labels == index, texture, hidden, config)
-        if region is None or _fades(labels == index, contrast, texture):
+        patch = labels == index
+        region = _picture_region(patch, texture, hidden, config)
+        if region is None or _fades(patch, contrast, texture):
             continue
         inside = region[texture.cells[:, 0], texture.cells[:, 1]]
         found.append(np.sort(texture.used[inside]))

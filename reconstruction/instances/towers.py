@@ -13,7 +13,7 @@ from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.image_colors import SurfaceSamples
 from reconstruction.instances.outlines import inset
-from reconstruction.instances.two_colors import common_colors
+from reconstruction.instances.two_colors import Paint
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
 
 _LEVELS = (0.5, 0.6, 0.7, 0.8)  # of the height: somewhere there the tall one is alone
@@ -64,7 +64,9 @@ def tower_parts(
             clear = samples.points[:, 2] > bottom + _CLEAR * (low_top - bottom)
             seen = samples.of(clear & np.isfinite(samples.lab[:, 0]))
             upright = inset(outline, seen.points[:, :2]) > -slack
-            common = common_colors(seen, upright)
+            if not len(seen.points):
+                continue
+            common = Paint.of(seen).common(upright)
             if common < best and not _is_sheet(points, areas, ~column, seen.of(~upright), ground):
                 best, found = common, column
     if (

@@ -124,19 +124,14 @@ class Paint:
         return np.bincount(self.color[rows], weights=self.areas[rows], minlength=self.count)
 
     def common(self, side: np.ndarray) -> float:
-        """Return the share of the area of samples on one side (mask) and the other that is of colors that both have."""
+        """Return the share of the area of samples on one side (mask) and the other that is of colors that both have.
+
+        1 where either side is too little to tell.
+        """
+        if min(side.sum(), (~side).sum()) < _MIN_SIDE:
+            return 1.0
         one, two = self.area(side), self.area(~side)
         return float(np.minimum(one / one.sum(), two / two.sum()).sum())
-
-
-def common_colors(samples: SurfaceSamples, side: np.ndarray) -> float:
-    """Return the share of the area of samples on one side (mask) and the other that is of colors that both have.
-
-    1 where either side is too little to tell.
-    """
-    if min(side.sum(), (~side).sum()) < _MIN_SIDE:
-        return 1.0
-    return Paint.of(samples).common(side)
 
 
 def _steps(samples: SurfaceSamples, axis: np.ndarray, at: float, clear: float) -> bool:
