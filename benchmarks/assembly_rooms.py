@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction.synthetic.procedural import RoomSpec, build_procedural_room
-from reconstruction.synthetic.true_assets import true_assets, true_edges
 from reconstruction.types import AssetSet, SceneGraph
 from registry.geometry import rigid
+from synthetic.procedural import RoomSpec, build_procedural_room
+from synthetic.true_assets import true_assets, true_edges
 
 # 1-sigma of what is off: each axis, about level axes, about the vertical.
 SHIFT_M, TILT_DEG, YAW_DEG = 0.004, 1.0, 2.0

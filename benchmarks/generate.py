@@ -14,10 +14,10 @@ import sys
 import time
 from pathlib import Path
 
-from reconstruction.synthetic.benchmark_capture import CaptureSpec, write_capture
-from reconstruction.synthetic.suites import CI_CAPTURES, PRESETS, SUITE, drawn_captures
-from reconstruction.synthetic.walks import WALKS
 from registry.errors import SimReconError, UsageError
+from synthetic.benchmark_capture import CaptureSpec, write_capture
+from synthetic.suites import CI_CAPTURES, PRESETS, SUITE, drawn_captures
+from synthetic.walks import WALKS
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -26,13 +26,13 @@ from reconstruction.scene_graph import (
     region_questions,
     synthesize,
 )
-from reconstruction.synthetic.containers import CONTAINER_KINDS
-from reconstruction.synthetic.procedural import RoomSpec, plan_room, unpainted
-from reconstruction.synthetic.room import Room
-from reconstruction.synthetic.true_assets import true_assets, true_edges
 from reconstruction.types import AssetSet
 from registry.errors import UsageError
 from registry.geometry import rigid
+from synthetic.containers import CONTAINER_KINDS
+from synthetic.procedural import RoomSpec, plan_room, unpainted
+from synthetic.room import Room
+from synthetic.true_assets import true_assets, true_edges
 
 DEFAULT_PAGE = ROOT / "docs" / "scene_graph_benchmark.md"
 MERGINGS = ("online", "naive", "global")

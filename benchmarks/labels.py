@@ -15,10 +15,10 @@ from reconstruction.evaluation.labels import UNKNOWN, Guess, overconfidence, rel
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.synthetic.benchmark_capture import CaptureSpec, stage
-from reconstruction.synthetic.film import film_room, render_truth
-from reconstruction.synthetic.procedural import RoomSpec
 from reconstruction.types import DepthMaps, InstanceSet, PosedFrames, VideoSource
+from synthetic.benchmark_capture import CaptureSpec, stage
+from synthetic.film import film_room, render_truth
+from synthetic.procedural import RoomSpec
 
 SIZES = (16, 24, 30, 12, 22, 24, 30, 16)  # things a room, in turn
 _DEPTH_NOISE, _SAME = 0.004, 0.3

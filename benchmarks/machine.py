@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 _MEASURED = ("reconstruction", "registry")  # what a reconstruction and its evaluation run,
 _NOT_MEASURED = (
     "reconstruction/report",
-    "reconstruction/synthetic",
+    "synthetic",
     "reconstruction/doctor.py",
 )  # without these
 

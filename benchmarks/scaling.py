@@ -46,7 +46,7 @@ def rasterizer_costs(counts: tuple[int, ...]) -> list[dict[str, float]]:
     from reconstruction.gaussians.rasterizer import rasterize, rasterize_backward
     from reconstruction.gaussians.scratch import Scratch
     from reconstruction.gaussians.seeding import seed_from_depth
-    from reconstruction.synthetic.capture import make_test_capture
+    from synthetic.capture import make_test_capture
 
     capture = make_test_capture()
     settings = settings_of(GaussiansConfig(), median_depth_of(capture.depth))

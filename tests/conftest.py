@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from reconstruction.synthetic.capture import SyntheticCapture, make_test_capture
+from synthetic.capture import SyntheticCapture, make_test_capture
 
 DEMO_VIDEO = Path(__file__).parents[1] / "examples" / "data" / "demo_room.mp4"
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # runs from a checkout that is not installed
 
-from reconstruction.synthetic.capture import truth_as_json, write_ground_truth
-from reconstruction.synthetic.film import Sensor, handheld_path, iterate_film, phone_camera, prepare
-from reconstruction.synthetic.room import build_room
-from reconstruction.synthetic.videos import write_video
+from synthetic.capture import truth_as_json, write_ground_truth
+from synthetic.film import Sensor, handheld_path, iterate_film, phone_camera, prepare
+from synthetic.room import build_room
+from synthetic.videos import write_video
 
 WIDTH, HEIGHT, FPS, FRAMES = 640, 480, 12.0, 120
 SENSOR = Sensor(noise=1.4, exposure_drift=0.05, blur_shutter=0.10, blur_samples=2)

@@ -6,8 +6,8 @@ from benchmarks.graph import Disturbance, disturbed, kind_of, main, measure_geom
 from benchmarks.graph_page import KINDS
 from benchmarks.lying import LyingRelations, TrueRelations
 from reconstruction.scene_graph import Question
-from reconstruction.synthetic.procedural import plan_room, unpainted
-from reconstruction.synthetic.true_assets import true_assets, true_edges
+from synthetic.procedural import plan_room, unpainted
+from synthetic.true_assets import true_assets, true_edges
 
 
 def test_rooms_hold_every_kind_of_relation():

@@ -14,10 +14,10 @@ import pytest
 from benchmarks.results import load_result, load_results
 from benchmarks.run import main, run_command
 from reconstruction.pipeline import DEFAULT_STAGE_NAMES
-from reconstruction.synthetic.capture import write_ground_truth
-from reconstruction.synthetic.film import film_room, handheld_path, phone_camera, prepare
-from reconstruction.synthetic.room import build_room
-from reconstruction.synthetic.videos import write_not_a_video, write_video
+from synthetic.capture import write_ground_truth
+from synthetic.film import film_room, handheld_path, phone_camera, prepare
+from synthetic.room import build_room
+from synthetic.videos import write_not_a_video, write_video
 
 ROOT = Path(__file__).resolve().parents[2]
 

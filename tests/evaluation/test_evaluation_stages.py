@@ -12,11 +12,11 @@ from reconstruction.evaluation.planes import planes_figures
 from reconstruction.evaluation.surfaces import sample_seen
 from reconstruction.oracle import Oracle
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.synthetic.capture import SyntheticCapture, make_test_capture, write_ground_truth
-from reconstruction.synthetic.film import prepare
 from reconstruction.types import DepthMaps, Plane
 from registry.errors import UsageError
 from registry.geometry import rigid, split_similarity
+from synthetic.capture import SyntheticCapture, make_test_capture, write_ground_truth
+from synthetic.film import prepare
 
 KINDS = ["table", "carton", "can", "book"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from reconstruction.synthetic.benchmark_capture import write_capture
-from reconstruction.synthetic.suites import CI_CAPTURES
+from synthetic.benchmark_capture import write_capture
+from synthetic.suites import CI_CAPTURES
 
 ROOT = Path(__file__).resolve().parents[2]
 

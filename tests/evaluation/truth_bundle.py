@@ -9,12 +9,12 @@ import numpy as np
 
 from reconstruction.assets.gltf import write_glb, write_obj
 from reconstruction.preview import render_textured
-from reconstruction.synthetic.capture import write_ground_truth
-from reconstruction.synthetic.film import handheld_path, phone_camera, prepare
-from reconstruction.synthetic.room import Entity, Room, build_room
 from reconstruction.types import Camera, ConvexPart, TexturedMesh
 from registry import SceneBundle, seal_bundle
 from registry.geometry import invert_rigid, rigid, split_similarity, transform_points
+from synthetic.capture import write_ground_truth
+from synthetic.film import handheld_path, phone_camera, prepare
+from synthetic.room import Entity, Room, build_room
 
 KINDS = ("table", "shelf", "box", "can", "carton", "book", "tin", "picture")
 FIXED = ("table", "shelf", "picture")

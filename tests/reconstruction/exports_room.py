@@ -8,12 +8,12 @@ from masses import mass_entry
 
 from reconstruction.assets.gltf import read_glb, write_glb, write_obj
 from reconstruction.exports.scene import ExportBody, ExportScene, closed_part, safe_name, uniform_inertia
-from reconstruction.synthetic.checks import bodies
-from reconstruction.synthetic.procedural import RoomSpec, build_procedural_room
 from reconstruction.types import ConvexPart, TexturedMesh
 from registry import SceneBundle, seal_bundle
 from registry.geometry import matrix_from_quat, rigid, transform_points
 from registry.simulation import read_obj_points, standing_primitive
+from synthetic.checks import bodies
+from synthetic.procedural import RoomSpec, build_procedural_room
 
 FLOOR, WALL, TABLE, MUG, BOOK, KNOB, PICTURE, CABINET, LEAF, HANDLE = range(1, 11)
 MOVING = {TABLE, MUG, BOOK, KNOB, LEAF}

@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from local_server import LocalServer, reply
 
-from reconstruction.synthetic.furniture import Workshop
 from registry.geometry import GLTF_FROM_WORLD
+from synthetic.furniture import Workshop
 
 
 def thing_mesh(make, seed: int = 0) -> trimesh.Trimesh:

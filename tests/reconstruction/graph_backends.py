@@ -1,8 +1,8 @@
 """Relation backends for tests: one that knows the truth, and rooms of which everything is known."""
 
 from reconstruction.scene_graph import LocalGraph, Question, SaidEdge
-from reconstruction.synthetic.procedural import RoomSpec, plan_room, unpainted
-from reconstruction.synthetic.room import Room
+from synthetic.procedural import RoomSpec, plan_room, unpainted
+from synthetic.room import Room
 
 FLOOR = 1
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from reconstruction.synthetic.videos import BAD_VIDEOS, HARD_VIDEOS
 from registry import SceneRegistry
+from synthetic.videos import BAD_VIDEOS, HARD_VIDEOS
 
 ROOT = Path(__file__).resolve().parents[2]
 NEEDS_POSES = ("pure_rotation",)  # Refused only after matching, so the test of it is slow.

@@ -17,12 +17,12 @@ from reconstruction.assets.collision.slicing import own_levels
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.solid import Solid, box_solid, from_manifold
 from reconstruction.progress import NO_PROGRESS
-from reconstruction.synthetic import containers, furnishing
-from reconstruction.synthetic.furniture import Workshop
-from reconstruction.synthetic.things import Place, Thing
 from registry.errors import EnvironmentMissing
 from registry.primitives import primitive_of
 from registry.simulation import BodySpec, Physics
+from synthetic import containers, furnishing
+from synthetic.furniture import Workshop
+from synthetic.things import Place, Thing
 
 manifold3d = pytest.importorskip("manifold3d")
 MARBLE_M = 0.005  # radius

@@ -18,7 +18,7 @@ import hashlib
 import numpy as np
 from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.gaussians import GaussiansConfig, make_gaussians
-from reconstruction.synthetic.capture import make_test_capture
+from synthetic.capture import make_test_capture
 
 capture = make_test_capture(8, 160, 120)
 depth = estimate_depth(capture.posed, DepthConfig(depth_side_px=160, sweep_side_px=120, planes=32))

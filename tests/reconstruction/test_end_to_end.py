@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from reconstruction.pipeline import DEFAULT_STAGE_NAMES
-from reconstruction.synthetic.videos import HARD_VIDEOS, standard_film, write_video
 from registry import SceneRegistry
 from registry.geometry import transform_points, umeyama
+from synthetic.videos import HARD_VIDEOS, standard_film, write_video
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.slow

@@ -11,7 +11,8 @@ from PIL import Image
 from reconstruction import frames
 from reconstruction.frames import FRAMES_PRESETS, FramesConfig, load_frames
 from reconstruction.keyframes import FrameStats, MotionMeter, Spacing, choose_keyframes
-from reconstruction.synthetic.videos import (
+from registry.errors import InputError, UsageError
+from synthetic.videos import (
     BAD_VIDEOS,
     HARD_VIDEOS,
     short_film,
@@ -19,7 +20,6 @@ from reconstruction.synthetic.videos import (
     write_4k60,
     write_video,
 )
-from registry.errors import InputError, UsageError
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,8 @@ from reconstruction.assets.generation.pictures import _without_specks
 from reconstruction.assets.generation.records import Records
 from reconstruction.assets.generation.rodin import Rodin
 from reconstruction.assets.generation.service import ServiceLimits
-from reconstruction.synthetic.containers import make_mug
 from registry.errors import EnvironmentMissing, UsageError
+from synthetic.containers import make_mug
 
 LIMITS = ServiceLimits(timeout_s=5.0, max_bytes=2 << 20, pause_s=0.01, poll_s=0.01)
 HTML = (200, {"Content-Type": "text/html"}, b"<html>please sign in</html>")

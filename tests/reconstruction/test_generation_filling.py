@@ -11,8 +11,8 @@ from reconstruction.assets.generation.closing import closed_solid
 from reconstruction.assets.generation.filling import filled_share
 from reconstruction.assets.generation.meshes import read_generated
 from reconstruction.assets.solid import manifold_of
-from reconstruction.synthetic.containers import make_basket, make_bowl, make_crate, make_mug
-from reconstruction.synthetic.furnishing import (
+from synthetic.containers import make_basket, make_bowl, make_crate, make_mug
+from synthetic.furnishing import (
     make_bench,
     make_bookcase,
     make_cabinet,

@@ -8,8 +8,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from reconstruction.assets.registration import SeenSurface, register
-from reconstruction.synthetic.containers import make_bowl, make_mug, make_tray
-from reconstruction.synthetic.furnishing import make_cabinet, make_chair
+from synthetic.containers import make_bowl, make_mug, make_tray
+from synthetic.furnishing import make_cabinet, make_chair
 
 NOISE_M = 0.002
 

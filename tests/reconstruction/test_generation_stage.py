@@ -20,10 +20,10 @@ from reconstruction.assets.solid import to_manifold
 from reconstruction.assets.views import lift_object, prepare_pixels
 from reconstruction.config import PipelineConfig
 from reconstruction.publish import _completion
-from reconstruction.synthetic.containers import make_bowl, make_mug
-from reconstruction.synthetic.furnishing import make_chair
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.geometry import transform_points
+from synthetic.containers import make_bowl, make_mug
+from synthetic.furnishing import make_chair
 
 NAMES = ("can", "bowl", "book")
 EMPTY = Surface(*(np.zeros(0),) * 5, voxel_size_m=0.01, space=None)

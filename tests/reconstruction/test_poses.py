@@ -9,11 +9,11 @@ import pytest
 
 from reconstruction.poses import POSES_PRESETS, PosesConfig, estimate_poses
 from reconstruction.poses.undistort import undistort
-from reconstruction.synthetic.film import pan_path
-from reconstruction.synthetic.videos import short_film
 from reconstruction.types import FrameSet, PosedFrames
 from registry.errors import InputError
 from registry.geometry import split_similarity, umeyama
+from synthetic.film import pan_path
+from synthetic.videos import short_film
 
 
 class Notes:

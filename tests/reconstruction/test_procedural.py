@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruction.synthetic import footprints
-from reconstruction.synthetic.checks import bodies, carried_share, overlaps, validate_room
-from reconstruction.synthetic.furniture import Workshop
-from reconstruction.synthetic.layout import KINDS, Shape
-from reconstruction.synthetic.procedural import RoomSpec, build_procedural_room, furnish, plan_room
-from reconstruction.synthetic.shapes import COARSE, moved, signed_volume
-from reconstruction.synthetic.suites import CI_CAPTURES, PRESETS, SUITE
 from registry.errors import UsageError
 from registry.geometry import rigid
+from synthetic import footprints
+from synthetic.checks import bodies, carried_share, overlaps, validate_room
+from synthetic.furniture import Workshop
+from synthetic.layout import KINDS, Shape
+from synthetic.procedural import RoomSpec, build_procedural_room, furnish, plan_room
+from synthetic.shapes import COARSE, moved, signed_volume
+from synthetic.suites import CI_CAPTURES, PRESETS, SUITE
 
 ROUGH = {"step_m": COARSE, "density": 0.05}  # geometry is the same, only coarsely painted
 

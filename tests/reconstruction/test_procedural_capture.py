@@ -9,13 +9,13 @@ import pytest
 import trimesh
 
 from benchmarks.generate import build_parser, chosen_captures, main
-from reconstruction.synthetic import footprints
-from reconstruction.synthetic.benchmark_capture import CaptureSpec, load_spec, stage, write_capture
-from reconstruction.synthetic.film import iterate_film, render_truth
-from reconstruction.synthetic.procedural import RoomSpec, plan_room
-from reconstruction.synthetic.suites import CI_CAPTURES, PRESETS, SUITE, drawn_captures
-from reconstruction.synthetic.walks import walk_path
 from registry.errors import UsageError
+from synthetic import footprints
+from synthetic.benchmark_capture import CaptureSpec, load_spec, stage, write_capture
+from synthetic.film import iterate_film, render_truth
+from synthetic.procedural import RoomSpec, plan_room
+from synthetic.suites import CI_CAPTURES, PRESETS, SUITE, drawn_captures
+from synthetic.walks import walk_path
 
 SMALL = CaptureSpec(
     RoomSpec(seed=3, objects=6, step_m=0.15, density=0.2),

@@ -18,8 +18,8 @@ from reconstruction.scene_graph import (
 )
 from reconstruction.scene_graph.merge import GraphMerge
 from reconstruction.scene_graph.numbering import id_map, number_things
-from reconstruction.synthetic.true_assets import true_assets, true_edges
 from reconstruction.types import Camera
+from synthetic.true_assets import true_assets, true_edges
 
 TRUTH = {10: FLOOR, 11: 10, 12: 11, 13: 10, 14: 13}
 

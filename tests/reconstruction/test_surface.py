@@ -248,7 +248,7 @@ def test_memory_is_bounded_by_the_slab_not_by_the_scene() -> None:
 
 def test_space_is_told_right_in_a_furnished_room() -> None:
     """Of a generated room with true depth: what is free is known, and nothing within things is called free."""
-    from reconstruction.synthetic.capture import make_test_capture
+    from synthetic.capture import make_test_capture
 
     capture = make_test_capture(16, 240, 180, seed=3)
     space = fuse_surface(capture.posed, capture.depth, SurfaceConfig(voxel_size_m=0.012)).space

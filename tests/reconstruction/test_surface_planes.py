@@ -13,8 +13,8 @@ from reconstruction.evaluation.surfaces import sample_seen
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.surface.base_planes import plane_axes
 from reconstruction.surface.planes import find_planes
-from reconstruction.synthetic.capture import SyntheticCapture, make_test_capture
 from reconstruction.types import SpaceGrid, Surface, SurfacePlane
+from synthetic.capture import SyntheticCapture, make_test_capture
 
 GRAY, BROWN, BLUE = (200, 200, 190), (120, 80, 50), (30, 60, 200)
 CONFIG = SurfaceConfig(voxel_size_m=0.012)

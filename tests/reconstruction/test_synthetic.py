@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from reconstruction.synthetic.capture import make_test_capture, truth_as_json, write_ground_truth
-from reconstruction.synthetic.film import handheld_path, pan_path, phone_camera, prepare
-from reconstruction.synthetic.room import NORTH_M, build_room
-from reconstruction.synthetic.shapes import COARSE, box, lathe, signed_volume
 from registry.geometry import invert_rigid, rigid, transform_points
+from synthetic.capture import make_test_capture, truth_as_json, write_ground_truth
+from synthetic.film import handheld_path, pan_path, phone_camera, prepare
+from synthetic.room import NORTH_M, build_room
+from synthetic.shapes import COARSE, box, lathe, signed_volume
 
 
 @pytest.fixture(scope="module")

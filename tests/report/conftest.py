@@ -23,9 +23,9 @@ from reconstruction.publish import publish_scene
 from reconstruction.report.page import build_page
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.synthetic.capture import make_test_capture
 from reconstruction.types import ScaleEstimate, WorldFrame
 from registry import SceneBundle, SceneRegistry
+from synthetic.capture import make_test_capture
 
 SCENE = "small_room"
 THINGS = ("table", "mug", "box", "picture")

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.synthetic import textures
-from reconstruction.synthetic.containers import CONTAINER_KINDS, VESSEL_KINDS
-from reconstruction.synthetic.furnishing import SIDE_KINDS, WALL_KINDS
-from reconstruction.synthetic.furniture import Workshop
-from reconstruction.synthetic.layout import KINDS, Item, Layout, RoomIsFull, RoomShape
-from reconstruction.synthetic.room import WALL_HEIGHT_M, Entity, Room
-from reconstruction.synthetic.shapes import COARSE, Patch, Solid, box, moved, shifted
-from reconstruction.synthetic.textures import Texture
-from reconstruction.synthetic.things import SMALL_KINDS
 from registry.errors import UsageError
+from synthetic import textures
+from synthetic.containers import CONTAINER_KINDS, VESSEL_KINDS
+from synthetic.furnishing import SIDE_KINDS, WALL_KINDS
+from synthetic.furniture import Workshop
+from synthetic.layout import KINDS, Item, Layout, RoomIsFull, RoomShape
+from synthetic.room import WALL_HEIGHT_M, Entity, Room
+from synthetic.shapes import COARSE, Patch, Solid, box, moved, shifted
+from synthetic.textures import Texture
+from synthetic.things import SMALL_KINDS
 
 _WALL_THICKNESS_M = 0.1
 _ATTEMPTS = 20  # five sufficed for every preset, size and seed that was tried

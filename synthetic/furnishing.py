@@ -5,12 +5,12 @@ Furniture faces -y: its back may stand towards a wall. What hangs has its back a
 
 import numpy as np
 
-from reconstruction.synthetic import textures
-from reconstruction.synthetic.footprints import disc, rectangle
-from reconstruction.synthetic.furniture import Workshop
-from reconstruction.synthetic.shapes import Solid, box, lathe, moved, shifted
-from reconstruction.synthetic.textures import Texture
-from reconstruction.synthetic.things import PALETTE, Kind, Place, Thing, pick_color, prefixed
+from synthetic import textures
+from synthetic.footprints import disc, rectangle
+from synthetic.furniture import Workshop
+from synthetic.shapes import Solid, box, lathe, moved, shifted
+from synthetic.textures import Texture
+from synthetic.things import PALETTE, Kind, Place, Thing, pick_color, prefixed
 
 _WOODS = ((176, 122, 74), (206, 178, 138), (120, 78, 46), (150, 108, 76), (196, 160, 110))
 _OVERLAP_M = 0.004

@@ -10,11 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from reconstruction.synthetic import textures
-from reconstruction.synthetic.footprints import disc, rectangle
-from reconstruction.synthetic.furniture import Model, Workshop
-from reconstruction.synthetic.shapes import Solid, box, grid_patch, lathe, moved
-from reconstruction.synthetic.textures import Texture
+from synthetic import textures
+from synthetic.footprints import disc, rectangle
+from synthetic.furniture import Model, Workshop
+from synthetic.shapes import Solid, box, grid_patch, lathe, moved
+from synthetic.textures import Texture
 
 PALETTE = (
     (196, 52, 48), (222, 122, 46), (232, 190, 70), (122, 160, 66), (52, 128, 88), (56, 132, 150),

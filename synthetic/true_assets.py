@@ -5,8 +5,6 @@ of its own primitives, no hints, no textures.
 import numpy as np
 
 from reconstruction.assembly.base import convex_part
-from reconstruction.synthetic.checks import convex_pieces
-from reconstruction.synthetic.room import Entity, Room
 from reconstruction.types import (
     AssetProvenance,
     AssetSet,
@@ -18,6 +16,8 @@ from reconstruction.types import (
     TexturedMesh,
 )
 from registry.geometry import invert_rigid, transform_points
+from synthetic.checks import convex_pieces
+from synthetic.room import Entity, Room
 
 _TEXTURE = np.full((2, 2, 3), 180, np.uint8)
 _DENSITY_KG_M3, _FRICTION, _RESTITUTION = 600.0, 0.45, 0.1

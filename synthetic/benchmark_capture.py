@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.synthetic.capture import write_ground_truth
-from reconstruction.synthetic.film import FilmSet, Sensor, iterate_film, phone_camera, prepare
-from reconstruction.synthetic.procedural import RoomSpec, furnish, plan_room
-from reconstruction.synthetic.room import Room
-from reconstruction.synthetic.videos import write_video
-from reconstruction.synthetic.walks import walk_path
 from reconstruction.types import Camera
 from registry.errors import UsageError
+from synthetic.capture import write_ground_truth
+from synthetic.film import FilmSet, Sensor, iterate_film, phone_camera, prepare
+from synthetic.procedural import RoomSpec, furnish, plan_room
+from synthetic.room import Room
+from synthetic.videos import write_video
+from synthetic.walks import walk_path
 
 SCHEMA = "simrecon.capture/1"
 _EVALUATED_PIXELS, _EVALUATED_AT = 2000, 640 * 480  # contract, section 4: in proportion to the pixel count

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.synthetic import textures
-from reconstruction.synthetic.furniture import MAKERS, Model, Workshop
-from reconstruction.synthetic.shapes import COARSE, Patch, Solid, box, moved, shifted
-from reconstruction.synthetic.textures import Texture
 from registry.geometry import rigid
+from synthetic import textures
+from synthetic.furniture import MAKERS, Model, Workshop
+from synthetic.shapes import COARSE, Patch, Solid, box, moved, shifted
+from synthetic.textures import Texture
 
 WEST_M, EAST_M, NORTH_M, SOUTH_M = -2.0, 2.1, 1.55, -2.6
 WALL_HEIGHT_M = 2.5

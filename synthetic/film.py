@@ -11,9 +11,9 @@ import numpy as np
 from numba import njit, prange
 
 from reconstruction.rasterize import rasterize_mesh
-from reconstruction.synthetic.room import Room
-from reconstruction.synthetic.textures import Texture
 from reconstruction.types import Camera
+from synthetic.room import Room
+from synthetic.textures import Texture
 
 _LAMP_HEIGHT_M = 2.45
 _SHADOW_BIAS_M = 0.012

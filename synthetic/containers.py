@@ -7,11 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from reconstruction.synthetic import textures
-from reconstruction.synthetic.footprints import disc, rectangle
-from reconstruction.synthetic.furniture import Workshop
-from reconstruction.synthetic.shapes import Solid, box, lathe, shifted, tube
-from reconstruction.synthetic.things import Kind, Place, Thing, pick_color, prefixed
+from synthetic import textures
+from synthetic.footprints import disc, rectangle
+from synthetic.furniture import Workshop
+from synthetic.shapes import Solid, box, lathe, shifted, tube
+from synthetic.things import Kind, Place, Thing, pick_color, prefixed
 
 _SEGMENTS = 48  # of the turned mesh
 _SECTORS = 24  # of its convex pieces; each spans two segments

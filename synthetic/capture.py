@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.synthetic.film import (
+from reconstruction.types import Camera, DepthMaps, FrameSet, PosedFrames, VideoSource
+from registry.geometry import split_similarity, transform_points
+from synthetic.film import (
     FilmSet,
     Sensor,
     film_room,
@@ -21,9 +23,7 @@ from reconstruction.synthetic.film import (
     prepare,
     render_truth,
 )
-from reconstruction.synthetic.room import Entity, Room, build_room
-from reconstruction.types import Camera, DepthMaps, FrameSet, PosedFrames, VideoSource
-from registry.geometry import split_similarity, transform_points
+from synthetic.room import Entity, Room, build_room
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruction.synthetic.benchmark_capture import CaptureSpec
-from reconstruction.synthetic.procedural import RoomSpec
 from registry.errors import UsageError
+from synthetic.benchmark_capture import CaptureSpec
+from synthetic.procedural import RoomSpec
 
 _SMALL = CaptureSpec(frames=50, width=480, height=360, noise=1.4)
 

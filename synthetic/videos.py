@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from reconstruction.synthetic.film import (
+from synthetic.film import (
     FilmSet,
     Sensor,
     film_room,
@@ -20,7 +20,7 @@ from reconstruction.synthetic.film import (
     phone_camera,
     prepare,
 )
-from reconstruction.synthetic.room import build_room
+from synthetic.room import build_room
 
 _TICKS_PER_S = 90000
 

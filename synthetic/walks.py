@@ -4,9 +4,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from reconstruction.synthetic.film import look_at
-from reconstruction.synthetic.layout import RoomShape
 from registry.errors import UsageError
+from synthetic.film import look_at
+from synthetic.layout import RoomShape
 
 WalkKind = Literal["arc", "loop", "two_heights"]
 WALKS: tuple[str, ...] = get_args(WalkKind)

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from reconstruction.synthetic import footprints as plane
-from reconstruction.synthetic.containers import CONTAINER_KINDS, VESSEL_KINDS, make_crate
-from reconstruction.synthetic.furnishing import CENTER_KINDS, SIDE_KINDS, WALL_KINDS
-from reconstruction.synthetic.furniture import Workshop
-from reconstruction.synthetic.shapes import COARSE
-from reconstruction.synthetic.things import SMALL_KINDS, Kind, Place, Thing
 from registry.geometry import invert_rigid, rigid, transform_points
+from synthetic import footprints as plane
+from synthetic.containers import CONTAINER_KINDS, VESSEL_KINDS, make_crate
+from synthetic.furnishing import CENTER_KINDS, SIDE_KINDS, WALL_KINDS
+from synthetic.furniture import Workshop
+from synthetic.shapes import COARSE
+from synthetic.things import SMALL_KINDS, Kind, Place, Thing
 
 KINDS: dict[str, Kind] = {
     **CENTER_KINDS, **SIDE_KINDS, **WALL_KINDS, **CONTAINER_KINDS, **VESSEL_KINDS, **SMALL_KINDS,

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reconstruction.synthetic.room import Entity, Room
 from registry.geometry import invert_rigid, transform_points
+from synthetic.room import Entity, Room
 
 if TYPE_CHECKING:
     import trimesh

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from reconstruction.synthetic import textures
-from reconstruction.synthetic.shapes import Solid, box, lathe, shifted, tube
-from reconstruction.synthetic.textures import Texture
+from synthetic import textures
+from synthetic.shapes import Solid, box, lathe, shifted, tube
+from synthetic.textures import Texture
 
 
 @dataclass
