@@ -4,7 +4,7 @@
     python -m benchmarks.depth dev_clutter --stage gaussians --perturb 5           # mean and spread of five runs
 
 Frames, poses and depth (with `--stage gaussians`, also the Gaussians, whose depth maps are the corrected ones) come
-from the work folders of `python -m benchmarks.run`: what is known there is not computed again. See docs/benchmarking.md.
+from the work folders of `python -m benchmarks.run`: what is there is not done again. See docs/benchmarking.md.
 """
 
 import argparse
@@ -172,9 +172,9 @@ def _truth(
     if truth is None:
         return 1.0, [], {}
     posed = run.results["poses"]
-    views = list(true_views(posed, depth.camera, truth))
-    names = {e.id: e.name for e in truth.entities if not e.base}
-    return similarity(posed, truth).scale, views, names
+    alignment = similarity(posed, truth)
+    views = list(true_views(posed, depth.camera, truth, alignment))
+    return alignment.scale, views, {e.id: e.name for e in truth.entities if not e.base}
 
 
 def report_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -211,7 +211,10 @@ def _cell(row: Mapping[str, Any], key: str, digits: int) -> str:
 
 def _thing_lines(row: Mapping[str, Any]) -> list[str]:
     things = sorted(row.get("things", {}).items(), key=lambda item: item[1]["right"])
-    return [f"  {name:<28} {t['pixels']:>9} px, known {t['known']:6.1%}, right within 2 % {t['right']:6.1%}" for name, t in things]  # fmt: skip
+    return [
+        f"  {name:<28} {found['pixels']:>9} px, known {found['known']:6.1%}, within 2 % {found['right']:6.1%}"
+        for name, found in things
+    ]
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ surface between its pixels, cut at jumps) at the aligned camera. Depths are metr
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ import numpy as np
 from reconstruction.evaluation.alignment import Alignment, align
 from reconstruction.evaluation.ground_truth import GroundTruth
 from reconstruction.evaluation.scene import joined
+from reconstruction.evaluation.stages import sensor_surface
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import Camera, DepthMaps, PosedFrames
-from registry.geometry import transform_points
+from registry.geometry import transform_points, umeyama
 
 FAR_M = 5.0
 OFF = 0.05  # relative error from which a pixel is off
@@ -25,7 +26,10 @@ RING_SIDE_PX = 320  # longer side at which rings around things are drawn
 RING_PX = 4.0
 BEHIND = 1.03  # ratio of depths from which what lies beside a thing is background
 _SENSOR_STEP_PX, _SENSOR_JUMP = 2, 0.03
-_FEWEST_RING_THING_PX = 20
+_FEWEST_RING_THING_PX = 20  # in one frame
+_FEWEST_THING_PX = 1000  # in all frames: of a sliver, one frame decides
+_SURE_POINT_PX, _SENSOR_VOXEL_M, _FEWEST_POINTS = 1.0, 0.02, 100
+_ROUNDS, _FIRST_REACH_M, _LAST_REACH_M, _SHRINK = 150, 0.2, 0.03, 0.93
 _PICTURE_ERROR = 0.10
 
 
@@ -39,21 +43,49 @@ class TrueView:
 
 
 def similarity(posed: PosedFrames, truth: GroundTruth) -> Alignment:
-    """Return what takes the poses' space to the true world, by the camera centers of all frames."""
+    """Return what takes the poses' space to the true world, by the camera centers of all frames.
+
+    A depth camera is another camera than the one that films, and paths are short: there, the sparse points of the
+    poses, which no depth setting changes, are then laid onto what the depth camera measured.
+    """
     indices = [*posed.indices, *posed.held_out_indices]
     poses = [*posed.world_from_camera, *posed.held_out_world_from_camera]
-    return align({int(i): p for i, p in zip(indices, poses)}, truth.world_from_camera, truth.up)
+    by_centers = align({int(i): p for i, p in zip(indices, poses)}, truth.world_from_camera, truth.up)
+    if truth.entities or not truth.indices("depth"):
+        return by_centers
+    sure = np.asarray(posed.points)[np.asarray(posed.point_errors_px) < _SURE_POINT_PX]
+    surface = sensor_surface(truth, _SENSOR_VOXEL_M).points
+    return replace(by_centers, true_from_estimated=laid_onto(sure, surface, by_centers.true_from_estimated))
 
 
-def true_views(posed: PosedFrames, camera: Camera, truth: GroundTruth) -> Iterable[TrueView]:
+def laid_onto(points: np.ndarray, surface: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the similarity (4, 4) that lays points (n, 3) onto a surface's points (m, 3), from a first guess.
+
+    In every round each point is drawn to the nearest of the surface, if it is within 20 cm at first, 3 cm at last.
+    """
+    from scipy.spatial import cKDTree
+
+    tree, matrix = cKDTree(surface), start
+    for k in range(_ROUNDS):
+        far, nearest = tree.query(transform_points(matrix, points))
+        near = far < max(_LAST_REACH_M, _FIRST_REACH_M * _SHRINK**k)
+        if near.sum() < _FEWEST_POINTS:
+            return start
+        matrix = umeyama(points[near], surface[nearest[near]])
+    return matrix
+
+
+def true_views(
+    posed: PosedFrames, camera: Camera, truth: GroundTruth, alignment: Alignment
+) -> Iterable[TrueView]:
     """Draw the truth at every keyframe, as large as the depth maps.
 
     Args:
         posed: keyframes in any space.
         camera: of the depth maps.
         truth: with entities, or with a depth camera's pictures; nothing is drawn where it has neither.
+        alignment: of `similarity`.
     """
-    alignment = similarity(posed, truth)
     if truth.entities:
         yield from _drawn_meshes(posed, camera, truth, alignment)
     elif truth.indices("depth"):
@@ -163,7 +195,8 @@ def depth_figures(
     if seen:
         total = np.sum(list(seen.values()), axis=0)
         out["on_things"] = float(total[2] / total[0])
-        out["on_things_each"] = float(np.mean([c[2] / c[0] for c in seen.values()]))
+        each = [c[2] / c[0] for c in seen.values() if c[0] >= _FEWEST_THING_PX]
+        out["on_things_each"] = float(np.mean(each)) if each else None
         out["ring"], out["ring_px"] = float(ring[1] / max(ring[0], 1)), int(ring[0])
         out["things"] = {
             names[i]: {"pixels": int(c[0]), "known": float(c[1] / c[0]), "right": float(c[2] / c[0])}

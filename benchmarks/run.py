@@ -25,8 +25,10 @@ from benchmarks.captures import Capture, find_captures
 from benchmarks.command import KEPT_RESULTS, guarded
 from benchmarks.machine import ROOT, describe_code, describe_machine
 from benchmarks.results import Result, Status, last_line, load_result, load_results, result_path, save_result
+from benchmarks.spread import save_spreads
 from benchmarks.table import DEFAULT_OUT, DEFAULT_PAGE, write_page
-from benchmarks.variants import VARIANTS, Variant, choose_variants, home_of, scene_id
+from benchmarks.variants import VARIANTS, Variant, choose_variants, home_of, perturbed_variants, scene_id
+from registry.errors import UsageError
 
 _ERROR_LINES = 20
 _GRACE_S = 60.0  # for a command to stop after Ctrl-C
@@ -43,6 +45,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_arguments(parser)
     parser.add_argument("--page", type=Path, default=DEFAULT_PAGE, metavar="FILE", help="the page to write")
+    parser.add_argument(
+        "--perturb",
+        type=int,
+        default=1,
+        metavar="N",
+        help="N runs of each variant, depth maps changed in their last bits: mean and spread of every figure",
+    )
     return parser
 
 
@@ -86,10 +95,15 @@ def _run(arguments: argparse.Namespace) -> int:
     captures = find_captures(arguments.captures, arguments.only)
     names = arguments.variants or ([] if arguments.variant else ["default"])
     variants = choose_variants(names, arguments.variant)
+    if arguments.perturb < 1:
+        raise UsageError(f"--perturb {arguments.perturb}: at least one run is needed")
+    runs = [run for variant in variants for run in perturbed_variants(variant, arguments.perturb)]
     out = arguments.out.resolve()
-    failed = measure_scenes(captures, variants, out, arguments)
+    failed = measure_scenes(captures, runs, out, arguments)
     if not arguments.dry_run:
-        write_page(load_results(out), arguments.page, describe_code())
+        results = load_results(out)
+        save_spreads(results, out)
+        write_page(results, arguments.page, describe_code())
         print(f"{arguments.page} is written", flush=True)
     return 1 if failed else 0
 

@@ -12,7 +12,8 @@ from string import Template
 
 from benchmarks.columns import GROUPS, ORACLE, PAPER, PAPER_ROWS, REAL, Column
 from benchmarks.machine import ROOT, describe_code, machine_line
-from benchmarks.results import Result, load_results
+from benchmarks.results import Result, last_line, load_results
+from benchmarks.spread import PooledResult, Spread, pool, save_spreads, spread_of
 from benchmarks.variants import BASELINE, VARIANTS, is_oracle
 from reconstruction.profiling import cost_rows
 from registry.errors import SimReconError, UsageError
@@ -59,14 +60,20 @@ def write_page(results: Sequence[Result], page: Path, code: dict) -> None:
 
 def render_page(results: Sequence[Result], code: dict) -> str:
     """Return the page's Markdown."""
-    results = sorted(results, key=_order)
+    results = sorted(pool(results), key=_order)
     keys = {id(result): f"r{number}" for number, result in enumerate(results, start=1)}
     full = [result for result in results if result.truth == "scene"]
     real = [result for result in results if result.truth != "scene"]
     stale = sum(result.sources != code["sources"] for result in results)
     state = f"{stale} of {len(results)} runs are of an older state of the code and marked †." if stale else ""
+    counts = sorted({len(result.runs) for result in results if isinstance(result, PooledResult)})
+    if counts:
+        state += (
+            f" Cells with ± are mean ± standard deviation of {' or '.join(map(str, counts))} runs that differ in the "
+            "last bits of their depth maps."
+        )
     return Template(_TEMPLATE.read_text()).substitute(
-        state=state,
+        state=state.strip(),
         baseline=BASELINE,
         means=_means(full) if full else _NOTHING,
         paper=_paper(),
@@ -149,7 +156,20 @@ def _mean_cell(group: Sequence[Result], column: Column, done: int, notes: Notes)
     if count < done:
         without = [r.capture for r in group if not r.failed and r.metrics.get(column.key) is None]
         return column.shown(mean) + notes.mark(f"without {', '.join(without)}, which have no such figure")
-    return column.shown(mean)
+    return column.shown(mean) + _plus_minus(_spread_of_means(group, column.key), column)
+
+
+def _spread_of_means(group: Sequence[Result], key: str) -> Spread | None:
+    """Return how the mean over captures varies from run to run; None unless all captures ran equally often."""
+    runs = [result.runs if isinstance(result, PooledResult) else (result,) for result in group]
+    if len({len(of) for of in runs}) != 1:
+        return None
+    return spread_of([mean_of(same, key)[0] for same in zip(*runs)])
+
+
+def _plus_minus(spread: Spread | None, column: Column) -> str:
+    """Return ± standard deviation as the column shows it, nothing where there was one run."""
+    return f" ± {column.shown(spread.sd)}" if spread is not None and spread.runs > 1 else ""
 
 
 # -- The paper -----------------------------------------------------------------------------------------------------
@@ -243,6 +263,11 @@ def _rows(
     for result in results:
         first = [result.capture] if with_capture else []
         label = result.variant + (notes.mark(_flat(result.reason(""))) if result.failed else "")
+        lost = [run for run in result.runs if run.failed] if isinstance(result, PooledResult) else []
+        if lost and not result.failed:
+            label += notes.mark(
+                _flat(f"{len(lost)} of {len(result.runs)} runs failed: {last_line(lost[0].error)}")
+            )
         cells = [*first, label, keys[id(result)]]
         rows.append(cells + _cells(result, columns, notes))
     heads = [*(["capture"] if with_capture else []), "variant", "run", *(column.head for column in columns)]
@@ -255,10 +280,11 @@ def _cells(result: Result, columns: Sequence[Column], notes: Notes) -> list[str]
     cells = []
     for column in columns:
         value = result.metrics.get(column.key)
-        missing = value is None
-        cells.append(
-            "–" + notes.mark(_flat(result.reason(column.key))) if missing else column.shown(float(value))
-        )
+        if value is None:
+            cells.append("–" + notes.mark(_flat(result.reason(column.key))))
+            continue
+        spread = result.spread(column.key) if isinstance(result, PooledResult) else None
+        cells.append(column.shown(float(value)) + _plus_minus(spread, column))
     return cells
 
 
@@ -273,7 +299,7 @@ def _runs(results: Sequence[Result], keys: dict[int, str], code: dict) -> str:
         [
             keys[id(result)],
             result.capture,
-            result.variant,
+            result.variant + (f", {len(result.runs)} runs" if isinstance(result, PooledResult) else ""),
             str(machines.index(machine_line(result.machine)) + 1),
             result.commit
             + (" + changes" if result.dirty else "")
@@ -306,6 +332,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         results = load_results(arguments.out)
         if not results:
             raise UsageError(f"{arguments.out}: no results; make some with python -m benchmarks.run")
+        save_spreads(results, arguments.out)
         write_page(results, arguments.page, describe_code())
     except SimReconError as error:
         print(f"benchmarks: {error}", file=sys.stderr)

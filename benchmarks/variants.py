@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.captures import TRUTH_ORDER, Capture, Truth
@@ -51,6 +51,7 @@ VARIANTS: tuple[Variant, ...] = (
     _oracle("instances", "scene", "instances"),
     _oracle("all", "scene", "poses", "depth", "world", "instances"),
 )
+_RUN_MARK = "+p"  # between a variant's name and a run's seed; names of variants have no plus
 BASELINE = "default"  # what the tables compare the other variants with
 
 
@@ -88,9 +89,34 @@ def choose_variants(names: Sequence[str], extra: Sequence[str]) -> list[Variant]
     return list(chosen.values())
 
 
+def perturbed_variants(variant: Variant, runs: int) -> list[Variant]:
+    """Return a variant and `runs - 1` more whose depth maps differ from its own in the last bits only.
+
+    One that is given the true depth stays alone: nothing is estimated there that could be changed.
+    """
+    if "--oracle" in variant.arguments:
+        given = variant.arguments[variant.arguments.index("--oracle") + 1].split(",")
+        if "depth" in given:
+            return [variant]
+    return [variant] + [
+        replace(
+            variant,
+            name=f"{variant.name}{_RUN_MARK}{seed}",
+            arguments=(*variant.arguments, "--set", f"depth.perturb={seed}"),
+        )
+        for seed in range(1, runs)
+    ]
+
+
+def run_of(name: str) -> tuple[str, int]:
+    """Return the variant that a run is of, and the seed of its perturbation (0: none), by the run's name."""
+    variant, mark, seed = name.partition(_RUN_MARK)
+    return (variant, int(seed)) if mark else (name, 0)
+
+
 def scene_id(variant: Variant) -> str:
     """Return the id under which the variant's scene is registered."""
-    return variant.name.lower().replace("-", "_")
+    return variant.name.lower().replace("-", "_").replace("+", "__")
 
 
 def home_of(out: Path, capture: Capture) -> Path:

@@ -109,11 +109,27 @@ def make_test_capture(
     depth, ids = np.stack([d for d, _ in truth]), np.stack([i for _, i in truth])
     numbers = np.arange(len(path), dtype=np.int32)
     keep, held = numbers[numbers % 10 != 0], numbers[numbers % 10 == 0]
-    fps = 12.0
+    posed = posed_capture(camera, path, images, depth, f"synthetic-room-{seed}.mp4", held)
+    confidence = np.where(depth[keep] > 0, 2, 0).astype(np.uint8)
+    return SyntheticCapture(posed, DepthMaps(camera, depth[keep], confidence), ids[keep], depth[held], room)
+
+
+def posed_capture(
+    camera: Camera,
+    path: np.ndarray,
+    images: np.ndarray,
+    depth: np.ndarray,
+    name: str,
+    held_out: Sequence[int] = (),
+    fps: float = 12.0,
+) -> PosedFrames:
+    """Return a film (n frames, true cameras and depth) as the poses stage would, with corners as sparse points."""
+    held = np.asarray(held_out, np.int32)
+    keep = np.setdiff1d(np.arange(len(path), dtype=np.int32), held)
     points, colors, observations = _sparse_points(camera, path[keep], images[keep], depth[keep])
     digest = hashlib.sha256(images.tobytes()).hexdigest()
-    source = VideoSource(f"synthetic-room-{seed}.mp4", digest, width, height, fps, len(path), len(path) / fps)
-    posed = PosedFrames(
+    source = VideoSource(name, digest, camera.width, camera.height, fps, len(path), len(path) / fps)
+    return PosedFrames(
         source=source,
         camera=camera,
         images=images[keep],
@@ -133,8 +149,6 @@ def make_test_capture(
         ordered=True,
         reprojection_error_px=0.3,
     )
-    confidence = np.where(depth[keep] > 0, 2, 0).astype(np.uint8)
-    return SyntheticCapture(posed, DepthMaps(camera, depth[keep], confidence), ids[keep], depth[held], room)
 
 
 def _sparse_points(

@@ -14,6 +14,8 @@ from synthetic import footprints as plane
 from synthetic.containers import CONTAINER_KINDS, VESSEL_KINDS, make_crate
 from synthetic.furnishing import CENTER_KINDS, SIDE_KINDS, WALL_KINDS
 from synthetic.furniture import Workshop
+from synthetic.furniture_families import CLOTH_KINDS, hang_range_m, kind_named
+from synthetic.room import WALL_HEIGHT_M
 from synthetic.shapes import COARSE
 from synthetic.things import SMALL_KINDS, Kind, Place, Thing
 
@@ -21,7 +23,7 @@ KINDS: dict[str, Kind] = {
     **CENTER_KINDS, **SIDE_KINDS, **WALL_KINDS, **CONTAINER_KINDS, **VESSEL_KINDS, **SMALL_KINDS,
     "crate": Kind("crate", make_crate, weight=0.8),
 }  # fmt: skip
-"""Everything that a procedural room may hold."""
+"""What a household room holds; more comes from families (`kind_of`)."""
 
 _WALK_AWAY_M = 0.78  # of the camera from the middle group, as a person stands at a table
 _WALK_HALF_M = 0.36  # half the width of the band that stays free
@@ -30,6 +32,12 @@ _WALL_YAW = {"wall_north": 0.0, "wall_west": np.pi / 2, "wall_south": np.pi, "wa
 _EDGE_M, _IN_CONTAINER_M, _ABOVE_M = 0.012, 0.008, 0.01
 _TRIES = 60
 _LIKED = {"board": 4.0}  # wall shelves are small, but nobody hangs one to leave it empty
+
+
+def kind_of(key: str) -> Kind:
+    """Return a kind by its name in rooms: of a household, or of a family."""
+    kind = KINDS.get(key)
+    return kind_named(key) if kind is None else kind
 
 
 class RoomIsFull(Exception):
@@ -46,10 +54,15 @@ class RoomShape:
     north: float
     walls: tuple[str, ...]
     half: tuple[float, float]  # semi-axes of the walk around the origin
+    facing_rad: float = 0.0  # turns the walk: 0 comes from the south (-y), positive from further east
+    free_deg: tuple[float, float] = (-180.0, 180.0)  # angles of the walk that stay free, before `facing_rad`
+    wall_height_m: float = WALL_HEIGHT_M
+    surface_m: float = 0.5  # height of the main support, where the camera should look
+    layout: str = "walk_around"
 
     def walk(self, angle_rad: np.ndarray, outwards_m: float = 0.0) -> np.ndarray:
         """Return points (n, 2) of the walk, a rounded rectangle, at these angles seen from the middle."""
-        c, s = np.cos(angle_rad), np.sin(angle_rad)
+        c, s = np.cos(angle_rad + self.facing_rad), np.sin(angle_rad + self.facing_rad)
         a, b = self.half[0] + outwards_m, self.half[1] + outwards_m
         radius = (np.abs(c / a) ** 2.4 + np.abs(s / b) ** 2.4) ** (-1 / 2.4)
         return np.stack([radius * c, radius * s], -1)
@@ -86,6 +99,14 @@ class Item:
     contact: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # world (k, 2)
     mass: tuple[float, np.ndarray] = (0.0, np.zeros(3))  # volume in m3, its middle in the world
     children: list[tuple["Item", Place]] = field(default_factory=list)
+    bodies: tuple[
+        tuple[np.ndarray, float, float], ...
+    ] = ()  # (silhouette, bottom, top) of parts; (): the whole
+    near: bool = False  # main furniture, where most things go
+
+    def solids(self) -> tuple[tuple[np.ndarray, float, float], ...]:
+        """Return the silhouettes and the world heights that other things must keep clear of."""
+        return self.bodies or ((self.silhouette, self.bottom_m, self.top_m),)
 
     def ancestors(self) -> list["Item"]:
         """Return what it stands on, from near to far."""
@@ -115,9 +136,21 @@ class Shape:
         corners = np.concatenate([p.vertices[p.faces] for part in model.parts for p in part])
         volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
         center = (volume[:, None] * corners.sum(1) / 4).sum(0) / volume.sum()
+        silhouette = plane.convex_hull(points[:, :2])
         foot = plane.convex_hull(points[points[:, 2] < points[:, 2].min() + 1e-6, :2])
+        if len(foot) < 3 or plane.area(foot) < 1e-6:  # it touches in a point or along a line
+            foot = silhouette.mean(0) + 0.4 * (silhouette - silhouette.mean(0))
         low, high = points.min(0), points.max(0)
-        return cls(model, plane.convex_hull(points[:, :2]), foot, low, high, float(volume.sum()), center)
+        return cls(model, silhouette, foot, low, high, float(volume.sum()), center)
+
+    def bodies(self, pose: np.ndarray) -> tuple[tuple[np.ndarray, float, float], ...]:
+        """Return silhouette, bottom and top of every part in the world."""
+        yaw, out = np.arctan2(pose[1, 0], pose[0, 0]), []
+        for part in self.model.parts:
+            points = np.concatenate([p.vertices for p in part])
+            outline = plane.turned(plane.convex_hull(points[:, :2]), yaw, *pose[:2, 3])
+            out.append((outline, pose[2, 3] + points[:, 2].min(), pose[2, 3] + points[:, 2].max()))
+        return tuple(out)
 
 
 class Layout:
@@ -135,11 +168,11 @@ class Layout:
     def draw(self, keys: Iterable[str]) -> tuple[str, tuple[int, ...], Shape]:
         """Draw a kind, rather one that is not in the room yet, and make its coarse model."""
         keys = list(keys)
-        weights = np.array([KINDS[k].weight * 0.4 ** self._counts.get(k, 0) for k in keys])
+        weights = np.array([kind_of(k).weight * 0.4 ** self._counts.get(k, 0) for k in keys])
         key = keys[int(self.rng.choice(len(keys), p=weights / weights.sum()))]
         self._drawn += 1
         stream = (*self.seed, self._drawn)
-        coarse = KINDS[key].make(Workshop(np.random.default_rng(stream), COARSE, 0.01), "")
+        coarse = kind_of(key).make(Workshop(np.random.default_rng(stream), COARSE, 0.01), "")
         return key, stream, Shape.of(coarse)
 
     def _add(self, key, stream, shape: Shape, parent, support, pose, **more) -> Item:
@@ -173,15 +206,61 @@ class Layout:
         south = -north if "wall_south" in walls else -(half[1] + 0.7)
         self.shape = RoomShape(-east, east, south, north, walls, half)
 
-    def furnish_side(self, keys: Iterable[str]) -> None:
+    def stand(
+        self, drawn: tuple[str, tuple[int, ...], Shape], yaw: float, x: float, y: float, **more
+    ) -> Item:
+        """Stand a drawn piece on the floor at a chosen place."""
+        key, stream, shape = drawn
+        pose = _upright(yaw, x, y, 0.0)
+        return self._add(key, stream, shape, None, "floor", pose, bodies=shape.bodies(pose), **more)
+
+    def may_stand(self, shape: Shape, yaw: float, x: float, y: float, gap_m: float = 0.03) -> bool:
+        """Check that a piece stays in the room, off the camera's way and clear of what stands there."""
+        room = self._room()
+        outline = plane.turned(shape.silhouette, yaw, x, y)
+        if np.any(outline.min(0) < (room.west, room.south)) or np.any(
+            outline.max(0) > (room.east, room.north)
+        ):
+            return False
+        return self._off_the_walk(outline) and self.is_clear(shape.bodies(_upright(yaw, x, y, 0.0)), gap_m)
+
+    def is_clear(self, bodies: tuple[tuple[np.ndarray, float, float], ...], gap_m: float) -> bool:
+        """Check parts of a piece against all furniture, part by part."""
+        for outline, bottom, top in bodies:
+            for other in self.items:
+                if bottom > other.top_m or top < other.bottom_m:
+                    continue
+                if plane.distance(outline, other.silhouette) >= gap_m:
+                    continue
+                for theirs, low, high in other.solids():
+                    if bottom < high + 0.01 and low < top + 0.01 and plane.distance(outline, theirs) < gap_m:
+                        return False
+        return True
+
+    def _off_the_walk(self, outline: np.ndarray) -> bool:
+        """Check an outline against the band where the camera goes."""
+        room = self._room()
+        low, high = np.radians(room.free_deg)
+        ways = room.walk(np.linspace(low, high, 60))
+        steps = np.roll(outline, -1, axis=0) - outline
+        away = ways[:, None] - outline
+        share = np.clip(np.sum(away * steps, -1) / np.maximum(np.sum(steps**2, -1), 1e-12), 0, 1)
+        gap = np.linalg.norm(away - share[..., None] * steps, axis=-1).min()
+        inside = (steps[:, 0] * away[..., 1] - steps[:, 1] * away[..., 0] > 0).all(1).any()
+        return bool(gap > min(_WALK_HALF_M, 0.6 * min(room.half)) and not inside)
+
+    def furnish_side(self, keys: Iterable[str], walls: tuple[str, ...] = ()) -> None:
         """Stand a piece with its back to a wall, off the camera's way."""
         shape_of_room = self._room()
+        turned = shape_of_room.free_deg != (-180.0, 180.0)
+        among = walls or shape_of_room.walls
         angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
         band = plane.convex_hull(shape_of_room.walk(angles, _WALK_HALF_M))
         key, stream, shape = self.draw(keys)
         for _ in range(4 * _TRIES):
-            wall = shape_of_room.walls[int(self.rng.integers(len(shape_of_room.walls)))]
-            spread = np.radians(20.0 if key in ("stool", "chair", "crate") else 2.0)
+            wall = among[int(self.rng.integers(len(among)))]
+            loose = key.rsplit("_", 1)[-1] in ("stool", "chair", "crate", "pouf")
+            spread = np.radians(20.0 if loose else 2.0)
             yaw = _WALL_YAW[wall] + self.rng.uniform(-spread, spread)
             middle, length = shape_of_room.wall(wall)
             along = np.array([np.cos(_WALL_YAW[wall]), np.sin(_WALL_YAW[wall])])
@@ -190,9 +269,14 @@ class Layout:
             back = float((outline @ -inwards).max()) + self.rng.uniform(0.02, 0.05)
             at = middle + inwards * back + along * self.rng.uniform(-0.5, 0.5) * length
             outline = outline + at
-            if not self._in_room(outline, at) or plane.distance(outline, band) < 0:
+            if not self._in_room(outline, at):
                 continue
-            if all(plane.distance(outline, other.silhouette) > 0.1 for other in self.items):
+            if not self._off_the_walk(outline) if turned else plane.distance(outline, band) < 0:
+                continue
+            if all(
+                plane.distance(outline, other.silhouette) > 0.1 or other.bottom_m > shape.high[2] + 0.1
+                for other in self.items
+            ):
                 self._add(key, stream, shape, None, "floor", _upright(yaw, *at, 0.0))
                 return
         raise RoomIsFull(key)
@@ -208,10 +292,23 @@ class Layout:
         # An open side is where the camera comes from: what stands beside it would never be seen.
         return bool(inside.all()) and ("wall_south" in room.walls or at[1] > -0.35 * room.half[1])
 
+    def hang_at(
+        self, drawn: tuple[str, tuple[int, ...], Shape], wall: str, x: float, y: float, z: float
+    ) -> Item:
+        """Hang a drawn thing on a wall at a chosen place."""
+        key, stream, shape = drawn
+        return self._add(
+            key, stream, shape, None, wall, _upright(_WALL_YAW[wall], x, y, z), hangs=True, bodies=()
+        )
+
     def hang(self, keys: Iterable[str]) -> None:
         """Hang a thing on a wall, clear of what stands below."""
         room = self._room()
         key, stream, shape = self.draw(keys)
+        low_high = hang_range_m(key)
+        if low_high is not None:
+            self._hang_family((key, stream, shape), low_high)
+            return
         high = 0.92 if key == "wall_shelf" else 0.86
         for _ in range(4 * _TRIES):
             wall = room.walls[int(self.rng.integers(len(room.walls)))]
@@ -234,7 +331,70 @@ class Layout:
                 return
         raise RoomIsFull(key)
 
+    def _hang_family(
+        self, drawn: tuple[str, tuple[int, ...], Shape], low_high: tuple[float, float]
+    ) -> None:  # fmt: skip
+        """Hang a thing at the height that its kind asks for, clear of what stands in front or hangs there."""
+        room, shape = self._room(), drawn[2]
+        top = room.wall_height_m - float(shape.high[2]) - 0.01
+        low, high = (min(v, top) for v in low_high)
+        if top < 0:
+            raise RoomIsFull(drawn[0])
+        half = float(np.abs(shape.silhouette[:, 0]).max())
+        for _ in range(3 * _TRIES):
+            wall = room.walls[int(self.rng.integers(len(room.walls)))]
+            middle, length = room.wall(wall)
+            along = np.array([np.cos(_WALL_YAW[wall]), np.sin(_WALL_YAW[wall])])
+            reach = length / 2 - half - 0.05
+            at = middle + along * self.rng.uniform(-1, 1) * max(reach, 0.0)
+            z = float(self.rng.uniform(low, high)) if high > low else low
+            if reach < 0 or ("wall_south" not in room.walls and at[1] < -0.35 * room.half[1]):
+                continue
+            outline = plane.turned(shape.silhouette, _WALL_YAW[wall], *at)
+            end = z + float(shape.high[2])
+            clear = all(
+                plane.distance(outline, o.silhouette) > 0.06
+                or (not o.hangs and z > o.top_m + 0.2)
+                or (o.hangs and (z > o.top_m + 0.06 or end < o.bottom_m - 0.06))
+                for o in self.items
+            )
+            if clear and (low > 0.7 or self._off_the_walk(outline)):
+                self.hang_at(drawn, wall, *at, z)
+                return
+        raise RoomIsFull(drawn[0])
+
     # Things
+
+    def lay_cloth(self) -> bool:
+        """Lay a cloth on a free level support; False where none fits."""
+        options = [
+            (item, place) for item, place, _ in self.open_places()
+            if place.sag is None and not np.isfinite(place.headroom_m) and plane.area(place.area) > 0.12
+            and not any(p is place for _, p in item.children)
+        ]  # fmt: skip
+        if not options:
+            return False
+        weights = np.array([plane.area(p.area) * (3.0 if i.near else 1.0) for i, p in options])
+        owner, place = options[int(self.rng.choice(len(options), p=weights / weights.sum()))]
+        for key in CLOTH_KINDS:
+            for _ in range(3):
+                key, stream, shape = self.draw([key])
+                for _ in range(12):
+                    yaw = 0.5 * np.pi * int(self.rng.integers(2)) + np.radians(self.rng.uniform(-8, 8))
+                    outline = plane.turned(shape.silhouette, yaw)
+                    low, high = place.area.min(0) - outline.min(0), place.area.max(0) - outline.max(0)
+                    x, y = self.rng.uniform(np.minimum(low, high), np.maximum(low, high))
+                    outline = outline + (x, y)
+                    if plane.depth_inside(outline, place.area) < 0.003:
+                        continue
+                    pose = owner.pose @ _upright(yaw, x, y, place.height_m)
+                    item = self._add(
+                        key, stream, shape, owner, owner.name, pose, level=0, contact=outline,
+                        ceiling_m=owner.ceiling_m, near=owner.near,
+                    )  # fmt: skip
+                    owner.children.append((item, place))
+                    return True
+        return False
 
     def put(
         self, keys: Iterable[str], places: Callable[[], list[tuple[Item, Place, float]]], kinds_tried: int = 6
@@ -263,7 +423,7 @@ class Layout:
     def _try(self, shape: Shape, owner: Item, place: Place) -> tuple[np.ndarray, np.ndarray] | None:
         """Drop a thing at random on a place; (pose, contact) where it may stay."""
         height = float(shape.high[2])
-        bottom = float(owner.pose[2, 3]) + place.height_m
+        bottom = float(owner.pose[2, 3]) + place.height_m + _lowest(place)
         headroom = min(place.headroom_m, owner.ceiling_m - bottom)
         if height + _ABOVE_M > headroom or (place.inside and height > place.rim_m + 0.17):
             return None
@@ -279,7 +439,8 @@ class Layout:
         overhangs = place.stack and place.rim_m == 0
         if not overhangs and plane.depth_inside(outline, place.area) < margin:
             return None
-        pose = owner.pose @ _upright(yaw, x, y, place.height_m)
+        lift = 0.0 if place.sag is None else _rest_height(place, plane.turned(shape.foot, yaw, x, y))
+        pose = owner.pose @ _upright(yaw, x, y, place.height_m + lift)
         turn = np.arctan2(pose[1, 0], pose[0, 0])
         world = plane.turned(shape.silhouette, turn, *pose[:2, 3])
         foot = plane.turned(shape.foot, turn, *pose[:2, 3])
@@ -332,8 +493,13 @@ class Layout:
         for other in self.items:
             if any(other is b for b in below) or bottom > other.top_m or top + _ABOVE_M < other.bottom_m:
                 continue
-            if plane.distance(outline, other.silhouette) < gap:
-                return False
+            if plane.distance(outline, other.silhouette) >= gap:
+                continue
+            for theirs, low, high in other.solids():
+                if bottom > high or top + _ABOVE_M < low:
+                    continue
+                if plane.distance(outline, theirs) < gap:
+                    return False
         return True
 
     def open_places(self) -> list[tuple[Item, Place, float]]:
@@ -345,7 +511,7 @@ class Layout:
             for place in item.model.places:
                 used = sum(1.6 * plane.area(c.silhouette) for c, p in item.children if p is place)
                 left = max(plane.area(place.area) - used, 0.02)
-                near = 2.0 if item.key in CENTER_KINDS else 1.0
+                near = 2.0 if item.near or item.key in CENTER_KINDS else 1.0
                 out.append((item, place, near * left * _LIKED.get(place.name, 1.0)))
         return out
 
@@ -367,6 +533,29 @@ class Layout:
             if item.level < self.max_stack or item.level == 0:
                 out += [(item, p, 0.2 ** len(item.children)) for p in item.model.places if p.inside]
         return out
+
+
+def _lowest(place: Place) -> float:
+    """Return how far an uneven support goes down."""
+    if place.sag is None:
+        return 0.0
+    x, y = _samples(place.area)
+    return float(np.min(place.sag(x, y)))
+
+
+def _rest_height(place: Place, foot: np.ndarray) -> float:
+    """Return where a foot rests on an uneven support: soft things give, so it sinks into the highest folds."""
+    x, y = _samples(foot)
+    assert place.sag is not None
+    return float(np.percentile(place.sag(x, y), 60))
+
+
+def _samples(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (x, y) spread over a convex polygon: its corners and rings towards its middle."""
+    middle = polygon.mean(0)
+    edge = np.concatenate([polygon, 0.5 * (polygon + np.roll(polygon, -1, axis=0))])
+    points = np.concatenate([middle + share * (edge - middle) for share in (0.0, 0.35, 0.7, 1.0)])
+    return points[:, 0], points[:, 1]
 
 
 def _upright(yaw: float, x: float, y: float, z: float) -> np.ndarray:

@@ -4,17 +4,21 @@
 ground truth and the tests treat both alike.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from registry.errors import UsageError
 from synthetic import textures
+from synthetic.arrangements import LAYOUTS, arrange
 from synthetic.containers import CONTAINER_KINDS, VESSEL_KINDS
 from synthetic.furnishing import SIDE_KINDS, WALL_KINDS
 from synthetic.furniture import Workshop
-from synthetic.layout import KINDS, Item, Layout, RoomIsFull, RoomShape
-from synthetic.room import WALL_HEIGHT_M, Entity, Room
+from synthetic.furniture_families import FURNITURE_FAMILIES, role_of, shape_families, shape_keys
+from synthetic.layout import KINDS, Item, Layout, RoomIsFull, RoomShape, kind_of
+from synthetic.room import Entity, Room
 from synthetic.shapes import COARSE, Patch, Solid, box, moved, shifted
 from synthetic.textures import Texture
 from synthetic.things import SMALL_KINDS
@@ -61,9 +65,32 @@ class RoomSpec:
     """Fineness of the drawn surface, which carries the light."""
     density: float = 1.0
     """Factor on the resolution of all textures; 1 suits 640x480."""
+    families: tuple[str, ...] = ()
+    """Families of small things (`shape_families`) that are mixed in."""
+    furniture: tuple[str, ...] = ()
+    """Families of furniture (`furniture_families`) that are mixed in."""
+    household: bool = True
+    """Use the household's own kinds, too, where a family offers kinds."""
+    layout: str = "walk_around"
+    """How the furniture stands: one of `arrangements.LAYOUTS`."""
+    uneven: float = 0.0
+    """Share of the supports that get a cloth in folds."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
+        for name in ("families", "furniture"):  # JSON knows lists only
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name, known in (
+            ("layout", LAYOUTS),
+            ("furniture", FURNITURE_FAMILIES),
+            ("families", shape_families() if self.families else ()),
+        ):
+            value = getattr(self, name)
+            unknown = sorted({value} - set(known) if name == "layout" else set(value) - set(known))
+            if unknown:
+                raise UsageError(f"RoomSpec: {name}={', '.join(unknown)}, there are {', '.join(known)}")
+        if self.layout == "bedroom" and "beds" not in self.furniture:
+            raise UsageError("RoomSpec: layout=bedroom needs furniture with 'beds'")
         if self.objects < 3 or self.max_stack < 1 or self.walls not in (3, 4):
             raise UsageError(
                 f"RoomSpec: objects={self.objects} (3 or more), max_stack={self.max_stack} (1 or more), "
@@ -76,9 +103,17 @@ class RoomSpec:
             "side_furniture",
             "textureless_share",
             "crowding",
+            "uneven",
         ):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"RoomSpec: {name}={getattr(self, name)}, expected a share between 0 and 1")
+
+    @property
+    def classic(self) -> bool:
+        """Return whether the room is furnished from the household alone, around tables in the middle."""
+        return (
+            self.layout == "walk_around" and not self.families and not self.furniture and self.uneven == 0
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -111,6 +146,8 @@ def plan_room(spec: RoomSpec) -> RoomPlan:
 
 def _fill(spec: RoomSpec, room: Layout) -> Layout:
     """Furnish, hang, then place things from the large to what lies on and in others."""
+    if not spec.classic:
+        return _fill_from_families(spec, room)
     count = spec.objects
     middle = 1 if count <= 16 else 2
     hanging = min(round(spec.wall_things * count), count - middle - 1)
@@ -146,6 +183,74 @@ def _fill(spec: RoomSpec, room: Layout) -> Layout:
     return room
 
 
+@dataclass(frozen=True)
+class _Stock:
+    """Which small things a room may hold, by what they are used for."""
+
+    containers: tuple[str, ...]
+    supports: tuple[str, ...]
+    stacked: tuple[str, ...]
+    contents: tuple[str, ...]
+    free: tuple[str, ...]
+
+
+@cache
+def _stock(families: tuple[str, ...], household: bool) -> _Stock:
+    keys = shape_keys(families)
+    by_role = {key: role_of(key) for key in keys}
+
+    def mix(roles: tuple[str, ...], own: tuple[str, ...]) -> tuple[str, ...]:
+        offered = tuple(key for key in keys if by_role[key] in roles)
+        return (*offered, *(own if household or not offered else ()))
+
+    return _Stock(
+        mix(("container",), tuple(CONTAINER_KINDS)),
+        mix(("support",), _SUPPORTS),
+        mix(("support", "content", "free"), _STACKED),
+        mix(("content", "rolls"), _CONTENTS),
+        mix(("support", "content", "free"), _FREE),
+    )
+
+
+def _fill_from_families(spec: RoomSpec, room: Layout) -> Layout:
+    """Furnish as the layout says, then place things; what finds no place where it was meant for goes elsewhere."""
+    arrange(spec, room)
+    stock = _stock(spec.families, spec.household)
+    small = spec.objects - len(room.items)
+    containers = min(round(spec.containers * spec.objects), small // 2)
+    available = small - 2 * containers
+    stacked = min(round(spec.stacks * small), available * (spec.max_stack - 1) // spec.max_stack)
+    supports = -(-stacked // (spec.max_stack - 1)) if stacked else 0
+    holders = containers + sum(item.key == "crate" for item in room.items)
+    left = small - containers - stacked - supports
+    inside = min(int(sum(room.rng.integers(1, 4) for _ in range(holders))), left)
+    for _ in range(containers):
+        _put(room, stock, stock.containers, room.open_places)
+    for _ in range(supports):
+        _put(room, stock, stock.supports, room.open_places)
+    for _ in range(stacked):
+        _put(room, stock, stock.stacked, room.stack_places)
+    for _ in range(inside):
+        _put(room, stock, stock.contents, room.container_places)
+    for _ in range(left - inside):
+        _put(room, stock, stock.free, room.open_places)
+    return room
+
+
+def _put(room: Layout, stock: _Stock, keys: tuple[str, ...], places: Callable[[], list]) -> None:
+    """Put a thing where it is meant to be, else anywhere, else something smaller."""
+    for among, where, tried in (
+        (keys, places, 4), (stock.free, room.open_places, 5), (stock.contents, room.container_places, 2),
+        (stock.free, room.stack_places if room.max_stack > 1 else room.open_places, 4),
+    ):  # fmt: skip
+        try:
+            room.put(among, where, tried)
+            return
+        except RoomIsFull:
+            continue
+    raise RoomIsFull("small things")
+
+
 def build_procedural_room(spec: RoomSpec) -> Room:
     """Return a furnished room with true geometry and relations."""
     return furnish(plan_room(spec))
@@ -159,7 +264,7 @@ def furnish(plan: RoomPlan) -> Room:
     ids = {e.name: e.id for e in entities}
     chosen = rng.permutation(len(plan.items))[: round(spec.textureless_share * len(plan.items))]
     for number, item in enumerate(plan.items):
-        kind = KINDS[item.key]
+        kind = kind_of(item.key)
         shop = Workshop(np.random.default_rng(item.stream), 0.7 * spec.step_m, spec.density)
         fine = kind.make(shop, f"{item.name}/")
         painted = (
@@ -195,11 +300,11 @@ def _entity(item: Item, number: int, parent: int, patches: tuple[Patch, ...]) ->
     return Entity(
         id=number,
         name=item.name,
-        label=KINDS[item.key].label,
+        label=kind_of(item.key).label,
         base=False,
         relation="attached_to" if item.hangs else "supported_by",
         parent=parent,
-        fixed=KINDS[item.key].fixed,
+        fixed=kind_of(item.key).fixed,
         size=tuple(np.ptp(points, axis=0).tolist()),
         world_from_object=item.pose,
         solids=tuple(moved(part, item.pose) for part in item.model.parts),
@@ -231,7 +336,7 @@ def _base_entity(number: int, name: str, label: str, coarse: Solid, fine: tuple[
 def _base_solids(shape: RoomShape, step_m: float) -> list[tuple[str, str, Solid]]:
     """Return (name, label, solid) of floor and walls: slabs whose inner faces are the planes."""
     wall_step = step_m if step_m >= COARSE else max(step_m, min(3 * step_m, 0.12))  # light on walls is soft
-    t, high = _WALL_THICKNESS_M, WALL_HEIGHT_M
+    t, high = _WALL_THICKNESS_M, shape.wall_height_m
     wide, deep = shape.east - shape.west, shape.north - shape.south
     x, y = (shape.west + shape.east) / 2, (shape.south + shape.north) / 2
     floor = box((wide + 2 * t, deep + 2 * t, t), {"+z": "floor", "*": "edge"}, step_m)
@@ -258,13 +363,24 @@ _WALL_TONES = (
 )
 
 
+_FLOOR_TONES = (
+    (150, 132, 112),
+    (196, 190, 180),
+    (92, 90, 90),
+    (172, 136, 96),
+    (120, 76, 52),
+    (126, 138, 128),
+)
+
+
 def _base_looks(plan: RoomPlan, rng: np.random.Generator) -> dict[str, Texture]:
     shape, density = plan.shape, plan.spec.density
     names = ("floor", *shape.walls)
     if plan.spec.blank_walls:
         looks = {}
         for name in names:
-            tone = (150, 132, 112) if name == "floor" else _WALL_TONES[int(rng.integers(len(_WALL_TONES)))]
+            tones = _FLOOR_TONES[: 1 if plan.spec.classic else None] if name == "floor" else _WALL_TONES
+            tone = tones[int(rng.integers(len(tones)))] if len(tones) > 1 else tones[0]
             looks[name] = textures.plain(tone)
         return looks | {"edge": textures.plain((120, 120, 120))}
     wide, deep = shape.east - shape.west + 0.2, shape.north - shape.south + 0.2
@@ -281,5 +397,5 @@ def _base_looks(plan: RoomPlan, rng: np.random.Generator) -> dict[str, Texture]:
         tone = _WALL_TONES[int(order[number])]
         paper = number == int(order[-1]) % len(shape.walls)
         maker = textures.wallpaper if paper else textures.plaster
-        looks[name] = maker(rng, long, WALL_HEIGHT_M, 340 * density, tone)
+        looks[name] = maker(rng, long, shape.wall_height_m, 340 * density, tone)
     return looks

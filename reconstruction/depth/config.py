@@ -53,6 +53,18 @@ class DepthConfig:
     min_speckle_px: int = 60
     """Smaller islands of measured depth are dropped."""
 
+    prior: Literal["none", "aggregation"] = "none"
+    """The network that aggregates the costs (docs/priors.md); "none": semi-global aggregation."""
+
+    prior_surety: float = 0.5
+    """Probability from which the network's depth is asked for where windows measure nothing."""
+
+    prior_agree_depth: float = 0.03
+    """Relative depth difference up to which two views predict the same."""
+
+    prior_agree_px: float = 4.0
+    """Reprojection error up to which they do, at depth resolution."""
+
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""
 
@@ -70,6 +82,9 @@ class DepthConfig:
 
     seed: int = 0
     """Seed of the random sampling of planes."""
+
+    perturb: int = 0
+    """Seed of noise in the last bits of the finished maps, to measure what chance does to figures; 0 = none."""
 
 
 DEPTH_PRESETS: dict[str, DepthConfig] = {

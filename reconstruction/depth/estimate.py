@@ -7,6 +7,7 @@ import numpy as np
 
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.monocular import MonocularBackend, fill_from_predictions, load_monocular
+from reconstruction.depth.perturb import perturbed
 from reconstruction.depth.views import ViewPlan, plan_views
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import Camera, DepthMaps, PosedFrames
@@ -23,7 +24,7 @@ def sized_camera(camera: Camera, side: int) -> Camera:
     return camera.resized(max(16, round(camera.width * scale)), max(16, round(camera.height * scale)))
 
 
-def _gray(images: np.ndarray, camera: Camera) -> np.ndarray:
+def gray_images(images: np.ndarray, camera: Camera) -> np.ndarray:
     """Return float32 gray levels minus 128 (n, h, w) at the camera's resolution."""
     import cv2
 
@@ -66,7 +67,7 @@ class _Workers:
                 progress.advance()
 
 
-def _sweep(i, gray, posed, camera: Camera, plan: ViewPlan, rhos: np.ndarray, noise: float) -> np.ndarray:
+def sweep_frame(i, gray, posed, camera: Camera, plan: ViewPlan, rhos: np.ndarray, noise: float) -> np.ndarray:
     """Return the cost uint8 (h, w, planes) of every inverse depth at every pixel, each part by its own sources."""
     from reconstruction.depth.sweep import REACH_PX, sweep_costs
 
@@ -84,33 +85,51 @@ def _sweep(i, gray, posed, camera: Camera, plan: ViewPlan, rhos: np.ndarray, noi
     return cost
 
 
-def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers, progress):
-    """Sweep, aggregate and refine every frame; return inverse depth and correlation (n, h, w)."""
-    import cv2
-
-    from reconstruction.depth.edges import sharpen_edges
-    from reconstruction.depth.refine import fit_slopes, refine
+def winner_of(cost: np.ndarray, gray: np.ndarray, rhos: np.ndarray, config: DepthConfig) -> np.ndarray:
+    """Return the inverse depth float32 (h, w) that semi-global aggregation of a cost volume (h, w, planes) chooses."""
     from reconstruction.depth.sgm import aggregate, winner
 
+    p1 = np.int32(max(1, round(127 * config.smooth_small)))
+    p2 = np.int32(round(127 * config.smooth_large))
+    total = np.zeros(cost.shape, np.uint16)
+    aggregate(cost, gray, p1, p2, p1 + np.int32(1), 8.0, total)
+    out = np.empty(cost.shape[:2], np.float32)
+    winner(total, rhos, out)
+    return out
+
+
+def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers, progress):
+    """Sweep, aggregate and refine every frame; return inverse depth, correlation and surety (n, h, w).
+
+    Surety is the learned aggregation's probability of the surface, 0 without it.
+    """
+    import cv2
+
+    from reconstruction.depth.aggregation import aggregate_costs
+    from reconstruction.depth.edges import sharpen_edges
+    from reconstruction.depth.refine import fit_slopes, refine
+
+    learned = config.prior != "none"
     small = sized_camera(camera, config.sweep_side_px)
-    fine_gray, small_gray = _gray(posed.images, camera), _gray(posed.images, small)
+    fine_gray, small_gray = gray_images(posed.images, camera), gray_images(posed.images, small)
     shape = (camera.height, camera.width)
     rho_all = np.zeros((len(fine_gray), *shape), np.float32)
     score_all = np.full((len(fine_gray), *shape), -1.0, np.float32)
-    p1 = np.int32(max(1, round(127 * config.smooth_small)))
-    p2 = np.int32(round(127 * config.smooth_large))
+    surety_all = np.zeros(rho_all.shape, np.float32)
+    fine_size = (camera.width, camera.height)
 
     def work(i: int) -> None:
         parts = list(plan.parts_with_sources(i, *shape))
         if not parts:
             return
         rhos = np.linspace(1.0 / plan.far[i], 1.0 / plan.near[i], config.planes)
-        cost = _sweep(i, small_gray, posed, small, plan, rhos, config.noise_gray)
-        total = np.zeros(cost.shape, np.uint16)
-        aggregate(cost, small_gray[i], p1, p2, p1 + np.int32(1), 8.0, total)
-        coarse = np.empty((small.height, small.width), np.float32)
-        winner(total, rhos, coarse)
-        rho = cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+        cost = sweep_frame(i, small_gray, posed, small, plan, rhos, config.noise_gray)
+        if learned:
+            coarse, sure = aggregate_costs(cost, _small_color(posed.images[i], small), rhos)
+            surety_all[i] = cv2.resize(sure, fine_size, interpolation=cv2.INTER_NEAREST)
+        else:
+            coarse = winner_of(cost, small_gray[i], rhos, config)
+        rho = predicted = cv2.resize(coarse, fine_size, interpolation=cv2.INTER_NEAREST)
         warps = [(fine_gray[sources], *_warps(posed, camera, i, sources)) for _, sources in parts]
         fitted, gx, gy = (np.empty(shape, np.float32) for _ in range(3))
         score = np.full(shape, -1.0, np.float32)
@@ -121,12 +140,15 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
                 refine(
                     fine_gray[i], seen, h_inf, shift, fitted, gx, gy, step_px, config.noise_gray, bounds, rho, score
                 )  # fmt: skip
+        score_all[i] = score
+        if learned:  # where windows say nothing, the network does
+            rho_all[i] = np.where(score >= 0.6 * config.min_correlation, rho, predicted)
+            return
         fit_slopes(rho, 0.012, fitted, gx, gy)
         sharpen_edges(rho, gx, gy, score, _small_color(posed.images[i], camera), rho_all[i])
-        score_all[i] = score
 
     workers.each(len(fine_gray), work, "measuring depth", progress)
-    return rho_all, score_all
+    return rho_all, score_all, surety_all
 
 
 def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthConfig, workers, progress):
@@ -153,6 +175,47 @@ def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthCon
     return fused, count
 
 
+def _believe(
+    posed,
+    camera: Camera,
+    plan: ViewPlan,
+    raw,
+    surety,
+    depth,
+    confidence,
+    config: DepthConfig,
+    workers,
+    progress,
+) -> None:
+    """Take predicted depth where the network is sure and several views predict the same, in place, as completed."""
+    from reconstruction.depth.consistency import check_view, count_witnesses, remove_speckles
+
+    k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    said = np.where((depth > 0) | (surety < config.prior_surety), depth, raw)
+    weight = np.where(depth > 0, 1.0, surety).astype(np.float32)
+    taken = np.zeros(depth.shape, np.float32)
+
+    def work(i: int) -> None:
+        rows = plan.neighbors[i]
+        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
+        count, fused = np.zeros(depth.shape[1:], np.uint8), np.zeros(depth.shape[1:], np.float32)
+        check_view(
+            i, rows, said, weight, relative, k, config.prior_agree_depth, config.prior_agree_px, count, fused
+        )
+        asked = (depth[i] == 0) & (said[i] > 0)
+        agree, through = np.zeros_like(count), np.zeros_like(count)
+        count_witnesses(
+            i, rows, said, asked, relative, k, 1.0 + 2 * config.prior_agree_depth, 0.015, agree, through
+        )
+        taken[i] = np.where(asked & (count >= config.min_agreeing) & (count > through), fused, 0)
+        together = np.where(depth[i] > 0, depth[i], taken[i])
+        taken[i] *= remove_speckles(together, config.min_speckle_px, 0.03)
+
+    workers.each(len(depth), work, "comparing predictions", progress)
+    depth[taken > 0] = taken[taken > 0]
+    confidence[taken > 0] = 1
+
+
 def _resolve(
     posed, camera: Camera, plan: ViewPlan, depth, confidence, score, config: DepthConfig, workers, progress
 ):
@@ -161,7 +224,7 @@ def _resolve(
     from reconstruction.depth.outlines import mark_doubt, resolve_edges
     from reconstruction.depth.refine import fit_slopes
 
-    gray = _gray(posed.images, camera)
+    gray = gray_images(posed.images, camera)
     shape = (camera.height, camera.width)
     moved, trust = np.zeros_like(depth), confidence.copy()
     doubts = np.zeros(depth.shape, bool)
@@ -236,7 +299,7 @@ def estimate_depth(
     camera = sized_camera(posed.camera, config.depth_side_px)
     plan = plan_views(posed, config)
     workers = _Workers(config.threads)
-    rho, score = _measure(posed, camera, plan, config, workers, progress)
+    rho, score, surety = _measure(posed, camera, plan, config, workers, progress)
     raw = np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0).astype(np.float32)
     depth, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
     confidence = np.where(depth > 0, 2, 0).astype(np.uint8)
@@ -246,6 +309,8 @@ def estimate_depth(
             f"depth: only {100 * share:.1f} % of the pixels could be measured. The frames are blurred, blank or do "
             "not move sideways: film textured things with steady sideways motion and enough light."
         )
+    if config.prior != "none":
+        _believe(posed, camera, plan, raw, surety, depth, confidence, config, workers, progress)
     if config.complete:
         from reconstruction.depth.complete import complete_depth
 
@@ -259,4 +324,6 @@ def estimate_depth(
     progress.note(
         f"depth: {100 * share:.0f} % of the pixels measured, {100 * float((confidence == 1).mean()):.0f} % completed"
     )
+    if config.perturb:
+        depth = perturbed(depth, config.perturb)
     return DepthMaps(camera, depth, confidence)

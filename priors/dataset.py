@@ -1,0 +1,180 @@
+"""Film generated rooms, run the pipeline's depth on them, and keep what it measured beside the truth.
+
+    python -m priors.dataset OUT --rooms 200 [--split train] [--seed 0] [--frames 20] [--photographs DIR]
+                             [--until costs|winner|depth|gaussians|surface] [--cameras noisy|true] [--processes 2]
+
+Every room is a folder `OUT/<split>/<number>` of arrays (see `priors.samples.ARRAYS`), written whole or not at all: kill
+and start again at any time. `manifest.json` lists every room with its families and the SHA-256 of its arrays.
+"""
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import sys
+import time
+import traceback
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from priors.rooms import SPLITS, Film, draw_film
+from registry.errors import InputError, UsageError
+
+WIDTH, HEIGHT = 480, 360
+UNTIL = ("costs", "winner", "depth", "gaussians", "surface")
+_KEYFRAMES_PER_FILM = 70  # of a whole walk, as the frames stage chooses them
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command."""
+    options = _parser().parse_args(arguments)
+    rooms = [(options, number) for number in range(options.seed, options.seed + options.rooms)]
+    folder = options.out / options.split
+    missing = [job for job in rooms if not (folder / f"{job[1]:05d}" / "room.json").is_file()]
+    print(f"{folder}: {len(rooms) - len(missing)} of {len(rooms)} rooms are there", flush=True)
+    started, failed = time.perf_counter(), 0
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(options.processes, _prepare_process, maxtasksperchild=20) as pool:
+        for done, line in enumerate(pool.imap_unordered(_make_room, missing), start=1):
+            failed += "FAILED" in line
+            each = (time.perf_counter() - started) / done
+            print(
+                f"{done}/{len(missing)} {line} ({(len(missing) - done) * each / 60:.0f} min left)", flush=True
+            )
+    write_manifest(options.out)
+    return 1 if failed else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m priors.dataset", description=__doc__.split("\n\n")[0])
+    parser.add_argument("out", type=Path, help="folder of the dataset")
+    parser.add_argument(
+        "--split", choices=SPLITS, default="train", help="which families (default: %(default)s)"
+    )
+    parser.add_argument("--rooms", type=int, default=100, help="how many (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="number of the first room (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=20, help="keyframes a room (default: %(default)s)")
+    parser.add_argument("--photographs", type=Path, help="folder of pictures that materials may show")
+    parser.add_argument("--until", choices=UNTIL, default="depth", help="last stage (default: %(default)s)")
+    parser.add_argument(
+        "--cameras", choices=("noisy", "true"), default="noisy",
+        help="noisy: moved by what estimated cameras are typically off by (default)",
+    )  # fmt: skip
+    parser.add_argument("--processes", type=int, default=2, help="rooms at once (default: %(default)s)")
+    return parser
+
+
+def _prepare_process() -> None:
+    """One thread a process, and patience with everything else on the machine."""
+    import cv2
+    import numba
+
+    os.nice(10)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    numba.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+def _make_room(job: tuple[argparse.Namespace, int]) -> str:
+    options, number = job
+    try:
+        return _write_room(options, number)
+    except (InputError, UsageError) as error:  # a draw that no layout fits: the next number is another room
+        return f"{options.split}/{number:05d}: left out, {error}"
+    except Exception:  # one room's fault must not end a night's work
+        return f"{options.split}/{number:05d}: FAILED\n{traceback.format_exc()}"
+
+
+def _write_room(options: argparse.Namespace, number: int) -> str:
+    final = options.out / options.split / f"{number:05d}"
+    part = final.with_name(final.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    started = time.process_time()
+    film = draw_film(options.split, number, _KEYFRAMES_PER_FILM, photographs=options.photographs)
+    arrays = measure_film(film, options.frames, options.cameras, options.until)
+    digests = {}
+    for name, array in arrays.items():
+        np.save(part / f"{name}.npy", array)
+        digests[name] = hashlib.sha256((part / f"{name}.npy").read_bytes()).hexdigest()
+    about = {
+        "split": options.split, "number": number, "frames": options.frames, "cameras": options.cameras,
+        "until": options.until, "film": film.describe(), "sha256": digests,
+    }  # fmt: skip
+    (part / "room.json").write_text(json.dumps(about, indent=1) + "\n")
+    shutil.rmtree(final, ignore_errors=True)
+    part.rename(final)
+    return f"{options.split}/{number:05d}: {time.process_time() - started:.0f} s of one core"
+
+
+def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str, np.ndarray]:
+    """Film a stretch of a walk and measure it; arrays by name, at sweep resolution (h, w) unless said otherwise."""
+    import cv2
+
+    from reconstruction.depth import DepthConfig, estimate_depth
+    from reconstruction.depth.aggregation import bin_costs
+    from reconstruction.depth.estimate import gray_images, sized_camera, sweep_frame, winner_of
+    from reconstruction.depth.views import plan_views
+    from synthetic.capture import posed_capture
+    from synthetic.film import film_room, render_truth
+
+    camera, path = film.camera(WIDTH, HEIGHT), film.stretch(frames)
+    images = film_room(
+        film.film_set, camera, path, film.sensor, seed=film.number, supersample=film.supersample
+    )
+    truth = [render_truth(film.film_set, camera, pose) for pose in path]
+    depth, ids = np.stack([d for d, _ in truth]), np.stack([i for _, i in truth])
+    posed = posed_capture(camera, path, images, depth, f"room-{film.number}.mp4")
+    if cameras == "noisy":
+        posed = replace(posed, world_from_camera=film.shaken(path))
+    config = DepthConfig(threads=1)
+    small = sized_camera(camera, config.sweep_side_px)
+    plan = plan_views(posed, config)
+    gray = gray_images(posed.images, small)
+    size = (small.width, small.height)
+    costs, winners = [], []
+    for row in range(frames):
+        rhos = np.linspace(1.0 / plan.far[row], 1.0 / plan.near[row], config.planes)
+        cost = sweep_frame(row, gray, posed, small, plan, rhos, config.noise_gray)
+        costs.append(bin_costs(cost))
+        if until != "costs":
+            winners.append(1.0 / winner_of(cost, gray[row], rhos, config))
+    exact = [render_truth(film.film_set, small, pose) for pose in path]
+    out = {
+        "color": np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images]),
+        "cost": np.stack(costs),
+        "true_depth": np.stack([d for d, _ in exact]).astype(np.float32),
+        "true_ids": np.stack([i for _, i in exact]),
+        "range": np.stack([plan.far, plan.near], 1),
+        "world_from_camera": path,
+        "intrinsics": np.array([small.fx, small.fy, small.cx, small.cy]),
+    }
+    if until == "costs":
+        return out
+    out["winner"] = np.stack(winners).astype(np.float32)
+    if until == "winner":
+        return out
+    maps = estimate_depth(posed, config)
+    out |= {"depth": maps.depth.astype(np.float16), "confidence": maps.confidence}
+    if until in ("gaussians", "surface"):
+        out |= _measure_surface(film, posed, maps, until)
+    return out
+
+
+def _measure_surface(film: Film, posed, maps, until: str) -> dict[str, np.ndarray]:
+    raise SystemExit("later")
+
+
+def write_manifest(out: Path) -> None:
+    """Write `manifest.json`: every finished room with its families and the hashes of its arrays."""
+    rooms = [json.loads(file.read_text()) for file in sorted(out.glob("*/*/room.json"))]
+    whole = hashlib.sha256(json.dumps(rooms, sort_keys=True).encode()).hexdigest()
+    (out / "manifest.json").write_text(json.dumps({"sha256": whole, "rooms": rooms}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

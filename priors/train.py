@@ -1,0 +1,254 @@
+"""Train the aggregation network on a dataset of rooms, and export its weights.
+
+    python -m priors.train CONFIG.yaml [--resume]
+
+Stop it at any time: `--resume` (or the same command again) goes on from the last checkpoint with the same samples as
+if it had not been stopped. On a CPU all is float32; where there is CUDA, bfloat16 under autocast. Curves:
+`tensorboard --logdir OUT`. The weights that are best on the held-out splits are written to `OUT/best.safetensors`.
+"""
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from torch.nn import functional
+
+from priors.samples import Room, draw_sample, load_sample, open_rooms, stack
+from reconstruction.depth.network import OFFSETS_PX, WIDTHS, Aggregation, place_of
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What is trained, on what, for how long."""
+
+    data: str
+    out: str
+    steps: int = 4000
+    batch: int = 8
+    rate: float = 2e-3
+    decay: float = 1e-4
+    warm_up: int = 150
+    ema: float = 0.998
+    seed: int = 0
+    threads: int = 0
+    widths: tuple[int, ...] = WIDTHS
+    border_weight: float = 3.0
+    affinity_weight: float = 0.2
+    check_every: int = 400
+    check_keyframes: int = 48
+    held_out: tuple[str, ...] = ("shapes", "rooms")
+    refresh_every: int = 200  # steps between looks for rooms that were finished meanwhile
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(prog="python -m priors.train", description=__doc__.split("\n\n")[0])
+    parser.add_argument("config", type=Path, help="YAML with the fields of TrainConfig")
+    parser.add_argument(
+        "--resume", action="store_true", help="say so where a checkpoint is expected to be there"
+    )
+    options = parser.parse_args(arguments)
+    values = yaml.safe_load(options.config.read_text())
+    unknown = set(values) - {f.name for f in fields(TrainConfig)}
+    if unknown:
+        parser.error(f"{options.config}: unknown fields {sorted(unknown)}")
+    train(TrainConfig(**values), must_resume=options.resume)
+    return 0
+
+
+def losses(net: Aggregation, batch, config: TrainConfig) -> dict[str, torch.Tensor]:
+    """Return the parts of the loss of a batch (see `samples.stack`)."""
+    correlation, color, place, ids, border, rho = batch
+    logits, offset, affinity = net(correlation, color)
+    known = place >= 0
+    weight = known * (1 + config.border_weight * border)
+    total = weight.sum().clamp_min(1)
+    log_share = functional.log_softmax(logits.float(), 1)
+    low = place.clamp_min(0).floor().long().clamp_max(logits.shape[1] - 2)
+    share = (place.clamp_min(0) - low).clamp(0, 1)
+    entropy = -(
+        (1 - share) * log_share.gather(1, low[:, None])[:, 0]
+        + share * log_share.gather(1, low[:, None] + 1)[:, 0]
+    )
+    found, _ = place_of(logits.float(), offset.float())
+    start, step = rho[:, 0, None, None], rho[:, 1, None, None]
+    # Relative depth in percent, where the right mode won.
+    error = 100 * step * (found - place).abs() / (start + step * place.clamp_min(0)).clamp_min(1e-6)
+    right = weight * ((found - place).abs() < 2)
+    precision = (
+        right * functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none")
+    ).sum() / total
+    return {
+        "entropy": (weight * entropy).sum() / total,
+        "precision": 0.25 * precision,
+        "affinity": config.affinity_weight * _affinity_loss(affinity.float(), ids),
+    }
+
+
+def _affinity_loss(affinity: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+    """Cross entropy of `one thing` for pairs to the right and below; pairs of two things weigh more, being few."""
+    parts = []
+    for k, px in enumerate(OFFSETS_PX):
+        for channel, (a, b) in enumerate(((ids[:, :, :-px], ids[:, :, px:]), (ids[:, :-px], ids[:, px:]))):
+            said = affinity[:, 2 * k + channel]
+            said = said[:, :, :-px] if channel == 0 else said[:, :-px]
+            same = (a == b).float()
+            weight = ((a > 0) & (b > 0)) * (1 + 4 * (1 - same))
+            loss = functional.binary_cross_entropy_with_logits(said, same, reduction="none")
+            parts.append((weight * loss).sum() / weight.sum().clamp_min(1))
+    return torch.stack(parts).mean()
+
+
+@torch.inference_mode()
+def check(net: Aggregation, rooms: list[Room], keyframes: int) -> dict[str, float]:
+    """Measure whole keyframes, spread over the rooms: shares of pixels off, and of semi-global aggregation beside it."""
+    sums: dict[str, list[float]] = {}
+    rng = np.random.default_rng(0)
+    chosen = [(rooms[int(k)], int(rng.integers(1 << 30))) for k in np.linspace(0, len(rooms) - 1, keyframes)]
+    for room, number in chosen:
+        row = number % len(room)
+        sample = load_sample(room, row)
+        correlation, color, place, _, border, rho = stack([sample])
+        logits, offset, _ = net(correlation, color)
+        found, surety = place_of(logits, offset)
+        start, step = sample.rho
+        truth = (start + step * place[0]).numpy()
+        known, border = (place[0] >= 0).numpy(), border[0].numpy()
+        errors = {"net": (start + step * found[0]).numpy() / truth}
+        if "winner" in room.arrays:
+            errors["sgm"] = 1 / (np.asarray(room.arrays["winner"][row]) * truth)
+        for name, ratio in errors.items():
+            off = np.abs(ratio - 1)
+            for part, mask in (("", known), ("_border", known & border)):
+                if mask.any():
+                    sums.setdefault(f"{name}_off5{part}", []).append(float((off[mask] > 0.05).mean()))
+                    sums.setdefault(f"{name}_off2{part}", []).append(float((off[mask] > 0.02).mean()))
+            sums.setdefault(f"{name}_median", []).append(float(np.median(off[known])))
+        sure = known & (surety[0].numpy() > 0.6)
+        sums.setdefault("sure", []).append(float(sure.sum() / max(known.sum(), 1)))
+        off = np.abs(errors["net"] - 1)
+        sums.setdefault("sure_off5", []).append(float((off[sure] > 0.05).mean()) if sure.any() else 0.0)
+    return {name: float(np.mean(values)) for name, values in sums.items()}
+
+
+def rate_at(step: int, config: TrainConfig) -> float:
+    """Return the learning rate: a linear start, then half a cosine down to zero."""
+    if step < config.warm_up:
+        return config.rate * (step + 1) / config.warm_up
+    share = (step - config.warm_up) / max(1, config.steps - config.warm_up)
+    return config.rate * 0.5 * (1 + np.cos(np.pi * min(share, 1.0)))
+
+
+def train(config: TrainConfig, must_resume: bool = False) -> None:
+    """Train until `steps`, from the checkpoint if there is one."""
+    from safetensors.torch import save_file
+    from torch.utils.tensorboard import SummaryWriter
+
+    out = Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    net = Aggregation(config.widths).to(device, memory_format=torch.channels_last)
+    slow = Aggregation(config.widths).to(device, memory_format=torch.channels_last)
+    slow.load_state_dict(net.state_dict())
+    optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=config.decay)
+    first, best = 0, float("inf")
+    checkpoint = out / "checkpoint.pt"
+    if checkpoint.is_file():
+        state = torch.load(checkpoint, weights_only=True, map_location=device)
+        net.load_state_dict(state["net"])
+        slow.load_state_dict(state["slow"])
+        optimizer.load_state_dict(state["optimizer"])
+        first, best = state["step"], state["best"]
+    elif must_resume:
+        raise SystemExit(f"{checkpoint}: there is no checkpoint to resume from")
+    data = Path(config.data)
+    (out / "config.json").write_text(json.dumps(asdict(config), indent=1) + "\n")
+    log = SummaryWriter(str(out), purge_step=first)
+    rooms: list[Room] = []
+    held: dict[str, list[Room]] = {}
+    started, seen = time.perf_counter(), 0
+    for step in range(first, config.steps):
+        if not rooms or step % config.refresh_every == 0:
+            rooms = open_rooms(data / "train")
+            held = {name: open_rooms(data / name) for name in config.held_out}
+        for group in optimizer.param_groups:
+            group["lr"] = rate_at(step, config)
+        rng = np.random.default_rng((config.seed, step))
+        batch = stack([draw_sample(rooms[int(rng.integers(len(rooms)))], rng) for _ in range(config.batch)])
+        batch = [tensor.to(device) for tensor in batch]
+        net.train()
+        with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
+            parts = losses(net, batch, config)
+        total = sum(parts.values())
+        optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
+        optimizer.step()
+        keep = min(config.ema, (step + 1) / (step + 10))
+        with torch.no_grad():
+            for a, b in zip(slow.state_dict().values(), net.state_dict().values(), strict=True):
+                if a.dtype.is_floating_point:
+                    a.lerp_(b, 1 - keep)
+                else:
+                    a.copy_(b)
+        seen += config.batch
+        for name, value in parts.items():
+            log.add_scalar(f"train/{name}", value.item(), step)
+        if (step + 1) % 50 == 0:
+            speed = seen / (time.perf_counter() - started)
+            told = ", ".join(f"{n} {v.item():.3f}" for n, v in parts.items())
+            print(f"step {step + 1}: {told}; {speed:.2f} crops/s, {len(rooms)} rooms", flush=True)
+        if (step + 1) % config.check_every == 0 or step + 1 == config.steps:
+            slow.eval()
+            figures = {}
+            for name, split in [("train", rooms[-60:]), *held.items()]:
+                if split:
+                    figures[name] = check(
+                        slow.cpu() if device == "cuda" else slow, split, config.check_keyframes
+                    )
+                    for key, value in figures[name].items():
+                        log.add_scalar(f"{name}/{key}", value, step)
+            slow.to(device)
+            print(
+                f"step {step + 1}: {json.dumps({n: {k: round(v, 4) for k, v in f.items()} for n, f in figures.items()})}",
+                flush=True,
+            )
+            with (out / "curve.jsonl").open("a") as file:
+                file.write(
+                    json.dumps({"step": step + 1, "seconds": time.perf_counter() - started, **figures}) + "\n"
+                )
+            score = np.mean(
+                [figures[n]["net_off2"] for n in figures if n != "train"] or [figures["train"]["net_off2"]]
+            )
+            if score < best:
+                best = float(score)
+                weights = {
+                    k: v.half().contiguous() if v.dtype == torch.float32 else v
+                    for k, v in slow.state_dict().items()
+                }
+                about = {
+                    "config": json.dumps(asdict(config)),
+                    "step": str(step + 1),
+                    "figures": json.dumps(figures),
+                }
+                save_file(weights, str(out / "best.safetensors"), metadata=about)
+            state = {
+                "net": net.state_dict(), "slow": slow.state_dict(), "optimizer": optimizer.state_dict(),
+                "step": step + 1, "best": best,
+            }  # fmt: skip
+            torch.save(state, checkpoint.with_suffix(".part"))
+            checkpoint.with_suffix(".part").replace(checkpoint)
+    log.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""Learned aggregation of a cost volume: costs and picture of a keyframe -> inverse depth, and how sure it is.
+
+The network and what it was trained on: docs/priors.md. Weights ship with the project.
+"""
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from registry.errors import EnvironmentMissing
+
+WEIGHTS = Path(__file__).parent / "weights" / "aggregation.safetensors"
+PLANES, BINS = 96, 48  # of the sweeps that the network is trained on, and of its input
+
+
+def bin_costs(cost: np.ndarray) -> np.ndarray:
+    """Return the least cost inside each bin, uint8 (h, w, BINS), of costs (h, w, planes) of at least as many planes."""
+    first = np.arange(BINS) * cost.shape[2] // BINS
+    return np.minimum.reduceat(cost, first, axis=2)
+
+
+def line_of_places(far: float, near: float, planes: int) -> tuple[float, float]:
+    """Return the inverse depth at place 0 and its step from bin to bin, for planes spaced evenly from far to near."""
+    step = (1.0 / near - 1.0 / far) / (planes - 1)
+    per_bin = planes / BINS
+    return 1.0 / far + (0.5 * per_bin - 0.5) * step, per_bin * step
+
+
+def place_of_depth(depth: np.ndarray, far: float, near: float) -> tuple[np.ndarray, tuple[float, float]]:
+    """Return the place in bins of each depth, -1 where unknown or outside of the sweep, and the line of places."""
+    start, step = line_of_places(far, near, PLANES)
+    place = (1.0 / np.maximum(depth, 1e-9) - start) / step
+    inside = (depth > 0) & (place > -0.5) & (place < BINS - 0.5)
+    return np.where(inside, np.clip(place, 0, BINS - 1), -1.0), (start, step)
+
+
+@lru_cache(maxsize=2)
+def load_network(weights: Path = WEIGHTS):
+    """Return the network (`torch.nn.Module`) in evaluation mode, its normalizations folded into the convolutions.
+
+    Raises:
+        EnvironmentMissing: the file is not there or not what this version reads.
+    """
+    import torch
+    from safetensors.torch import load_file
+    from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+    from reconstruction.depth.network import Aggregation
+
+    try:
+        state = load_file(weights)
+        network = Aggregation(tuple(state[f"unet.{name}.weight"].shape[0] for name in _first_layers(state)))
+        network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
+    except (OSError, KeyError, RuntimeError) as error:
+        raise EnvironmentMissing(
+            f"depth: the weights {weights} cannot be read ({error}). Install the package again, or turn them off with "
+            "--set depth.prior=none."
+        ) from error
+    network.eval()
+    for module in network.modules():
+        if isinstance(module, torch.nn.Sequential) and isinstance(module[0], torch.nn.Conv2d):
+            module[0], module[1] = fuse_conv_bn_eval(module[0], module[1]), torch.nn.Identity()
+    return network.to(memory_format=torch.channels_last)
+
+
+def _first_layers(state: dict) -> list[str]:
+    deeper = sorted({int(k.split(".")[2]) for k in state if k.startswith("unet.down.")})
+    return ["enter.0", *(f"down.{i}.0.0" for i in deeper)]
+
+
+def aggregate_costs(
+    cost: np.ndarray, color: np.ndarray, rhos: np.ndarray, weights: Path = WEIGHTS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return inverse depth float32 (h, w) and the probability float32 (h, w) of the surface that it is on.
+
+    One thread, so that the result does not depend on how many there are; call it from several.
+
+    Args:
+        cost: uint8 (h, w, planes), 127 * (1 - correlation); 127 where no source sees the pixel.
+        color: (h, w, 3), 0 to 255.
+        rhos: (planes,) inverse depth of the planes, evenly spaced, far to near.
+        weights: Of the network.
+    """
+    import torch
+
+    from reconstruction.depth.network import place_of
+
+    torch.set_num_threads(1)
+    h, w = cost.shape[:2]
+    correlation = np.float32(1) - bin_costs(cost).astype(np.float32) / 127
+    picture = color.astype(np.float32) / 255
+    spare = ((0, h % 2), (0, w % 2), (0, 0))
+    tensors = [
+        torch.from_numpy(np.pad(array, spare, mode="edge")).permute(2, 0, 1)[None]
+        for array in (correlation, picture)
+    ]
+    with torch.inference_mode():
+        logits, offset, _ = load_network(weights)(*tensors)
+        place, surety = place_of(logits, offset)
+    start, step = line_of_places(1.0 / rhos[0], 1.0 / rhos[-1], len(rhos))
+    rho = start + step * place[0, :h, :w].numpy()
+    return np.maximum(rho, 0.25 * rhos[0]).astype(np.float32), surety[0, :h, :w].numpy()

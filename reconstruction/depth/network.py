@@ -1,0 +1,99 @@
+"""The learned aggregation: matching costs and the picture of a keyframe in, one score for every depth bin out.
+
+A U-Net of 2D convolutions over the plane sweep's costs, planes as channels (SimpleRecon, Sayed et al., ECCV 2022). Its
+output is added to the correlations themselves, so that the untrained network is winner-takes-all, and training only
+has to learn how neighbors, edges of the picture and blank regions change that.
+"""
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+BINS = 48
+"""Bins of inverse depth between the far and the near end of a keyframe's range."""
+OFFSETS_PX = (1, 4, 12)
+"""Distances at which the network says whether two pixels are of one thing, to the right and downwards."""
+
+
+WIDTHS = (48, 64, 96, 128, 128)
+"""Channels at a half, a quarter, ... of the resolution."""
+
+
+def _block(a: int, b: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(a, b, 3, padding=1, bias=False), nn.BatchNorm2d(b), nn.ReLU(inplace=True))
+
+
+class UNet(nn.Module):
+    """Convolutions at a half to 1/32 of the resolution with skip connections, for features at a half of it."""
+
+    def __init__(self, inputs: int, widths: tuple[int, ...] = WIDTHS) -> None:
+        """Make the layers; weights are random until loaded."""
+        super().__init__()
+        self.enter = _block(inputs, widths[0])
+        self.down = nn.ModuleList(
+            nn.Sequential(_block(a, b), _block(b, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.narrow = nn.ModuleList(
+            nn.Conv2d(a, b, 1) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)
+        )
+        self.up = nn.ModuleList(_block(2 * b, b) for b in widths[-2::-1])
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map (b, inputs, h, w) to (b, widths[0], h, w)."""
+        kept = [self.enter(x)]
+        for layer in self.down:
+            kept.append(layer(functional.max_pool2d(kept[-1], 2, ceil_mode=True)))
+        x = kept.pop()
+        for narrow, up in zip(self.narrow, self.up, strict=True):
+            skip = kept.pop()
+            wide = functional.interpolate(narrow(x), size=skip.shape[-2:], mode="bilinear")
+            x = up(torch.cat([wide, skip], 1))
+        return x
+
+
+class Aggregation(nn.Module):
+    """Scores of depth bins, an offset inside the bin, and whether neighbors belong to one thing.
+
+    All convolutions run at half the resolution, on blocks of 2x2 pixels (ESPCN, Shi et al., CVPR 2016): each block's
+    features hold its four pixels' colors, and each pixel has its own scores.
+    """
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
+        """Make the layers; the last one starts at zero."""
+        super().__init__()
+        self.sharpness = nn.Parameter(torch.tensor(8.0))
+        self.costs = nn.Conv2d(BINS, 40, 2, stride=2)
+        self.unet = UNet(40 + 12, tuple(widths))
+        outputs = BINS + 1 + 2 * len(OFFSETS_PX)
+        self.leave = nn.Conv2d(widths[0], 4 * outputs, 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+
+    def forward(self, correlation: torch.Tensor, color: torch.Tensor):
+        """Return logits (b, bins, h, w), offset in bins (b, h, w) and affinity logits (b, 6, h, w).
+
+        Args:
+            correlation: (b, bins, h, w), -1 to 1, best correlation inside each bin, far to near; 0 = unknown. Height
+                and width are even.
+            color: (b, 3, h, w), 0 to 1.
+        """
+        features = torch.cat([self.costs(correlation), functional.pixel_unshuffle(color - 0.5, 2)], 1)
+        out = functional.pixel_shuffle(self.leave(self.unet(features)), 2)
+        logits = self.sharpness * correlation + out[:, :BINS]
+        return logits, torch.tanh(out[:, BINS]), out[:, BINS + 1 :]
+
+
+def place_of(logits: torch.Tensor, offset: torch.Tensor, reach: int = 2):
+    """Return the place (b, h, w) of the strongest mode in bins, and the probability that it holds.
+
+    The expected bin over the best one and `reach` to each side, moved by the offset: bins of another surface have no say.
+    """
+    share = torch.softmax(logits, 1)
+    best = share.argmax(1, keepdim=True)
+    near = torch.arange(-reach, reach + 1, device=logits.device).view(1, -1, 1, 1) + best
+    inside = (near >= 0) & (near < logits.shape[1])
+    near = near.clamp(0, logits.shape[1] - 1)
+    mass = torch.gather(share, 1, near) * inside
+    total = mass.sum(1)
+    place = (mass * near).sum(1) / total.clamp_min(1e-6) + offset
+    return place, total
