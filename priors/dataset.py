@@ -115,6 +115,7 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
     """Film a stretch of a walk and measure it; arrays by name, at sweep resolution (h, w) unless said otherwise."""
     import cv2
 
+    from priors.surfaces import measure_surface
     from reconstruction.depth import DepthConfig, estimate_depth
     from reconstruction.depth.aggregation import bin_costs
     from reconstruction.depth.estimate import gray_images, sized_camera, sweep_frame, winner_of
@@ -127,7 +128,7 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
         film.film_set, camera, path, film.sensor, seed=film.number, supersample=film.supersample
     )
     truth = [render_truth(film.film_set, camera, pose) for pose in path]
-    depth, ids = np.stack([d for d, _ in truth]), np.stack([i for _, i in truth])
+    depth = np.stack([d for d, _ in truth])
     posed = posed_capture(camera, path, images, depth, f"room-{film.number}.mp4")
     if cameras == "noisy":
         posed = replace(posed, world_from_camera=film.shaken(path))
@@ -161,12 +162,8 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
     maps = estimate_depth(posed, config)
     out |= {"depth": maps.depth.astype(np.float16), "confidence": maps.confidence}
     if until in ("gaussians", "surface"):
-        out |= _measure_surface(film, posed, maps, until)
+        out |= measure_surface(film.film_set, posed, maps, until)
     return out
-
-
-def _measure_surface(film: Film, posed, maps, until: str) -> dict[str, np.ndarray]:
-    raise SystemExit("later")
 
 
 def write_manifest(out: Path) -> None:

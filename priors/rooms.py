@@ -38,7 +38,7 @@ class Families:
 
 
 def families_of(split: str) -> Families:
-    """Return the families of a split; a held-out one has only its own of one sort, and the trained ones of the others."""
+    """Return a split's families: a held-out one has only its own of one sort, and the trained ones of the others."""
 
     def chosen(sort: str, names) -> tuple[str, ...]:
         held = {name for sorts in HELD_OUT.values() for name in sorts.get(sort, ())}

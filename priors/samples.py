@@ -19,8 +19,14 @@ ARRAYS = {
     "range": "float64 (n, 2) far and near end of the sweep",
     "world_from_camera": "float64 (n, 4, 4) true cameras",
     "intrinsics": "float64 (4,) fx, fy, cx, cy at sweep resolution",
+    "gaussians_depth": "float16 (n, H, W) depth corrected by the Gaussians",
+    "mesh_vertices": "float32 (v, 3) of the fused surface, metres",
+    "mesh_faces": "int32 (f, 3)",
+    "mesh_colors": "uint8 (v, 3)",
+    "mesh_superpoints": "int32 (v,) superpoint of each vertex",
+    "mesh_true_ids": "uint16 (v,) true entity of each vertex, 0: farther than 2 cm from all",
 }
-"""What a room's folder holds; `--until` adds the rest."""
+"""What a room's folder may hold; `--until` says how far down the list."""
 _CROP = (192, 224)
 _JUMP = 1.03  # ratio of depths from which two neighbors are two surfaces
 
@@ -160,7 +166,4 @@ def stack(samples: list[Sample]):
         np.stack([s.place for s in samples]), np.stack([s.ids for s in samples]),
         np.stack([border_of(s.place, s.rho) for s in samples]), np.array([s.rho for s in samples], np.float32),
     ]  # fmt: skip
-    tensors = [torch.from_numpy(np.ascontiguousarray(c)) for c in columns]
-    tensors[0] = tensors[0].contiguous(memory_format=torch.channels_last)
-    tensors[1] = tensors[1].contiguous(memory_format=torch.channels_last)
-    return tensors
+    return [torch.from_numpy(np.ascontiguousarray(c)) for c in columns]

@@ -76,7 +76,7 @@ def losses(net: Aggregation, batch, config: TrainConfig) -> dict[str, torch.Tens
         (1 - share) * log_share.gather(1, low[:, None])[:, 0]
         + share * log_share.gather(1, low[:, None] + 1)[:, 0]
     )
-    found, _ = place_of(logits.float(), offset.float())
+    found, _ = place_of(log_share.exp(), offset.float())
     start, step = rho[:, 0, None, None], rho[:, 1, None, None]
     # Relative depth in percent, where the right mode won.
     error = 100 * step * (found - place).abs() / (start + step * place.clamp_min(0)).clamp_min(1e-6)
@@ -107,16 +107,16 @@ def _affinity_loss(affinity: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
 
 @torch.inference_mode()
 def check(net: Aggregation, rooms: list[Room], keyframes: int) -> dict[str, float]:
-    """Measure whole keyframes, spread over the rooms: shares of pixels off, and of semi-global aggregation beside it."""
+    """Measure whole keyframes, spread over the rooms: shares of pixels off; semi-global aggregation beside it."""
     sums: dict[str, list[float]] = {}
     rng = np.random.default_rng(0)
     chosen = [(rooms[int(k)], int(rng.integers(1 << 30))) for k in np.linspace(0, len(rooms) - 1, keyframes)]
     for room, number in chosen:
         row = number % len(room)
         sample = load_sample(room, row)
-        correlation, color, place, _, border, rho = stack([sample])
+        correlation, color, place, _, border, _ = stack([sample])
         logits, offset, _ = net(correlation, color)
-        found, surety = place_of(logits, offset)
+        found, surety = place_of(logits.softmax(1), offset)
         start, step = sample.rho
         truth = (start + step * place[0]).numpy()
         known, border = (place[0] >= 0).numpy(), border[0].numpy()
@@ -156,8 +156,8 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    net = Aggregation(config.widths).to(device, memory_format=torch.channels_last)
-    slow = Aggregation(config.widths).to(device, memory_format=torch.channels_last)
+    net = Aggregation(config.widths).to(device)
+    slow = Aggregation(config.widths).to(device)
     slow.load_state_dict(net.state_dict())
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=config.decay)
     first, best = 0, float("inf")
@@ -218,10 +218,8 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
                     for key, value in figures[name].items():
                         log.add_scalar(f"{name}/{key}", value, step)
             slow.to(device)
-            print(
-                f"step {step + 1}: {json.dumps({n: {k: round(v, 4) for k, v in f.items()} for n, f in figures.items()})}",
-                flush=True,
-            )
+            shown = {n: {k: round(v, 4) for k, v in f.items()} for n, f in figures.items()}
+            print(f"step {step + 1}: {json.dumps(shown)}", flush=True)
             with (out / "curve.jsonl").open("a") as file:
                 file.write(
                     json.dumps({"step": step + 1, "seconds": time.perf_counter() - started, **figures}) + "\n"

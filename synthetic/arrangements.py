@@ -190,19 +190,10 @@ def _push_in(room: Layout, drawn: Drawn, edge: tuple[float, float], yaw: float) 
     pushed = float(room.rng.uniform(-0.2, 0.75)) * deep
     for less in np.linspace(0.0, pushed + 0.16, 6):
         at = np.array(edge) + inwards * (pushed - less - deep / 2 + float(shape.high[1] + shape.low[1]) / 2)
-        if room.is_clear(shape.bodies(_pose(turn, at)), 0.012) and room.may_stand(
-            shape, turn, *at, gap_m=0.012
-        ):
+        if room.may_stand(shape, turn, *at, gap_m=0.012):
             room.stand(drawn, turn, float(at[0]), float(at[1]))
             return True
     return False
-
-
-def _pose(yaw: float, at: np.ndarray) -> np.ndarray:
-    out = np.eye(4)
-    out[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    out[:2, 3] = at
-    return out
 
 
 def _corner(spec: "RoomSpec", room: Layout, choice: Choice) -> None:

@@ -30,6 +30,7 @@ _STACKED = (
     "book", "package", "tin", "block", "can", "jar", "mug", "cup", "candle", "box", "bottle", "wedge", "calendar",
 )  # fmt: skip
 _CONTENTS = ("package", "tin", "block", "can", "jar", "mug", "cup", "candle", "wedge", "ball", "lemon")
+_MORE = ("nightstand", "dresser", "trolley", "sideboard")
 _FREE = tuple(key for key in (*SMALL_KINDS, *VESSEL_KINDS) if not KINDS[key].rolls)
 
 
@@ -192,10 +193,11 @@ class _Stock:
     stacked: tuple[str, ...]
     contents: tuple[str, ...]
     free: tuple[str, ...]
+    more: tuple[str, ...]  # furniture for what finds no place
 
 
 @cache
-def _stock(families: tuple[str, ...], household: bool) -> _Stock:
+def _stock(families: tuple[str, ...], furniture: tuple[str, ...], household: bool) -> _Stock:
     keys = shape_keys(families)
     by_role = {key: role_of(key) for key in keys}
 
@@ -209,13 +211,16 @@ def _stock(families: tuple[str, ...], household: bool) -> _Stock:
         mix(("support", "content", "free"), _STACKED),
         mix(("content", "rolls"), _CONTENTS),
         mix(("support", "content", "free"), _FREE),
+        tuple(f"storage_{kind}" for kind in _MORE)
+        if "storage" in furniture
+        else ("cabinet", "bench", "stool"),
     )
 
 
 def _fill_from_families(spec: RoomSpec, room: Layout) -> Layout:
     """Furnish as the layout says, then place things; what finds no place where it was meant for goes elsewhere."""
     arrange(spec, room)
-    stock = _stock(spec.families, spec.household)
+    stock = _stock(spec.families, spec.furniture, spec.household)
     small = spec.objects - len(room.items)
     containers = min(round(spec.containers * spec.objects), small // 2)
     available = small - 2 * containers
@@ -238,13 +243,17 @@ def _fill_from_families(spec: RoomSpec, room: Layout) -> Layout:
 
 
 def _put(room: Layout, stock: _Stock, keys: tuple[str, ...], places: Callable[[], list]) -> None:
-    """Put a thing where it is meant to be, else anywhere, else something smaller."""
-    for among, where, tried in (
-        (keys, places, 4), (stock.free, room.open_places, 5), (stock.contents, room.container_places, 2),
-        (stock.free, room.stack_places if room.max_stack > 1 else room.open_places, 4),
-    ):  # fmt: skip
+    """Put a thing where it is meant to be, else anywhere; a room that is full gets one more piece of furniture."""
+    ways: tuple[Callable[[], object], ...] = (
+        lambda: room.put(keys, places, 3),
+        lambda: room.put(stock.free, room.open_places, 3),
+        lambda: room.furnish_side(stock.more),
+        lambda: room.put(stock.contents, room.container_places, 2),
+        lambda: room.put(stock.free, room.stack_places if room.max_stack > 1 else room.open_places, 4),
+    )
+    for way in ways:
         try:
-            room.put(among, where, tried)
+            way()
             return
         except RoomIsFull:
             continue

@@ -432,7 +432,7 @@ def make_crescent(shop: Workshop, name: str) -> Thing:
     span = np.radians(bench.u(150, 310))
     t = np.linspace(-span / 2, span / 2, 30)
     arc = np.stack([np.cos(t), np.sin(t)], -1)
-    thick = bench.u(0.12, 0.3) * (np.cos(np.pi * t / span) ** bench.u(0.1, 1.0) + 0.08)
+    thick = bench.u(0.12, 0.3) * (np.maximum(np.cos(np.pi * t / span), 0) ** bench.u(0.1, 1.0) + 0.08)
     outline = 0.5 * np.concatenate([arc, (arc * (1 - thick[:, None]))[::-1]])
     return _extruded(bench, outline, "crescent")
 

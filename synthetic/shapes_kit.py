@@ -25,6 +25,7 @@ Raw = tuple[np.ndarray, np.ndarray]
 
 _CREASE_DEG = 38.0  # sharper edges are seen as edges
 _LARGEST_M, _SMALLEST_M = 0.45, 0.045  # of the longest side of a thing
+_SAME_M = 1e-5  # closer corners of an outline are one
 _LONG_STEPS = 1.5  # edges of triangles may be that many steps long; light is stored per vertex
 _HALVED = (
     (0, 1, 2), (0, 3, 2, 3, 1, 2), (0, 1, 4, 0, 4, 2), (0, 3, 2, 3, 1, 4, 3, 4, 2), (0, 1, 5, 5, 1, 2),
@@ -138,15 +139,17 @@ def raw_sweep(
 ) -> Raw:
     """Sweep a circle (pressed by `flat` along its second axis) along a path (k, 3) in space; cap the ends.
 
-    Frames start with a second axis that points upwards where it can. Plane paths on the support touch it with a
-    facet.
+    The second axis points upwards all along paths that are nowhere steep, so that what lies on the support
+    touches it with a facet; else it starts upwards, if it can, and turns as little as possible.
     """
     path = np.asarray(path, float)
     ahead = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
-    up = np.array([0, 0, 1.0]) if abs(ahead[0, 2]) < 0.9 else np.array([0, 1.0, 0])
+    level = np.abs(ahead[:, 2]).max() < 0.9
+    up = np.array([0, 0, 1.0]) if level or abs(ahead[0, 2]) < 0.9 else np.array([0, 1.0, 0])
     ups = np.empty_like(path)
     for number, direction in enumerate(ahead):
+        up = np.array([0, 0, 1.0]) if level else up
         up = up - direction * (up @ direction)
         up = up / max(float(np.linalg.norm(up)), 1e-12)
         ups[number] = up
@@ -171,24 +174,31 @@ def cleaned(outline: np.ndarray) -> np.ndarray:
     points = np.asarray(outline, float)
     while True:
         before, after = points - np.roll(points, 1, 0), np.roll(points, -1, 0) - points
-        keep = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > 1e-9
+        keep = np.linalg.norm(before, axis=1) > _SAME_M
+        if keep.all():
+            keep = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > 1e-9
         if keep.all():
             return points
-        points = points[keep] if np.linalg.norm(before, axis=1).min() > 1e-7 else points[_distinct(before)]
-
-
-def _distinct(before: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(before, axis=1) > 1e-7
+        points = points[keep]
 
 
 def cut_below(outline: np.ndarray, level: float) -> np.ndarray:
-    """Cut off what of an outline (k, 2) lies below a level, so that it can stand."""
-    out = []
-    for a, b in zip(outline, np.roll(outline, -1, axis=0)):
-        if a[1] >= level:
-            out.append(a)
-        if (a[1] >= level) != (b[1] >= level):
-            out.append(a + (level - a[1]) / (b[1] - a[1]) * (b - a))
+    """Cut off what of an outline (k, 2) lies below a level, or a lower one where that would cut it in two."""
+    outline, low = _counter_clockwise(outline), float(outline[:, 1].min())
+    for _ in range(12):
+        out, facets = [], []
+        for a, b in zip(outline, np.roll(outline, -1, axis=0)):
+            if a[1] >= level:
+                out.append(a)
+            if (a[1] >= level) != (b[1] >= level):
+                out.append(a + (level - a[1]) / (b[1] - a[1]) * (b - a))
+                facets.append((a[1] >= level, float(out[-1][0])))
+        if facets and not facets[0][0]:
+            facets = facets[1:] + facets[:1]  # every facet starts where the outline goes below
+        # Facets run to the right; one that runs back is the inner side of what would fall apart.
+        if all(end[1] > start[1] for start, end in zip(facets[::2], facets[1::2])):
+            break
+        level = low + 0.5 * (level - low)
     return cleaned(np.array(out))
 
 
@@ -243,12 +253,13 @@ def raw_leaf(length: float, width: float, droop: float, fold: float, thickness: 
     t = np.linspace(0, 1, 7)
     angle = droop * t
     rib = np.cumsum(np.column_stack([np.cos(angle), np.sin(-angle)]), axis=0) * length / 7
+    rib = rib - rib[0]
     half = 0.5 * width * np.maximum(np.sin(np.pi * t**0.8), 0.09)
     side = np.array([-1.0, 0.0, 1.0])
     grid = np.empty((7, 3, 3))
     grid[..., 0], grid[..., 1] = rib[:, :1], half[:, None] * side
     grid[..., 2] = rib[:, 1:] + fold * half[:, None] * np.abs(side)
-    return raw_slab(grid, thickness)
+    return raw_slab(grid, thickness * np.maximum(np.sin(np.pi * t**0.8), 0.2)[:, None])
 
 
 def wobbled(raw: Raw, rng: np.random.Generator, amount: float, size_m: float, waves: int = 5) -> Raw:

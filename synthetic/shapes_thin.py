@@ -37,30 +37,25 @@ from synthetic.things import Kind, Thing
 def make_plate_rack(shop: Workshop, name: str) -> Thing:
     """A rack of rods with plates or boards on their edges."""
     bench = Bench(shop, name)
-    slots, pitch, deep, tall = bench.n(2, 6), bench.u(0.025, 0.045), bench.u(0.08, 0.14), bench.u(0.05, 0.1)
-    long, look = (slots + 1) * pitch, bench.look()
-    rails = [posed(raw_box(long, 0.01, 0.01), (0, sign * deep / 2, 0)) for sign in (-1, 1)]
+    slots, pitch, deep, tall = bench.n(2, 6), bench.u(0.025, 0.045), bench.u(0.07, 0.1), bench.u(0.05, 0.1)
+    long, look, lift = (slots + 1) * pitch, bench.look(), 0.026
     x = (np.arange(slots + 1) - slots / 2) * pitch
-    rails += [
-        rod((at, sign * deep / 2, 0.005), (at, sign * deep / 2, tall), 0.003, 6)
-        for at in x
-        for sign in (-1, 1)
-    ]
-    rails += [rod((at, -deep / 2, 0.005), (at, deep / 2, 0.005), 0.003, 6) for at in x]
-    bench.put_all(rails, look)
+    parts = [posed(raw_box(long, 0.01, 0.01), (0, sign * deep / 2, lift)) for sign in (-1, 1)]
+    for sign in (-1, 1):
+        y, middle = sign * deep / 2, lift + 0.005
+        parts += [rod((at, y, middle), (at, y, lift + tall), 0.003, 6) for at in x]
+        parts += [posed(raw_box(0.012, 0.012, lift + 0.001), (end * 0.45 * long, y, 0)) for end in (-1, 1)]
+    parts += [rod((at, -deep / 2, lift + 0.005), (at, deep / 2, lift + 0.005), 0.003, 6) for at in x]
+    bench.put_all(parts, look)
     for at in x[:-1] + pitch / 2:
         if bench.chance(0.8):
             radius, thick, lean = bench.u(0.07, 0.13), bench.u(0.003, 0.008), bench.u(-8, 8)
-            shape = (
-                ring(radius, 36)
-                if bench.chance(0.7)
-                else rounded(2 * radius, 1.5 * radius, bench.u(0.005, 0.03))
-            )
-            sink = (
-                float(np.sqrt(max(radius**2 - (deep / 2) ** 2, 0.0))) if len(shape) == 36 else 0.75 * radius
-            )
-            plate = raw_extrude(shape, thick, layers=1, taper=bench.u(0.8, 1.0))
-            bench.put(plate, bench.look(), (at, 0, max(sink + 0.012, 0.85 * radius)), turn(y=90 + lean))
+            # Its edge rests on both rails; a round one hangs down between them.
+            shape, half = ring(radius, 36), np.sqrt(radius**2 - (deep / 2) ** 2)
+            if bench.chance(0.3):
+                shape, half = rounded(1.5 * radius, 2 * radius, bench.u(0.002, 0.015)), 0.75 * radius
+            plate = raw_extrude(shape, thick, taper=bench.u(0.8, 1.0))
+            bench.put(plate, bench.look(), (at, 0, lift + 0.0075 + float(half)), turn(y=90 + lean))
     return bench.thing("plate rack", vary=(0.8, 1.2))
 
 
@@ -183,7 +178,8 @@ def make_tripod(shop: Workshop, name: str) -> Thing:
     turned = bench.u(0, 120)
     feet = ring(spread, 3) @ turn(z=turned)[:2, :2]
     bench.put_all([grounded(rod((*f, 0), (*(0.08 * f), high), radius, 8), 0.015) for f in feet], look)
-    bench.put(rod((0, 0, 0.75 * high), (0, 0, high + 0.03), 1.2 * radius, 10), look)
+    bench.put(rod((0, 0, 0.75 * high), (0, 0, high + 0.022), 1.2 * radius, 10), look)
+    bench.put(rod((0, 0, 0.95 * high), (0, 0, high + 0.004), 0.08 * spread + radius, 16), look)
     kind, z = bench.n(0, 2), high + 0.02
     if kind == 0:
         size = bench.rng.uniform((0.06, 0.03, 0.04), (0.11, 0.06, 0.08))
@@ -341,29 +337,28 @@ def _merged_low(raws: list[Raw]) -> list[Raw]:
 
 
 def make_pens(shop: Workshop, name: str) -> Thing:
-    """Pens, pencils and rulers that lie on each other."""
+    """Pens, pencils and a ruler or set square side by side; some with one more pen across them."""
     bench = Bench(shop, name)
-    z = 0.0
+    radius, count, sides = bench.u(0.0035, 0.006), bench.n(1, 4), bench.pick((6, 8, 12))
     if bench.chance(0.7):
-        thick = bench.u(0.0015, 0.005)
         shape = rounded(bench.u(0.12, 0.32), bench.u(0.025, 0.05), 0.002)
         if bench.chance(0.3):
-            shape = np.array([(0, 0), (bench.u(0.1, 0.2), 0), (0, bench.u(0.08, 0.16))])
-        bench.put(raw_extrude(shape, thick), bench.look(), rotation=turn(z=bench.u(0, 180)))
-        z = 0.0
-    radius = bench.u(0.0035, 0.006)
-    for _ in range(bench.n(1, 4)):
-        long, sides = bench.u(0.11, 0.18), bench.pick((6, 8, 12))
-        path = np.array([(-0.5, 0, 0), (0.38, 0, 0), (0.5, 0, 0)]) * long
-        spin, at = (
-            turn(z=bench.u(0, 180)),
-            (*bench.rng.uniform(-0.04, 0.04, 2), z + radius * np.cos(np.pi / sides)),
+            shape = np.array([(-0.1, 0), (bench.u(0.0, 0.1), 0), (-0.1, bench.u(0.08, 0.16))])
+        bench.put(
+            raw_extrude(shape, bench.u(0.0015, 0.005)), bench.look(), (0, 0.05, 0), turn(z=bench.u(-6, 6))
         )
-        bench.put(raw_sweep(path, radius * np.array([1, 1, 0.15]), sides), bench.look(), at, spin)
+    low = radius * np.cos(np.pi / sides)
+    spots = [(bench.u(-0.02, 0.02), -0.021 * index, low, bench.u(-4, 4)) for index in range(count)]
+    if count > 1 and bench.chance(0.6):
+        spots.append((0.0, -0.01 * count, 3.0 * low, bench.u(60, 120)))
+    for x, y, z, yaw in spots:
+        long = bench.u(0.11, 0.18)
+        path = np.array([(-0.5, 0, 0), (0.38, 0, 0), (0.5, 0, 0)]) * long
+        pen = raw_sweep(path, radius * np.array([1, 1, 0.15]), sides)
+        bench.put(pen, bench.look(), (x, y, z), turn(z=yaw))
         if bench.chance(0.5):
             cap = raw_sweep(np.array([(-0.52, 0, 0), (-0.25, 0, 0)]) * long, 1.12 * radius, sides)
-            bench.put(cap, bench.look(), (at[0], at[1], at[2] + 0.12 * radius * np.cos(np.pi / sides)), spin)
-        z += 1.9 * radius
+            bench.put(cap, bench.look(), (x, y, z + 0.12 * low), turn(z=yaw))
     return bench.thing("pens", vary=(0.9, 1.4))
 
 
@@ -766,7 +761,7 @@ def make_lying_headphones(shop: Workshop, name: str) -> Thing:
         bench.put(shell, pad, (sign * wide, 0, 0))
     radius = bench.u(0.0025, 0.0035)
     path = _cable(
-        bench, np.array([-wide, -0.9 * cup]), -np.pi / 2, bench.u(0.2, 0.5), radius, bench.u(1.0, 2.2)
+        bench, np.array([-wide, -0.3 * cup]), -np.pi / 2, bench.u(0.2, 0.5), radius, bench.u(1.0, 2.2)
     )
     bench.put(raw_sweep(path, radius, 8), look, crease_deg=60)
     _plug(bench, path, look)

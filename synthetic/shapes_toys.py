@@ -248,7 +248,7 @@ def make_shoes(shop: Workshop, name: str) -> Thing:
             posed(
                 rod((0, -0.25 * wide, 0), (0, 0.25 * wide, 0), 0.0025, 6), (x0 * long, 0, thick + z0 * rise)
             )
-            for x0, z0 in ((0.04, 0.86), (0.1, 0.81), (0.16, 0.77))
+            for x0, z0 in ((0.04, 0.82), (0.1, 0.77), (0.16, 0.73))
         ]
         bench.put_all([posed(lace, at, spin) for lace in laces], looks[2])
     return bench.thing("shoes", vary=(0.6, 1.2))
@@ -448,7 +448,7 @@ def make_toy_truck(shop: Workshop, name: str) -> Thing:
     else:
         tank = raw_superquadric((load / 2, wide / 2, wide / 2), 0.9, 0.3, 20, 24)
         bench.put(tank, bench.look(), (x, 0, z + 0.005 + wide / 2))
-    spots = [(f * long, s * 0.42 * wide) for f in (-0.4, -0.26, 0.36) for s in (-1, 1)]
+    spots = [(f * long, s * 0.39 * wide) for f in (-0.4, -0.26, 0.36) for s in (-1, 1)]
     _wheels(bench, spots, radius, 0.013)
     return bench.thing("toy truck", vary=(0.7, 1.4))
 
@@ -516,7 +516,7 @@ def make_robot(shop: Workshop, name: str) -> Thing:
         )
         hand = elbow + bench.u(0.03, 0.045) * np.array([sign * 0.2, -bench.u(0.2, 1), bench.u(-0.6, 0.6)])
         joints += [
-            rod((0.8 * shoulder[0], *shoulder[1:]), shoulder, 0.008, 10),
+            rod((0.3 * shoulder[0], *shoulder[1:]), shoulder, 0.008, 10),
             rod(shoulder, elbow, 0.007, 10),
             rod(elbow, hand, 0.007, 10),
         ]
@@ -770,7 +770,7 @@ def make_excavator(shop: Workshop, name: str) -> Thing:
     b = a + bench.u(0.08, 0.14) * np.array([bench.u(0.3, 0.8), 0, 1.0])
     c = b + bench.u(0.07, 0.11) * np.array([1.0, 0, bench.u(-1.0, 0.2)])
     arms = [rod(a, b, 0.009, 4), rod(b, c, 0.007, 4)]
-    arms.append(rod(a + (0.012, 0, -0.01), 0.5 * (a + b) + (0.014, 0, 0), 0.004, 8))
+    arms.append(rod(a + (0.008, 0, -0.01), 0.5 * (a + b) + (0.009, 0, 0), 0.004, 8))
     bench.put_all([posed(arm, (0, 0, 0), yaw) for arm in arms], look)
     if bench.chance(0.6):
         scoop = (
@@ -923,7 +923,7 @@ def make_chess_figure(shop: Workshop, name: str) -> Thing:
                 [
                     posed(
                         raw_box(0.25 * radius, 0.25 * radius, 0.3 * radius),
-                        (*(at[:2] + 0.8 * crown[i]), at[2] + tall + 0.48 * radius),
+                        (*(at[:2] + 0.8 * crown[i]), at[2] + tall + 0.35 * radius),
                     )
                     for i in range(0, 12, 3)
                 ],
@@ -1088,7 +1088,7 @@ def make_drawers(shop: Workshop, name: str) -> Thing:
     for row in range(rows):
         for column in range(columns):
             x, z = -wide / 2 + wall + (column + 0.5) * cell[0], wall + (row + 0.5) * cell[1]
-            out = bench.u(0.02, 0.5) * deep if bench.chance(0.15) else bench.u(0.004, 0.009)
+            out = bench.u(0.02, 0.5) * deep if bench.chance(0.15) else bench.u(0.001, 0.006)
             size = cell - gap
             look = looks[(row + column) % len(looks)]
             y = -deep / 2 - out
@@ -1175,7 +1175,7 @@ def make_monitor(shop: Workshop, name: str) -> Thing:
     )
     bench.put(raw_box(0.4 * wide, bench.u(0.01, 0.05), 0.4 * tall), look, (0, 0.008, z - 0.2 * tall))
     if bench.chance(0.7):
-        bench.put(rod((0, 0.05, 0.004), (0, 0.015, z), bench.u(0.01, 0.02), 10), look)
+        bench.put(rod((0, 0.05, 0.008), (0, 0.015, z), bench.u(0.01, 0.02), 10), look)
         foot = bench.pick(
             (
                 ring(0.09, 32),
@@ -1292,9 +1292,9 @@ def make_toaster(shop: Workshop, name: str) -> Thing:
     )
     if bench.chance(0.6):
         for s in (-1, 1):
-            bread = raw_extrude(rounded(0.5 * wide, 0.11, 0.02), 0.013)
+            bread = raw_extrude(rounded(0.5 * wide, 0.62 * tall, 0.02), 0.013)
             bench.put(
-                _front(bread, bench.u(-0.1, 0.1) * wide, s * 0.2 * deep + 0.0065, tall - bench.u(0.01, 0.05)),
+                _front(bread, bench.u(-0.1, 0.1) * wide, s * 0.2 * deep + 0.0065, bench.u(0.77, 0.81) * tall),
                 bench.look("noise"),
             )
     bench.put(raw_box(0.03, 0.03, 0.012), bench.look("dark"), (wide / 2 + 0.004, 0, bench.u(0.4, 0.8) * tall))

@@ -89,6 +89,8 @@ def _drawn_path(
     direction = float(rng.choice([-1.0, 1.0]))
     # Where the south is open, the camera stays there: from the north it would look out.
     low, high = (0.0, 360.0) if "wall_south" in shape.walls else (-166.0, -14.0)
+    if shape.free_deg != (-180.0, 180.0):  # furniture takes the rest of the band
+        low, high = shape.free_deg[0] + 4.0, shape.free_deg[1] - 4.0
     span = {"near": (25, 110), "strafe": (25, 70), "pan": (15, 70), "sit": (30, 140),
             "handheld_wander": (50, 180)}[kind]  # fmt: skip
     reach = min(rng.uniform(*span), high - low)

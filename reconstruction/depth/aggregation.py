@@ -61,7 +61,7 @@ def load_network(weights: Path = WEIGHTS):
     for module in network.modules():
         if isinstance(module, torch.nn.Sequential) and isinstance(module[0], torch.nn.Conv2d):
             module[0], module[1] = fuse_conv_bn_eval(module[0], module[1]), torch.nn.Identity()
-    return network.to(memory_format=torch.channels_last)
+    return network
 
 
 def _first_layers(state: dict) -> list[str]:
@@ -97,7 +97,7 @@ def aggregate_costs(
     ]
     with torch.inference_mode():
         logits, offset, _ = load_network(weights)(*tensors)
-        place, surety = place_of(logits, offset)
+        place, surety = place_of(logits.softmax(1), offset)
     start, step = line_of_places(1.0 / rhos[0], 1.0 / rhos[-1], len(rhos))
     rho = start + step * place[0, :h, :w].numpy()
     return np.maximum(rho, 0.25 * rhos[0]).astype(np.float32), surety[0, :h, :w].numpy()

@@ -5,6 +5,8 @@ output is added to the correlations themselves, so that the untrained network is
 has to learn how neighbors, edges of the picture and blank regions change that.
 """
 
+from itertools import pairwise
+
 import torch
 from torch import nn
 from torch.nn import functional
@@ -30,9 +32,7 @@ class UNet(nn.Module):
         """Make the layers; weights are random until loaded."""
         super().__init__()
         self.enter = _block(inputs, widths[0])
-        self.down = nn.ModuleList(
-            nn.Sequential(_block(a, b), _block(b, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)
-        )
+        self.down = nn.ModuleList(nn.Sequential(_block(a, b), _block(b, b)) for a, b in pairwise(widths))
         self.narrow = nn.ModuleList(
             nn.Conv2d(a, b, 1) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)
         )
@@ -83,16 +83,21 @@ class Aggregation(nn.Module):
         return logits, torch.tanh(out[:, BINS]), out[:, BINS + 1 :]
 
 
-def place_of(logits: torch.Tensor, offset: torch.Tensor, reach: int = 2):
+def place_of(share: torch.Tensor, offset: torch.Tensor, reach: int = 2):
     """Return the place (b, h, w) of the strongest mode in bins, and the probability that it holds.
 
-    The expected bin over the best one and `reach` to each side, moved by the offset: bins of another surface have no say.
+    The expected bin over the best one and `reach` to each side, moved by the offset: bins of another surface have no
+    say.
+
+    Args:
+        share: (b, bins, h, w), the softmax of the logits.
+        offset: (b, h, w), in bins.
+        reach: Bins to each side of the best one.
     """
-    share = torch.softmax(logits, 1)
     best = share.argmax(1, keepdim=True)
-    near = torch.arange(-reach, reach + 1, device=logits.device).view(1, -1, 1, 1) + best
-    inside = (near >= 0) & (near < logits.shape[1])
-    near = near.clamp(0, logits.shape[1] - 1)
+    near = torch.arange(-reach, reach + 1, device=share.device).view(1, -1, 1, 1) + best
+    inside = (near >= 0) & (near < share.shape[1])
+    near = near.clamp(0, share.shape[1] - 1)
     mass = torch.gather(share, 1, near) * inside
     total = mass.sum(1)
     place = (mass * near).sum(1) / total.clamp_min(1e-6) + offset

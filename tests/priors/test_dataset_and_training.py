@@ -1,0 +1,108 @@
+"""Rooms on disk, samples of them, and training that can be stopped: the ground of the networks that ship."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from priors import dataset, train
+from priors.rooms import HELD_OUT, SPLITS, families_of
+from priors.samples import border_of, draw_sample, load_sample, open_rooms
+from reconstruction.depth.network import BINS
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """One small room of each split that the tests need."""
+    out = tmp_path_factory.mktemp("data")
+    for split in ("train", "shapes"):
+        arguments = [str(out), "--split", split, "--rooms", "1", "--frames", str(FRAMES), "--processes", "1"]
+        assert dataset.main([*arguments, "--until", "winner"]) == 0
+    return out
+
+
+def test_held_out_families_never_occur_in_training():
+    trained = families_of("train")
+    for sorts in HELD_OUT.values():
+        assert not set(sorts.get("shapes", ())) & set(trained.shapes)
+        assert not set(sorts.get("furniture", ())) & set(trained.furniture)
+        for name in sorts.get("materials", ()):
+            assert getattr(trained.materials, name) == 0
+    for split in SPLITS[1:]:
+        assert families_of(split) != trained
+
+
+def test_a_finished_room_is_kept_and_a_torn_one_is_made_again(data, capsys):
+    room = data / "train" / "00000"
+    before = (room / "cost.npy").stat().st_mtime_ns
+    (data / "train" / "00001.part").mkdir()
+    arguments = [str(data), "--rooms", "1", "--frames", str(FRAMES), "--processes", "1", "--until", "winner"]
+    assert dataset.main(arguments) == 0
+    assert "1 of 1 rooms are there" in capsys.readouterr().out
+    assert (room / "cost.npy").stat().st_mtime_ns == before
+    assert len(open_rooms(data / "train")) == 1  # the torn one is no room
+    manifest = json.loads((data / "manifest.json").read_text())
+    assert {r["split"] for r in manifest["rooms"]} == {"train", "shapes"}
+    assert all(len(digest) == 64 for r in manifest["rooms"] for digest in r["sha256"].values())
+
+
+def test_costs_are_least_near_the_true_depth(data):
+    room = open_rooms(data / "train")[0]
+    gaps = []
+    for row in range(FRAMES):
+        sample = load_sample(room, row)
+        gray = sample.color.mean(0)
+        textured = (np.abs(np.gradient(gray)[0]) + np.abs(np.gradient(gray)[1])) > 0.04
+        known = (sample.place >= 0) & textured & ~border_of(sample.place, sample.rho)
+        gaps.append(np.abs(sample.correlation.argmax(0) - sample.place)[known])
+    assert np.median(np.concatenate(gaps)) < 1.0  # bins
+
+
+def test_another_range_keeps_costs_and_truth_together(data):
+    room = open_rooms(data / "train")[0]
+    depths = room.arrays["true_depth"]
+    low, high = float(depths[depths > 0].min()), float(depths.max())
+    for seed in range(6):
+        sample = draw_sample(room, np.random.default_rng(seed))
+        known = sample.place >= 0
+        depth = 1 / (sample.rho[0] + sample.rho[1] * sample.place[known])
+        assert low * 0.999 <= depth.min()
+        assert depth.max() <= high * 1.001
+        assert sample.correlation.shape[0] == BINS
+        assert 0 <= sample.color.min() <= sample.color.max() <= 1
+
+
+def _train(data, out, steps):
+    values = {
+        "data": str(data), "out": str(out), "steps": steps, "batch": 1, "check_every": 2, "check_keyframes": 1,
+        "widths": [16, 16, 16], "held_out": ["shapes"], "threads": 1, "warm_up": 1000,
+    }  # fmt: skip
+    config = out.with_suffix(".yaml")
+    config.write_text(yaml.safe_dump(values))
+    assert train.main([str(config)]) == 0
+    return torch.load(out / "checkpoint.pt", weights_only=True)
+
+
+def test_stopped_training_goes_on_to_the_same_weights(data, tmp_path):
+    whole = _train(data, tmp_path / "whole", 4)
+    _train(data, tmp_path / "parts", 2)
+    parts = _train(data, tmp_path / "parts", 4)
+    assert parts["step"] == whole["step"] == 4
+    for name, value in whole["slow"].items():
+        assert torch.equal(value, parts["slow"][name]), name
+    assert (tmp_path / "whole" / "best.safetensors").is_file()
+    curve = [json.loads(line) for line in (tmp_path / "whole" / "curve.jsonl").read_text().splitlines()]
+    assert [entry["step"] for entry in curve] == [2, 4]
+    assert {"net_off5", "sgm_off5", "net_off5_border"} <= set(curve[0]["shapes"])
+
+
+def test_unknown_fields_of_a_config_are_refused(tmp_path, capsys):
+    config = tmp_path / "c.yaml"
+    config.write_text("data: x\nout: y\nsteppes: 3\n")
+    with pytest.raises(SystemExit):
+        train.main([str(config)])
+    assert "steppes" in capsys.readouterr().err
