@@ -22,11 +22,14 @@ from pathlib import Path
 import numpy as np
 
 from priors.rooms import SPLITS, Film, draw_film
+from reconstruction.types import PosedFrames
 from registry.errors import InputError, UsageError
+from synthetic.capture import posed_capture
+from synthetic.film import film_room, render_truth
 
 WIDTH, HEIGHT = 480, 360
 UNTIL = ("costs", "winner", "depth", "gaussians", "surface")
-_KEYFRAMES_PER_FILM = 70  # of a whole walk, as the frames stage chooses them
+KEYFRAMES_PER_FILM = 70  # of a whole walk, as the frames stage chooses them
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -95,7 +98,7 @@ def _write_room(options: argparse.Namespace, number: int) -> str:
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     started = time.process_time()
-    film = draw_film(options.split, number, _KEYFRAMES_PER_FILM, photographs=options.photographs)
+    film = draw_film(options.split, number, KEYFRAMES_PER_FILM, photographs=options.photographs)
     arrays = measure_film(film, options.frames, options.cameras, options.until)
     digests = {}
     for name, array in arrays.items():
@@ -111,6 +114,15 @@ def _write_room(options: argparse.Namespace, number: int) -> str:
     return f"{options.split}/{number:05d}: {time.process_time() - started:.0f} s of one core"
 
 
+def film_frames(film: Film, frames: int, cameras: str) -> tuple[PosedFrames, np.ndarray]:
+    """Film a stretch of a walk; return the frames with "noisy" or "true" cameras, and the true ones (n, 4, 4)."""
+    camera, path = film.camera(WIDTH, HEIGHT), film.stretch(frames)
+    images = film_room(film.film_set, camera, path, film.sensor, seed=film.number, quick=True)
+    depth = np.stack([render_truth(film.film_set, camera, pose)[0] for pose in path])
+    posed = posed_capture(camera, path, images, depth, f"room-{film.number}.mp4")
+    return (replace(posed, world_from_camera=film.shaken(path)) if cameras == "noisy" else posed), path
+
+
 def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str, np.ndarray]:
     """Film a stretch of a walk and measure it; arrays by name, at sweep resolution (h, w) unless said otherwise."""
     import cv2
@@ -120,20 +132,10 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
     from reconstruction.depth.aggregation import bin_costs
     from reconstruction.depth.estimate import gray_images, sized_camera, sweep_frame, winner_of
     from reconstruction.depth.views import plan_views
-    from synthetic.capture import posed_capture
-    from synthetic.film import film_room, render_truth
 
-    camera, path = film.camera(WIDTH, HEIGHT), film.stretch(frames)
-    images = film_room(
-        film.film_set, camera, path, film.sensor, seed=film.number, supersample=film.supersample
-    )
-    truth = [render_truth(film.film_set, camera, pose) for pose in path]
-    depth = np.stack([d for d, _ in truth])
-    posed = posed_capture(camera, path, images, depth, f"room-{film.number}.mp4")
-    if cameras == "noisy":
-        posed = replace(posed, world_from_camera=film.shaken(path))
+    posed, path = film_frames(film, frames, cameras)
     config = DepthConfig(threads=1)
-    small = sized_camera(camera, config.sweep_side_px)
+    small = sized_camera(posed.camera, config.sweep_side_px)
     plan = plan_views(posed, config)
     gray = gray_images(posed.images, small)
     size = (small.width, small.height)
@@ -146,7 +148,7 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
             winners.append(1.0 / winner_of(cost, gray[row], rhos, config))
     exact = [render_truth(film.film_set, small, pose) for pose in path]
     out = {
-        "color": np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images]),
+        "color": np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in posed.images]),
         "cost": np.stack(costs),
         "true_depth": np.stack([d for d, _ in exact]).astype(np.float32),
         "true_ids": np.stack([i for _, i in exact]),

@@ -68,7 +68,7 @@ class Film:
     fov_deg: float
     portrait: bool
     materials: MaterialMix
-    supersample: int = 1
+    base_entities: int  # ids 1 to this are floor and walls
 
     def camera(self, width: int, height: int) -> Camera:
         """Return the camera, upright where the film is."""
@@ -116,5 +116,5 @@ def draw_film(split: str, number: int, keyframes: int, *, photographs: Path | No
     return Film(
         split, number, spec, prepare(room, shadow_px=512, light=light, finishes=finishes),
         draw_walk(rng, plan.shape, keyframes), draw_sensor(rng), fov_deg=float(rng.uniform(50, 76)),
-        portrait=bool(rng.random() < 0.12), materials=mix,
+        portrait=bool(rng.random() < 0.12), materials=mix, base_entities=len(room.base),
     )  # fmt: skip

@@ -47,12 +47,12 @@ def canonical_json(value: Any) -> str:
 
 
 def source_digest(module_name: str) -> str:
-    """Digest the source of a module or package, prompts and word lists too: changed code never reuses old results."""
+    """Digest the source of a module or package, prompts, word lists and weights too: changed code never reuses old results."""
     module = importlib.import_module(module_name)
     root = Path(module.__file__)
     files = [root]
     if root.name == "__init__.py":
-        files = sorted(file for file in root.parent.rglob("*") if file.suffix in (".py", ".txt"))
+        files = sorted(file for file in root.parent.rglob("*") if file.suffix in (".py", ".txt", ".safetensors"))
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

@@ -135,7 +135,8 @@ def _walk_around(spec: "RoomSpec", room: Layout, choice: Choice, away_m: float =
 
 
 def _tabletop(spec: "RoomSpec", room: Layout, choice: Choice) -> None:
-    """One table that the camera comes close to."""
+    """One table that the camera comes close to, and where nearly everything stands."""
+    room.near_weight = 8.0
     _walk_around(spec, room, choice, float(room.rng.uniform(0.42, 0.55)))
 
 
@@ -365,7 +366,7 @@ def arrange(spec: "RoomSpec", room: Layout) -> None:
     """Furnish a room: its main furniture, more along the walls, what hangs."""
     choice = Choice(spec)
     ARRANGEMENTS[spec.layout](spec, room, choice)
-    most = max(1, round(0.5 * spec.objects))  # the rest are small things
+    most = max(1, round((0.3 if spec.layout == "tabletop" else 0.5) * spec.objects))  # the rest is small
     if len(room.items) > max(most, 2):
         raise RoomIsFull("furniture")
     wanted = min(round(spec.side_furniture * spec.objects - 0.3), most - len(room.items))

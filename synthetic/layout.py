@@ -182,6 +182,7 @@ class Layout:
         self.seed, self.max_stack, self.gap_m, self.crowding = seed, max_stack, gap_m, crowding
         self.items: list[Item] = []
         self.shape: RoomShape | None = None
+        self.near_weight = 2.0  # of main furniture where things are put
         self._drawn = 0
         self._counts: dict[str, int] = {}
 
@@ -461,7 +462,11 @@ class Layout:
         overhangs = place.stack and place.rim_m == 0
         if not overhangs and plane.depth_inside(outline, place.area) < margin:
             return None
-        lift = 0.0 if place.sag is None else _rest_height(place, plane.turned(shape.foot, yaw, x, y))
+        lift = (
+            0.0
+            if place.sag is None
+            else _rest_height(place, plane.turned(shape.foot, yaw, x, y), shape.model)
+        )
         pose = owner.pose @ _upright(yaw, x, y, place.height_m + lift)
         turn = np.arctan2(pose[1, 0], pose[0, 0])
         world = plane.turned(shape.silhouette, turn, *pose[:2, 3])
@@ -533,7 +538,7 @@ class Layout:
             for place in item.model.places:
                 used = sum(1.6 * plane.area(c.silhouette) for c, p in item.children if p is place)
                 left = max(plane.area(place.area) - used, 0.02)
-                near = 2.0 if item.near or item.key in CENTER_KINDS else 1.0
+                near = self.near_weight if item.near or item.key in CENTER_KINDS else 1.0
                 out.append((item, place, near * left * _LIKED.get(place.name, 1.0)))
         return out
 
@@ -565,11 +570,17 @@ def _lowest(place: Place) -> float:
     return float(np.min(place.sag(x, y)))
 
 
-def _rest_height(place: Place, foot: np.ndarray) -> float:
-    """Return where a foot rests on an uneven support: soft things give, so it sinks into the highest folds."""
+def _rest_height(place: Place, foot: np.ndarray, thing: Thing) -> float:
+    """Return where a foot rests on an uneven support: soft things give, so it sinks into the highest folds.
+
+    Folds must not come up through the floor of what is hollow.
+    """
     x, y = _samples(foot)
     assert place.sag is not None
-    return float(np.percentile(place.sag(x, y), 60))
+    heights = place.sag(x, y)
+    floors = [p.height_m for p in thing.places if p.inside or p.rim_m > 0]
+    through = float(np.max(heights)) - 0.7 * min(floors) if floors else -np.inf
+    return max(float(np.percentile(heights, 60)), through)
 
 
 def _samples(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

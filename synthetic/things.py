@@ -42,7 +42,7 @@ class Place:
     rim_m: float = 0.0  # height of the walls above the place
     stack: bool = False  # a thing on top counts as stacked; it may overhang a little
     name: str = "top"
-    sag: Callable[[float, float], float] | None = None  # height over (x, y) relative to `height_m`; None: level
+    sag: Callable[[float, float], float] | None = None  # height over (x, y) above `height_m`; None: level
 
 
 @dataclass

@@ -60,11 +60,11 @@ def test_a_second_surface_has_no_say_in_the_place():
 
 
 def test_missing_weights_say_what_to_do(tmp_path):
-    with pytest.raises(EnvironmentMissing, match="depth.prior=none"):
+    with pytest.raises(EnvironmentMissing, match=r"depth\.prior=none"):
         aggregation.load_network(tmp_path / "none.safetensors")
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes(b"not weights")
-    with pytest.raises(EnvironmentMissing, match="depth.prior=none"):
+    with pytest.raises(EnvironmentMissing, match=r"depth\.prior=none"):
         aggregation.load_network(broken)
 
 

@@ -1,0 +1,94 @@
+"""Measure the depth stage on rooms of held-out families, with one or several settings side by side.
+
+    python -m priors.evaluate --splits shapes rooms --rooms 4 --photographs DIR --set prior=none --set prior=aggregation
+
+Every `--set` is one variant (several fields with commas: `--set prior=aggregation,edge_rounds=0`). Rooms are numbered
+from `--first`, apart from those of the dataset, and filmed anew; the whole depth stage runs, nothing else.
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.depth_figures import TrueView, depth_figures
+from priors.dataset import KEYFRAMES_PER_FILM, film_frames
+from priors.rooms import SPLITS, Film, draw_film
+from reconstruction.depth import DepthConfig, estimate_depth
+from reconstruction.depth.estimate import sized_camera
+from reconstruction.types import PosedFrames
+from synthetic.film import render_truth
+
+FIGURES = ("known", "measured", "median_rel", "off", "on_things", "on_things_each", "ring")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(prog="python -m priors.evaluate", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--splits", nargs="+", choices=SPLITS, default=list(SPLITS), help="which families")
+    parser.add_argument("--rooms", type=int, default=4, help="of each split (default: %(default)s)")
+    parser.add_argument(
+        "--first", type=int, default=90_000, help="number of the first room (default: %(default)s)"
+    )
+    parser.add_argument("--frames", type=int, default=16, help="keyframes a room (default: %(default)s)")
+    parser.add_argument("--photographs", type=Path, help="folder of pictures that materials may show")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="A=B,C=D", help="a variant of DepthConfig"
+    )
+    parser.add_argument("--json", type=Path, help="write all figures there")
+    options = parser.parse_args(arguments)
+    variants = {text: _config(text, parser) for text in options.set or ["prior=none", ""]}
+    figures: dict[str, dict[str, list[dict]]] = {
+        text: {split: [] for split in options.splits} for text in variants
+    }
+    for split in options.splits:
+        for number in range(options.first, options.first + options.rooms):
+            film = draw_film(split, number, KEYFRAMES_PER_FILM, photographs=options.photographs)
+            posed, views = filmed(film, options.frames)
+            names = {i: str(i) for view in views for i in np.unique(view.ids) if i > film.base_entities}
+            for text, config in variants.items():
+                maps = estimate_depth(posed, config)
+                figures[text][split].append(depth_figures(maps, 1.0, views, names))
+                print(split, number, text or "default", _row(figures[text][split][-1:]), flush=True)
+    print("\n| variant | split | rooms | " + " | ".join(FIGURES) + " |\n|" + " --- |" * (3 + len(FIGURES)))
+    for text in variants:
+        for split in options.splits:
+            found = figures[text][split]
+            print(f"| {text or 'default'} | {split} | {len(found)} | {_row(found)} |")
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1) + "\n")
+    return 0
+
+
+def _config(text: str, parser: argparse.ArgumentParser) -> DepthConfig:
+    config = DepthConfig()
+    for pair in filter(None, text.split(",")):
+        name, _, value = pair.partition("=")
+        if not hasattr(config, name):
+            parser.error(f"--set {pair}: DepthConfig has no field {name!r}")
+        kind = type(getattr(config, name))
+        config = replace(config, **{name: value == "true" if kind is bool else kind(value)})
+    return config
+
+
+def filmed(film: Film, frames: int) -> tuple[PosedFrames, list[TrueView]]:
+    """Return a stretch of a film with the cameras that bundle adjustment would give, and its truth."""
+    posed, path = film_frames(film, frames, "noisy")
+    camera = sized_camera(posed.camera, DepthConfig().depth_side_px)
+    truth = [render_truth(film.film_set, camera, pose) for pose in path]
+    return posed, [TrueView(row, z, ids.astype(np.int32)) for row, (z, ids) in enumerate(truth)]
+
+
+def _row(found: list[dict]) -> str:
+    cells = []
+    for name in FIGURES:
+        values = [f[name] for f in found if f.get(name) is not None]
+        cells.append(f"{100 * np.mean(values):.2f}" if values else "-")
+    return " | ".join(cells)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
