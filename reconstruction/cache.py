@@ -52,7 +52,9 @@ def source_digest(module_name: str) -> str:
     root = Path(module.__file__)
     files = [root]
     if root.name == "__init__.py":
-        files = sorted(file for file in root.parent.rglob("*") if file.suffix in (".py", ".txt", ".safetensors"))
+        files = sorted(
+            file for file in root.parent.rglob("*") if file.suffix in (".py", ".txt", ".safetensors")
+        )
     digest = hashlib.sha256()
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())

@@ -146,8 +146,22 @@ def write_capture(spec: CaptureSpec, folder: Path) -> CaptureReport:
     return report
 
 
+_LATER_FIELDS = (
+    "families",
+    "furniture",
+    "household",
+    "layout",
+    "uneven",
+)  # of RoomSpec, after the first captures
+
+
 def _as_json(spec: CaptureSpec) -> dict:
-    return json.loads(json.dumps(asdict(spec)))
+    """Return the spec for `capture.json`; later fields only where they are set, so that old captures stay valid."""
+    out, usual = json.loads(json.dumps(asdict(spec))), RoomSpec()
+    for name in _LATER_FIELDS:
+        if getattr(spec.room, name) == getattr(usual, name):
+            del out["room"][name]
+    return out
 
 
 def _report(spec: CaptureSpec, folder: Path) -> CaptureReport:
