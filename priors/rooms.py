@@ -12,11 +12,14 @@ import numpy as np
 
 from reconstruction.types import Camera
 from synthetic.arrangements import draw_room
-from synthetic.film import FilmSet, Sensor, draw_light, draw_sensor, phone_camera, prepare
+from synthetic.camera_paths import phone_camera
+from synthetic.film import FilmSet, prepare
 from synthetic.furniture_families import FURNITURE_FAMILIES
+from synthetic.lighting import draw_light
 from synthetic.materials import MaterialMix, repaint
 from synthetic.photographs import load_photographs
 from synthetic.procedural import RoomSpec, furnish, plan_room
+from synthetic.sensor import Sensor, draw_sensor
 from synthetic.shape_families import SHAPE_FAMILIES
 from synthetic.walks import draw_walk
 

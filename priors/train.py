@@ -41,6 +41,7 @@ class TrainConfig:
     border_weight: float = 3.0
     affinity_weight: float = 0.2
     check_every: int = 400
+    save_every: int = 50
     check_keyframes: int = 48
     held_out: tuple[str, ...] = ("shapes", "rooms")
     refresh_every: int = 200  # steps between looks for rooms that were finished meanwhile
@@ -239,6 +240,11 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
                     "figures": json.dumps(figures),
                 }
                 save_file(weights, str(out / "best.safetensors"), metadata=about)
+        if (
+            (step + 1) % config.save_every == 0
+            or (step + 1) % config.check_every == 0
+            or step + 1 == config.steps
+        ):
             state = {
                 "net": net.state_dict(), "slow": slow.state_dict(), "optimizer": optimizer.state_dict(),
                 "step": step + 1, "best": best,

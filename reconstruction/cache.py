@@ -47,7 +47,7 @@ def canonical_json(value: Any) -> str:
 
 
 def source_digest(module_name: str) -> str:
-    """Digest the source of a module or package, prompts, word lists and weights too: changed code never reuses old results."""
+    """Digest a module or package with its prompts, word lists and weights: changed code never reuses old results."""
     module = importlib.import_module(module_name)
     root = Path(module.__file__)
     files = [root]

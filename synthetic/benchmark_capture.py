@@ -13,10 +13,12 @@ import numpy as np
 
 from reconstruction.types import Camera
 from registry.errors import UsageError
+from synthetic.camera_paths import phone_camera
 from synthetic.capture import write_ground_truth
-from synthetic.film import FilmSet, Sensor, iterate_film, phone_camera, prepare
+from synthetic.film import FilmSet, iterate_film, prepare
 from synthetic.procedural import RoomSpec, furnish, plan_room
 from synthetic.room import Room
+from synthetic.sensor import Sensor
 from synthetic.videos import write_video
 from synthetic.walks import walk_path
 

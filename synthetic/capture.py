@@ -14,16 +14,10 @@ import numpy as np
 
 from reconstruction.types import Camera, DepthMaps, FrameSet, PosedFrames, VideoSource
 from registry.geometry import split_similarity, transform_points
-from synthetic.film import (
-    FilmSet,
-    Sensor,
-    film_room,
-    handheld_path,
-    phone_camera,
-    prepare,
-    render_truth,
-)
+from synthetic.camera_paths import handheld_path, phone_camera
+from synthetic.film import FilmSet, film_room, prepare, render_truth
 from synthetic.room import Entity, Room, build_room
+from synthetic.sensor import Sensor
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synthetic.film import (
-    FilmSet,
-    Sensor,
-    film_room,
-    handheld_path,
-    pan_path,
-    phone_camera,
-    prepare,
-)
+from synthetic.camera_paths import handheld_path, pan_path, phone_camera
+from synthetic.film import FilmSet, film_room, prepare
 from synthetic.room import build_room
+from synthetic.sensor import Sensor
 
 _TICKS_PER_S = 90000
 

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from registry.errors import UsageError
-from synthetic.film import look_at
+from synthetic.camera_paths import look_at
 from synthetic.layout import RoomShape
 
 WalkKind = Literal["arc", "loop", "two_heights", "near", "strafe", "pan", "sit", "handheld_wander"]

@@ -12,9 +12,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # runs from a checkout that is not installed
 
+from synthetic.camera_paths import handheld_path, phone_camera
 from synthetic.capture import truth_as_json, write_ground_truth
-from synthetic.film import Sensor, handheld_path, iterate_film, phone_camera, prepare
+from synthetic.film import iterate_film, prepare
 from synthetic.room import build_room
+from synthetic.sensor import Sensor
 from synthetic.videos import write_video
 
 WIDTH, HEIGHT, FPS, FRAMES = 640, 480, 12.0, 120

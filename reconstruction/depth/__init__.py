@@ -3,6 +3,6 @@
 from reconstruction.depth.config import DEPTH_PRESETS, DepthConfig
 from reconstruction.depth.estimate import estimate_depth
 
-VERSION = 9
+VERSION = 10
 
 __all__ = ["DEPTH_PRESETS", "VERSION", "DepthConfig", "estimate_depth"]

@@ -176,18 +176,9 @@ def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthCon
 
 
 def _believe(
-    posed,
-    camera: Camera,
-    plan: ViewPlan,
-    raw,
-    surety,
-    depth,
-    confidence,
-    config: DepthConfig,
-    workers,
-    progress,
-) -> None:
-    """Take predicted depth where the network is sure and several views predict the same, in place, as completed."""
+    posed, camera: Camera, plan: ViewPlan, raw, surety, depth, config: DepthConfig, workers, progress
+) -> np.ndarray:
+    """Return predicted depth (n, h, w) where nothing is measured, the network is sure and others predict the same."""
     from reconstruction.depth.consistency import check_view, count_witnesses, remove_speckles
 
     k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
@@ -199,21 +190,17 @@ def _believe(
         rows = plan.neighbors[i]
         relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
         count, fused = np.zeros(depth.shape[1:], np.uint8), np.zeros(depth.shape[1:], np.float32)
-        check_view(
-            i, rows, said, weight, relative, k, config.prior_agree_depth, config.prior_agree_px, count, fused
-        )
+        reach, reach_px = config.prior_agree_depth, config.prior_agree_px
+        check_view(i, rows, said, weight, relative, k, reach, reach_px, count, fused)
         asked = (depth[i] == 0) & (said[i] > 0)
         agree, through = np.zeros_like(count), np.zeros_like(count)
-        count_witnesses(
-            i, rows, said, asked, relative, k, 1.0 + 2 * config.prior_agree_depth, 0.015, agree, through
-        )
+        count_witnesses(i, rows, said, asked, relative, k, 1.0 + 2 * reach, 0.5 * reach, agree, through)
         taken[i] = np.where(asked & (count >= config.min_agreeing) & (count > through), fused, 0)
         together = np.where(depth[i] > 0, depth[i], taken[i])
-        taken[i] *= remove_speckles(together, config.min_speckle_px, 0.03)
+        taken[i] *= remove_speckles(together, config.min_speckle_px, reach)
 
     workers.each(len(depth), work, "comparing predictions", progress)
-    depth[taken > 0] = taken[taken > 0]
-    confidence[taken > 0] = 1
+    return taken
 
 
 def _resolve(
@@ -309,12 +296,18 @@ def estimate_depth(
             f"depth: only {100 * share:.1f} % of the pixels could be measured. The frames are blurred, blank or do "
             "not move sideways: film textured things with steady sideways motion and enough light."
         )
+    predicted = np.zeros_like(depth)
     if config.prior != "none":
-        _believe(posed, camera, plan, raw, surety, depth, confidence, config, workers, progress)
+        predicted = _believe(posed, camera, plan, raw, surety, depth, config, workers, progress)
     if config.complete:
         from reconstruction.depth.complete import complete_depth
 
-        depth, confidence = complete_depth(posed, camera, plan, depth, raw, config, workers.each, progress)
+        depth, confidence = complete_depth(
+            posed, camera, plan, depth, predicted, raw, config, workers.each, progress
+        )
+    else:
+        depth, confidence = np.where(depth > 0, depth, predicted), np.where(predicted > 0, 1, confidence)
+        confidence = confidence.astype(np.uint8)
     if config.edge_rounds > 0:
         depth, confidence = _resolve(posed, camera, plan, depth, confidence, score, config, workers, progress)
     if backend is not None:

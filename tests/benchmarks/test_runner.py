@@ -14,8 +14,9 @@ import pytest
 from benchmarks.results import load_result, load_results
 from benchmarks.run import main, run_command
 from reconstruction.pipeline import DEFAULT_STAGE_NAMES
+from synthetic.camera_paths import handheld_path, phone_camera
 from synthetic.capture import write_ground_truth
-from synthetic.film import film_room, handheld_path, phone_camera, prepare
+from synthetic.film import film_room, prepare
 from synthetic.room import build_room
 from synthetic.videos import write_not_a_video, write_video
 

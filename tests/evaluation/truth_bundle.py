@@ -12,8 +12,9 @@ from reconstruction.preview import render_textured
 from reconstruction.types import Camera, ConvexPart, TexturedMesh
 from registry import SceneBundle, seal_bundle
 from registry.geometry import invert_rigid, rigid, split_similarity, transform_points
+from synthetic.camera_paths import handheld_path, phone_camera
 from synthetic.capture import write_ground_truth
-from synthetic.film import handheld_path, phone_camera, prepare
+from synthetic.film import prepare
 from synthetic.room import Entity, Room, build_room
 
 KINDS = ("table", "shelf", "box", "can", "carton", "book", "tin", "picture")

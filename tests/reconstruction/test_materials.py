@@ -8,19 +8,13 @@ import numpy as np
 import pytest
 
 from reconstruction.rasterize import rasterize_mesh
-from synthetic.film import (
-    Light,
-    Sensor,
-    draw_light,
-    draw_sensor,
-    iterate_film,
-    phone_camera,
-    prepare,
-    render_color,
-)
+from synthetic.camera_paths import phone_camera
+from synthetic.film import iterate_film, prepare, render_color
+from synthetic.lighting import Light, draw_light
 from synthetic.materials import FAMILIES, Finish, MaterialMix, repaint
 from synthetic.photographs import load_photographs
 from synthetic.procedural import RoomSpec, furnish, plan_room
+from synthetic.sensor import Sensor, draw_sensor
 from synthetic.walks import WALKS, draw_walk, walk_path
 
 _BEFORE = "5c9b9e668df2deaf15d1832482c30f157a71b0c2062229699a36d56389d985bb"

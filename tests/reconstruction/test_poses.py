@@ -12,7 +12,7 @@ from reconstruction.poses.undistort import undistort
 from reconstruction.types import FrameSet, PosedFrames
 from registry.errors import InputError
 from registry.geometry import split_similarity, umeyama
-from synthetic.film import pan_path
+from synthetic.camera_paths import pan_path
 from synthetic.videos import short_film
 
 

@@ -11,7 +11,8 @@ from reconstruction.poses.components import label_parts, propose_bridges
 from reconstruction.poses.consistency import reject_look_alikes
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
-from synthetic.film import film_room, handheld_path, phone_camera, prepare
+from synthetic.camera_paths import handheld_path, phone_camera
+from synthetic.film import film_room, prepare
 from synthetic.procedural import RoomSpec, build_procedural_room
 
 SIZE = (640, 480)

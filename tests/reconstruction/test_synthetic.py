@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from registry.geometry import invert_rigid, rigid, transform_points
+from synthetic.camera_paths import handheld_path, pan_path, phone_camera
 from synthetic.capture import make_test_capture, truth_as_json, write_ground_truth
-from synthetic.film import handheld_path, pan_path, phone_camera, prepare
+from synthetic.film import prepare
 from synthetic.room import NORTH_M, build_room
 from synthetic.shapes import COARSE, box, lathe, signed_volume
 
