@@ -29,7 +29,6 @@ from synthetic.film import film_room, render_truth
 
 WIDTH, HEIGHT = 480, 360
 UNTIL = ("costs", "winner", "depth", "gaussians", "surface")
-KEYFRAMES_PER_FILM = 70  # of a whole walk, as the frames stage chooses them
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -98,7 +97,7 @@ def _write_room(options: argparse.Namespace, number: int) -> str:
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     started = time.process_time()
-    film = draw_film(options.split, number, KEYFRAMES_PER_FILM, photographs=options.photographs)
+    film = draw_film(options.split, number, photographs=options.photographs)
     arrays = measure_film(film, options.frames, options.cameras, options.until)
     digests = {}
     for name, array in arrays.items():
@@ -116,7 +115,7 @@ def _write_room(options: argparse.Namespace, number: int) -> str:
 
 def film_frames(film: Film, frames: int, cameras: str) -> tuple[PosedFrames, np.ndarray]:
     """Film a stretch of a walk; return the frames with "noisy" or "true" cameras, and the true ones (n, 4, 4)."""
-    camera, path = film.camera(WIDTH, HEIGHT), film.stretch(frames)
+    camera, path = film.camera(WIDTH, HEIGHT), film.keyframes(frames)
     images = film_room(film.film_set, camera, path, film.sensor, seed=film.number, quick=True)
     depth = np.stack([render_truth(film.film_set, camera, pose)[0] for pose in path])
     posed = posed_capture(camera, path, images, depth, f"room-{film.number}.mp4")
@@ -140,7 +139,7 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
     gray = gray_images(posed.images, small)
     size = (small.width, small.height)
     costs, winners = [], []
-    for row in range(frames):
+    for row in range(len(path)):
         rhos = np.linspace(1.0 / plan.far[row], 1.0 / plan.near[row], config.planes)
         cost = sweep_frame(row, gray, posed, small, plan, rhos, config.noise_gray)
         costs.append(bin_costs(cost))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.depth_figures import TrueView, depth_figures
-from priors.dataset import KEYFRAMES_PER_FILM, film_frames
+from priors.dataset import film_frames
 from priors.rooms import SPLITS, Film, draw_film
 from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.depth.estimate import sized_camera
@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     }
     for split in options.splits:
         for number in range(options.first, options.first + options.rooms):
-            film = draw_film(split, number, KEYFRAMES_PER_FILM, photographs=options.photographs)
+            film = draw_film(split, number, photographs=options.photographs)
             posed, views = filmed(film, options.frames)
             names = {i: str(i) for view in views for i in np.unique(view.ids) if i > film.base_entities}
             for text, config in variants.items():

@@ -5,15 +5,16 @@ occurs in "train": figures of those splits say what is to be expected of rooms t
 """
 
 import zlib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from reconstruction.types import Camera
+from registry.errors import InputError
 from synthetic.arrangements import draw_room
 from synthetic.camera_paths import phone_camera
-from synthetic.film import FilmSet, prepare
+from synthetic.film import FilmSet, prepare, render_truth
 from synthetic.furniture_families import FURNITURE_FAMILIES
 from synthetic.lighting import draw_light
 from synthetic.materials import MaterialMix, repaint
@@ -29,6 +30,16 @@ HELD_OUT: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Families by held-out split: of small things; of furniture and materials."""
 SPLITS = ("train", *HELD_OUT)
+_WALK_FRAMES = 300  # of a whole film
+_SKETCH = (80, 60)  # pixels at which keyframes are chosen
+_STEPS = (0.035, 0.07)  # between keyframes, as a share of the longer side; the frames stage asks for .045
+_STARTS, _FEWEST_KEYFRAMES, _FEWEST_THINGS = 6, 8, 0.04
+_FRAMES_A_STEP = (
+    8.0  # frames of a phone's film from keyframe to keyframe: the shutter is open for a share of one
+)
+_USUAL = MaterialMix(
+    print=2.0, text=0.7, noise=1.6, blank=1.0, dark=0.25, gloss=0.5, gradient=0.3, wood=1.0, tiles=0.6
+)
 
 
 @dataclass(frozen=True)
@@ -47,7 +58,7 @@ def families_of(split: str) -> Families:
         held = {name for sorts in HELD_OUT.values() for name in sorts.get(sort, ())}
         return HELD_OUT.get(split, {}).get(sort) or tuple(name for name in names if name not in held)
 
-    usual = asdict(MaterialMix())
+    usual = asdict(_USUAL)
     own = HELD_OUT.get(split, {}).get("materials")
     kept = chosen("materials", usual)
     mix = {name: weight * (name in kept) for name, weight in usual.items()}
@@ -56,6 +67,20 @@ def families_of(split: str) -> Families:
     return Families(
         chosen("shapes", SHAPE_FAMILIES), chosen("furniture", FURNITURE_FAMILIES), MaterialMix(**mix)
     )
+
+
+def _flow_px(depth: np.ndarray, camera: Camera, walk: np.ndarray, row: int) -> np.ndarray:
+    """Return how far a grid of pixels moves on average from pose `row` to every later pose of a walk, pixels."""
+    v, u = np.mgrid[2 : depth.shape[0] : 8, 2 : depth.shape[1] : 8]
+    u, v, z = u.ravel(), v.ravel(), depth[2::8, 2::8].ravel()
+    u, v, z = u[z > 0], v[z > 0], z[z > 0].astype(np.float64)
+    local = np.stack([(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], -1)
+    other_from_row = np.linalg.inv(walk[row + 1 :]) @ walk[row]
+    there = np.einsum("nij,pj->npi", other_from_row[:, :3, :3], local) + other_from_row[:, None, :3, 3]
+    ahead = np.maximum(there[..., 2], 1e-3)
+    du = camera.fx * there[..., 0] / ahead + camera.cx - u - 0.5
+    dv = camera.fy * there[..., 1] / ahead + camera.cy - v - 0.5
+    return np.minimum(np.hypot(du, dv), max(_SKETCH)).mean(1) if len(z) else np.zeros(len(walk) - row - 1)
 
 
 @dataclass(frozen=True)
@@ -78,21 +103,42 @@ class Film:
         size = (height, width) if self.portrait else (width, height)
         return phone_camera(*size, self.fov_deg)
 
-    def stretch(self, frames: int) -> np.ndarray:
-        """Return `frames` poses (n, 4, 4) in a row, from anywhere in the walk."""
-        start = int(np.random.default_rng((self.number, 7)).integers(0, len(self.walk) - frames + 1))
-        return self.walk[start : start + frames]
+    def keyframes(self, count: int) -> np.ndarray:
+        """Return poses (n, 4, 4) of keyframes in a row, as far apart as the frames stage chooses them, n <= count.
+
+        The start is drawn; of a few starts the first is taken that sees things and leads far enough.
+        """
+        rng = np.random.default_rng((self.number, 7))
+        camera, step = self.camera(*_SKETCH), float(rng.uniform(*_STEPS)) * max(_SKETCH)
+        best = self.walk[:0]
+        for start in rng.integers(0, len(self.walk) - count, _STARTS):
+            chosen = [int(start)]
+            depth, ids = render_truth(self.film_set, camera, self.walk[start])
+            empty = (ids > self.base_entities).mean() < _FEWEST_THINGS
+            while len(chosen) < count:
+                ahead = np.flatnonzero(_flow_px(depth, camera, self.walk, chosen[-1]) >= step)
+                if not len(ahead):
+                    break
+                chosen.append(chosen[-1] + 1 + int(ahead[0]))
+                depth, _ = render_truth(self.film_set, camera, self.walk[chosen[-1]])
+            if len(chosen) > len(best) and not empty:
+                best = self.walk[chosen]
+            if len(best) == count:
+                return best
+        if len(best) < _FEWEST_KEYFRAMES:
+            raise InputError(f"{self.split}/{self.number}: no stretch of this walk sees enough")
+        return best
 
     def shaken(self, path: np.ndarray) -> np.ndarray:
-        """Return poses off by what bundle adjustment leaves: up to .4 mrad and 2 mm, as much as this film drew."""
+        """Return poses off by what bundle adjustment leaves: up to .15 mrad and .5 mm, as much as this film drew."""
         from scipy.spatial.transform import Rotation
 
         rng = np.random.default_rng((self.number, 8))
         size = rng.uniform(0, 1)
         out = path.copy()
-        turn = Rotation.from_rotvec(4e-4 * size * rng.standard_normal((len(path), 3))).as_matrix()
+        turn = Rotation.from_rotvec(1.5e-4 * size * rng.standard_normal((len(path), 3))).as_matrix()
         out[:, :3, :3] = path[:, :3, :3] @ turn
-        out[:, :3, 3] += 2e-3 * size * rng.standard_normal((len(path), 3))
+        out[:, :3, 3] += 5e-4 * size * rng.standard_normal((len(path), 3))
         return out
 
     def describe(self) -> dict:
@@ -103,21 +149,26 @@ class Film:
         }  # fmt: skip
 
 
-def draw_film(split: str, number: int, keyframes: int, *, photographs: Path | None = None) -> Film:
-    """Draw, furnish, paint and light the room of this number in a split; its walk has that many keyframes."""
+def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Film:
+    """Draw, furnish, paint and light the room of this number in a split, and a walk through it."""
     rng = np.random.default_rng((zlib.crc32(split.encode()), number))
     families = families_of(split)
     spec = draw_room(int(rng.integers(1 << 30)), shapes=families.shapes, furniture=families.furniture)
     plan = plan_room(spec)
     usual = asdict(families.materials)
     mix = MaterialMix(
-        **{f.name: usual[f.name] * float(np.exp(rng.normal(0, 0.8))) for f in fields(MaterialMix)}
+        **{f.name: usual[f.name] * float(np.exp(rng.normal(0, 0.6))) for f in fields(MaterialMix)}
     )
     pictures = load_photographs(photographs, 40, rng) if photographs else None
     room, finishes = repaint(furnish(plan), rng, mix, pictures)
-    light = draw_light(rng, room.extent)
+    light, sensor = draw_light(rng, room.extent), draw_sensor(rng)
+    sensor = replace(
+        sensor,
+        blur_shutter=sensor.blur_shutter / _FRAMES_A_STEP,
+        rolling_shutter=sensor.rolling_shutter / _FRAMES_A_STEP,
+    )
     return Film(
         split, number, spec, prepare(room, shadow_px=512, light=light, finishes=finishes),
-        draw_walk(rng, plan.shape, keyframes), draw_sensor(rng), fov_deg=float(rng.uniform(50, 76)),
+        draw_walk(rng, plan.shape, _WALK_FRAMES), sensor, fov_deg=float(rng.uniform(50, 76)),
         portrait=bool(rng.random() < 0.12), materials=mix, base_entities=len(room.base),
     )  # fmt: skip
