@@ -128,7 +128,7 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
 
     from priors.surfaces import measure_surface
     from reconstruction.depth import DepthConfig, estimate_depth
-    from reconstruction.depth.aggregation import bin_costs
+    from reconstruction.depth.aggregation import bin_costs, smoothed_scores
     from reconstruction.depth.estimate import gray_images, sized_camera, sweep_frame, winner_of
     from reconstruction.depth.views import plan_views
 
@@ -138,17 +138,19 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
     plan = plan_views(posed, config)
     gray = gray_images(posed.images, small)
     size = (small.width, small.height)
-    costs, winners = [], []
+    costs, smoothed, winners = [], [], []
     for row in range(len(path)):
         rhos = np.linspace(1.0 / plan.far[row], 1.0 / plan.near[row], config.planes)
         cost = sweep_frame(row, gray, posed, small, plan, rhos, config.noise_gray)
         costs.append(bin_costs(cost))
+        smoothed.append(smoothed_scores(costs[-1], gray[row], config.smooth_small, config.smooth_large))
         if until != "costs":
             winners.append(1.0 / winner_of(cost, gray[row], rhos, config))
     exact = [render_truth(film.film_set, small, pose) for pose in path]
     out = {
         "color": np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in posed.images]),
         "cost": np.stack(costs),
+        "smoothed": np.stack(smoothed),
         "true_depth": np.stack([d for d, _ in exact]).astype(np.float32),
         "true_ids": np.stack([i for _, i in exact]),
         "range": np.stack([plan.far, plan.near], 1),

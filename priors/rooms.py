@@ -125,7 +125,7 @@ class Film:
                 best = self.walk[chosen]
             if len(best) == count:
                 return best
-        if len(best) < _FEWEST_KEYFRAMES:
+        if len(best) < min(count, _FEWEST_KEYFRAMES):
             raise InputError(f"{self.split}/{self.number}: no stretch of this walk sees enough")
         return best
 

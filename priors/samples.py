@@ -11,6 +11,7 @@ from reconstruction.depth.network import BINS
 ARRAYS = {
     "color": "uint8 (n, h, w, 3) keyframes at sweep resolution",
     "cost": "uint8 (n, h, w, 48) least cost inside each bin, 127 * (1 - correlation), far to near",
+    "smoothed": "uint8 (n, h, w, 48) what semi-global aggregation says of each bin, 255 for the winner",
     "winner": "float32 (n, h, w) depth by semi-global aggregation, the hand-made way",
     "true_depth": "float32 (n, h, w) z-depth in metres, 0 = nothing",
     "true_ids": "uint16 (n, h, w) entities, 0 = nothing",
@@ -56,6 +57,7 @@ class Sample:
     """One keyframe, or a crop of it."""
 
     correlation: np.ndarray  # float32 (bins, h, w)
+    smoothed: np.ndarray  # float32 (bins, h, w) 0 to 1
     color: np.ndarray  # float32 (3, h, w) 0 to 1
     place: np.ndarray  # float32 (h, w) true place in bins, -1 = unknown
     ids: np.ndarray  # int32 (h, w)
@@ -69,10 +71,10 @@ def load_sample(room: Room, row: int, window: tuple[slice, slice] = (slice(None)
     far, near = a["range"][row]
     place, rho = place_of_depth(np.asarray(a["true_depth"][row][window], np.float64), far, near)
     correlation = (np.float32(1) - cost.astype(np.float32) / 127).transpose(2, 0, 1)
+    smoothed = a["smoothed"][row][window].astype(np.float32).transpose(2, 0, 1) / 255
     color = np.asarray(a["color"][row][window], np.float32).transpose(2, 0, 1) / 255
-    return Sample(
-        correlation, color, place.astype(np.float32), a["true_ids"][row][window].astype(np.int32), rho
-    )
+    ids = a["true_ids"][row][window].astype(np.int32)
+    return Sample(correlation, smoothed, color, place.astype(np.float32), ids, rho)
 
 
 def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
@@ -82,41 +84,28 @@ def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
     ch, cw = min(_CROP[0], h), min(_CROP[1], w)
     y, x = int(rng.integers(h - ch + 1)), int(rng.integers(w - cw + 1))
     sample = load_sample(room, row, (slice(y, y + ch), slice(x, x + cw)))
-    correlation, color, place, ids, rho = (
-        sample.correlation, sample.color, sample.place, sample.ids, sample.rho
-    )  # fmt: skip
+    correlation, smoothed, color = sample.correlation, sample.smoothed, sample.color
+    place, ids, rho = sample.place, sample.ids, sample.rho
     if rng.random() < 0.5:
-        correlation, color, place, ids = (
-            np.ascontiguousarray(v[..., ::-1]) for v in (correlation, color, place, ids)
+        correlation, smoothed, color, place, ids = (
+            np.ascontiguousarray(v[..., ::-1]) for v in (correlation, smoothed, color, place, ids)
         )
     if rng.random() < 0.7:
-        correlation, place, rho = _other_range(correlation, place, rho, rng)
-    if rng.random() < 0.2:
-        correlation = _with_gap(correlation, rng)
-    return Sample(correlation, _other_light(color, rng), place, ids, rho)
+        (correlation, smoothed), place, rho = _other_range((correlation, smoothed), place, rho, rng)
+    return Sample(correlation, smoothed, _other_light(color, rng), place, ids, rho)
 
 
-def _other_range(correlation, place, rho, rng):
+def _other_range(volumes, place, rho, rng):
     """Sweep another range of depths: bins are left out, repeated or empty."""
     step = float(rng.uniform(0.75, 1.25))
     first = float(rng.uniform(-0.15, 0.15)) * BINS
     old = first + step * np.arange(BINS)
     rows = np.round(old).astype(int)
-    out = np.where(
-        ((rows >= 0) & (rows < BINS))[:, None, None], correlation[np.clip(rows, 0, BINS - 1)], np.float32(0)
-    )
+    inside, rows = ((rows >= 0) & (rows < BINS))[:, None, None], np.clip(rows, 0, BINS - 1)
+    out = [np.where(inside, volume[rows], np.float32(0)) for volume in volumes]
     moved = np.where(place >= 0, (place - first) / step, -1).astype(np.float32)
     moved[(moved < 0) | (moved > BINS - 1)] = -1
     return out, moved, (rho[0] + first * rho[1], step * rho[1])
-
-
-def _with_gap(correlation, rng):
-    """Blank a rectangle, as where no source sees the place."""
-    h, w = correlation.shape[1:]
-    y, x = sorted(rng.integers(0, h, 2)), sorted(rng.integers(0, w, 2))
-    out = correlation.copy()
-    out[:, y[0] : min(y[1], y[0] + 90), x[0] : min(x[1], x[0] + 90)] = 0
-    return out
 
 
 def _other_light(color, rng):
@@ -158,11 +147,12 @@ def border_of(place: np.ndarray, rho: tuple[float, float], reach_px: int = 4) ->
 
 
 def stack(samples: list[Sample]):
-    """Return correlation, color, place, ids, border, rho as tensors with a batch axis."""
+    """Return correlation, smoothed, color, place, ids, border, rho as tensors with a batch axis."""
     import torch
 
     columns = [
-        np.stack([s.correlation for s in samples]), np.stack([s.color for s in samples]),
+        np.stack([s.correlation for s in samples]), np.stack([s.smoothed for s in samples]),
+        np.stack([s.color for s in samples]),
         np.stack([s.place for s in samples]), np.stack([s.ids for s in samples]),
         np.stack([border_of(s.place, s.rho) for s in samples]), np.array([s.rho for s in samples], np.float32),
     ]  # fmt: skip

@@ -65,8 +65,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def losses(net: Aggregation, batch, config: TrainConfig) -> dict[str, torch.Tensor]:
     """Return the parts of the loss of a batch (see `samples.stack`)."""
-    correlation, color, place, ids, border, rho = batch
-    logits, offset, affinity = net(correlation, color)
+    correlation, smoothed, color, place, ids, border, rho = batch
+    logits, offset, affinity = net(correlation, smoothed, color)
     known = place >= 0
     weight = known * (1 + config.border_weight * border)
     total = weight.sum().clamp_min(1)
@@ -115,8 +115,8 @@ def check(net: Aggregation, rooms: list[Room], keyframes: int) -> dict[str, floa
     for room, number in chosen:
         row = number % len(room)
         sample = load_sample(room, row)
-        correlation, color, place, _, border, _ = stack([sample])
-        logits, offset, _ = net(correlation, color)
+        correlation, smoothed, color, place, _, border, _ = stack([sample])
+        logits, offset, _ = net(correlation, smoothed, color)
         found, surety = place_of(logits.softmax(1), offset)
         start, step = sample.rho
         truth = (start + step * place[0]).numpy()
@@ -143,7 +143,7 @@ def rate_at(step: int, config: TrainConfig) -> float:
     if step < config.warm_up:
         return config.rate * (step + 1) / config.warm_up
     share = (step - config.warm_up) / max(1, config.steps - config.warm_up)
-    return config.rate * 0.5 * (1 + np.cos(np.pi * min(share, 1.0)))
+    return float(config.rate * 0.5 * (1 + np.cos(np.pi * min(share, 1.0))))
 
 
 def train(config: TrainConfig, must_resume: bool = False) -> None:

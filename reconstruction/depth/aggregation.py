@@ -12,12 +12,31 @@ from registry.errors import EnvironmentMissing
 
 WEIGHTS = Path(__file__).parent / "weights" / "aggregation.safetensors"
 PLANES, BINS = 96, 48  # of the sweeps that the network is trained on, and of its input
+_HOPELESS = 508.0  # sum of eight path costs behind the winner from which a bin has no chance
 
 
 def bin_costs(cost: np.ndarray) -> np.ndarray:
     """Return the least cost inside each bin, uint8 (h, w, BINS), of costs (h, w, planes) of at least as many planes."""
     first = np.arange(BINS) * cost.shape[2] // BINS
     return np.minimum.reduceat(cost, first, axis=2)
+
+
+def smoothed_scores(binned: np.ndarray, gray: np.ndarray, small: float, large: float) -> np.ndarray:
+    """Return what semi-global aggregation says of every bin, uint8 (h, w, BINS): 255 for the winner, less for others.
+
+    Args:
+        binned: costs of `bin_costs`.
+        gray: float32 (h, w), gray levels; where they change, so may depth.
+        small: penalty of a change by one bin, in units of correlation.
+        large: penalty of a jump, in units of correlation.
+    """
+    from reconstruction.depth.sgm import aggregate
+
+    p1, p2 = np.int32(max(1, round(127 * small))), np.int32(round(127 * large))
+    total = np.zeros(binned.shape, np.uint16)
+    aggregate(np.ascontiguousarray(binned), gray, p1, p2, p1 + np.int32(1), 8.0, total)
+    behind = (total - total.min(axis=2, keepdims=True)).astype(np.float32)
+    return (255 * (1 - np.minimum(behind / _HOPELESS, 1))).astype(np.uint8)
 
 
 def line_of_places(far: float, near: float, planes: int) -> tuple[float, float]:
@@ -70,7 +89,12 @@ def _first_layers(state: dict) -> list[str]:
 
 
 def aggregate_costs(
-    cost: np.ndarray, color: np.ndarray, rhos: np.ndarray, weights: Path = WEIGHTS
+    cost: np.ndarray,
+    color: np.ndarray,
+    gray: np.ndarray,
+    rhos: np.ndarray,
+    penalties: tuple[float, float],
+    weights: Path = WEIGHTS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return inverse depth float32 (h, w) and the probability float32 (h, w) of the surface that it is on.
 
@@ -79,7 +103,9 @@ def aggregate_costs(
     Args:
         cost: uint8 (h, w, planes), 127 * (1 - correlation); 127 where no source sees the pixel.
         color: (h, w, 3), 0 to 255.
+        gray: float32 (h, w), gray levels.
         rhos: (planes,) inverse depth of the planes, evenly spaced, far to near.
+        penalties: Of small and of large changes, in units of correlation, as `smoothed_scores` takes them.
         weights: Of the network.
     """
     import torch
@@ -88,12 +114,14 @@ def aggregate_costs(
 
     torch.set_num_threads(1)
     h, w = cost.shape[:2]
-    correlation = np.float32(1) - bin_costs(cost).astype(np.float32) / 127
+    binned = bin_costs(cost)
+    correlation = np.float32(1) - binned.astype(np.float32) / 127
+    smoothed = smoothed_scores(binned, gray, *penalties).astype(np.float32) / 255
     picture = color.astype(np.float32) / 255
     spare = ((0, h % 2), (0, w % 2), (0, 0))
     tensors = [
         torch.from_numpy(np.pad(array, spare, mode="edge")).permute(2, 0, 1)[None]
-        for array in (correlation, picture)
+        for array in (correlation, smoothed, picture)
     ]
     with torch.inference_mode():
         logits, offset, _ = load_network(weights)(*tensors)

@@ -125,7 +125,9 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
         rhos = np.linspace(1.0 / plan.far[i], 1.0 / plan.near[i], config.planes)
         cost = sweep_frame(i, small_gray, posed, small, plan, rhos, config.noise_gray)
         if learned:
-            coarse, sure = aggregate_costs(cost, _small_color(posed.images[i], small), rhos)
+            picture = _small_color(posed.images[i], small)
+            penalties = config.smooth_small, config.smooth_large
+            coarse, sure = aggregate_costs(cost, picture, small_gray[i], rhos, penalties)
             surety_all[i] = cv2.resize(sure, fine_size, interpolation=cv2.INTER_NEAREST)
         else:
             coarse = winner_of(cost, small_gray[i], rhos, config)

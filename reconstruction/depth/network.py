@@ -1,8 +1,8 @@
 """The learned aggregation: matching costs and the picture of a keyframe in, one score for every depth bin out.
 
 A U-Net of 2D convolutions over the plane sweep's costs, planes as channels (SimpleRecon, Sayed et al., ECCV 2022). Its
-output is added to the correlations themselves, so that the untrained network is winner-takes-all, and training only
-has to learn how neighbors, edges of the picture and blank regions change that.
+output is added to what semi-global aggregation says, so that the untrained network is that, and training only has to
+learn where it is wrong: beside occlusion borders and on blank regions.
 """
 
 from itertools import pairwise
@@ -61,25 +61,27 @@ class Aggregation(nn.Module):
     def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
         """Make the layers; the last one starts at zero."""
         super().__init__()
-        self.sharpness = nn.Parameter(torch.tensor(8.0))
-        self.costs = nn.Conv2d(BINS, 40, 2, stride=2)
+        self.sharpness = nn.Parameter(torch.tensor(24.0))
+        self.costs = nn.Conv2d(2 * BINS, 40, 2, stride=2)
         self.unet = UNet(40 + 12, tuple(widths))
         outputs = BINS + 1 + 2 * len(OFFSETS_PX)
         self.leave = nn.Conv2d(widths[0], 4 * outputs, 1)
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)
 
-    def forward(self, correlation: torch.Tensor, color: torch.Tensor):
+    def forward(self, correlation: torch.Tensor, smoothed: torch.Tensor, color: torch.Tensor):
         """Return logits (b, bins, h, w), offset in bins (b, h, w) and affinity logits (b, 6, h, w).
 
         Args:
             correlation: (b, bins, h, w), -1 to 1, best correlation inside each bin, far to near; 0 = unknown. Height
                 and width are even.
+            smoothed: (b, bins, h, w), 0 to 1, what semi-global aggregation says of each bin, 1 for its winner.
             color: (b, 3, h, w), 0 to 1.
         """
-        features = torch.cat([self.costs(correlation), functional.pixel_unshuffle(color - 0.5, 2)], 1)
+        matched = self.costs(torch.cat([correlation, smoothed], 1))
+        features = torch.cat([matched, functional.pixel_unshuffle(color - 0.5, 2)], 1)
         out = functional.pixel_shuffle(self.leave(self.unet(features)), 2)
-        logits = self.sharpness * correlation + out[:, :BINS]
+        logits = self.sharpness * smoothed + out[:, :BINS]
         return logits, torch.tanh(out[:, BINS]), out[:, BINS + 1 :]
 
 
