@@ -62,6 +62,7 @@ def load_network(weights: Path = WEIGHTS):
         EnvironmentMissing: the file is not there or not what this version reads.
     """
     import torch
+    from safetensors import SafetensorError
     from safetensors.torch import load_file
     from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -71,7 +72,7 @@ def load_network(weights: Path = WEIGHTS):
         state = load_file(weights)
         network = Aggregation(tuple(state[f"unet.{name}.weight"].shape[0] for name in _first_layers(state)))
         network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
-    except (OSError, KeyError, RuntimeError) as error:
+    except (OSError, KeyError, RuntimeError, SafetensorError) as error:
         raise EnvironmentMissing(
             f"depth: the weights {weights} cannot be read ({error}). Install the package again, or turn them off with "
             "--set depth.prior=none."

@@ -18,7 +18,6 @@ from registry.geometry import invert_rigid
 _MAX_LABELS = 20
 _RIM_SHARE = 0.15  # of a blank region's rim that has to lie on one plane: much is skirts of what stands there
 _LIMITS = (66, 16)
-_NEAR_PLANE = 0.03  # relative depth up to which a predicted pixel is moved onto its plane
 
 
 def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarray:
@@ -111,14 +110,10 @@ def _view_planes(
 
 
 def complete_depth(
-    posed: PosedFrames, camera: Camera, plan: ViewPlan, depth: np.ndarray, predicted: np.ndarray, raw: np.ndarray,
-    config: DepthConfig, each: Callable, progress: Progress,
+    posed: PosedFrames, camera: Camera, plan: ViewPlan, depth: np.ndarray, raw: np.ndarray, config: DepthConfig,
+    each: Callable, progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return completed depth and confidence (n, h, w): 2 measured, 1 completed, 0 unknown.
-
-    `predicted` (n, h, w) is the learned aggregation's depth where nothing is measured, 0 elsewhere: it moves onto the
-    plane that its pixel chooses, if that is near.
-    """
+    """Return completed depth and confidence (n, h, w): 2 measured, 1 completed, 0 unknown."""
     import cv2
 
     from reconstruction.depth.blank_walls import fill_walls
@@ -159,11 +154,6 @@ def complete_depth(
     bounds = plane_extents(planes, points, normals, depths, tolerance=0.006)
     doubt = 14.0 * _crooked(planes)
     out, confidence = gapless.copy(), np.where(depth > 0, 2, np.where(gapless > 0, 1, 0)).astype(np.uint8)
-    loose = (predicted > 0) & (out == 0)
-    out[loose], confidence[loose] = predicted[loose], 1
-    for i in range(n):
-        together = np.where(loose[i], predicted[i], depth[i])
-        maps[i] = cv2.resize(together, size, interpolation=cv2.INTER_NEAREST)
     k = np.array([small.fx, small.fy, small.cx, small.cy])
 
     def complete(i: int) -> None:
@@ -206,14 +196,13 @@ def complete_depth(
         if limit == _LIMITS[0]:
             _fill_regions(label, cost, maps[i] > 0, color.astype(np.float32))
         label = cv2.resize(label.astype(np.int16), (w, h), interpolation=cv2.INTER_NEAREST)
-        y, x = np.nonzero((label >= 0) & ((out[i] == 0) | loose[i]))
+        y, x = np.nonzero((label >= 0) & (out[i] == 0))
         rays = np.stack(
             [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))], 1
         )
         plane = local[label[y, x]]
         z = -plane[:, 3] / np.einsum("ij,ij->i", plane[:, :3], rays)
-        before = out[i, y, x]
-        good = np.isfinite(z) & (z > 0) & ((before == 0) | (np.abs(z - before) < _NEAR_PLANE * before))
+        good = np.isfinite(z) & (z > 0)
         out[i, y[good], x[good]] = z[good]
         confidence[i, y[good], x[good]] = 1
 
@@ -224,7 +213,7 @@ def complete_depth(
         relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
         keep = np.zeros((h, w), bool)
         confirm_fill(i, rows, filled, trust, relative, fine, keep)
-        drop = (trust[i] == 1) & ~keep & (gapless[i] == 0) & ~loose[i]
+        drop = (trust[i] == 1) & ~keep & (gapless[i] == 0)
         out[i][drop] = 0
         confidence[i][drop] = 0
 

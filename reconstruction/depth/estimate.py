@@ -15,6 +15,7 @@ from registry.errors import InputError
 from registry.geometry import invert_rigid
 
 _COMPLETED_SAY = 0.3  # what a completed pixel is worth beside the correlation of a measured one
+_BEND_REACH = 0.06  # of the width: how far known depth bends predictions beside it
 _SURE_CORRELATION = 0.5  # a pixel that changed its surface counts as measured from here on
 
 
@@ -99,9 +100,9 @@ def winner_of(cost: np.ndarray, gray: np.ndarray, rhos: np.ndarray, config: Dept
 
 
 def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers, progress):
-    """Sweep, aggregate and refine every frame; return inverse depth, correlation and surety (n, h, w).
+    """Sweep, aggregate and refine every frame; return inverse depth and correlation (n, h, w).
 
-    Surety is the learned aggregation's probability of the surface, 0 without it.
+    Beside them the learned aggregation's inverse depth and the probability of its surface (n, h, w), empty without it.
     """
     import cv2
 
@@ -115,7 +116,8 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
     shape = (camera.height, camera.width)
     rho_all = np.zeros((len(fine_gray), *shape), np.float32)
     score_all = np.full((len(fine_gray), *shape), -1.0, np.float32)
-    surety_all = np.zeros(rho_all.shape, np.float32)
+    predicted_all = np.zeros(rho_all.shape if learned else 0, np.float32)
+    surety_all = np.zeros_like(predicted_all)
     fine_size = (camera.width, camera.height)
 
     def work(i: int) -> None:
@@ -124,14 +126,16 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
             return
         rhos = np.linspace(1.0 / plan.far[i], 1.0 / plan.near[i], config.planes)
         cost = sweep_frame(i, small_gray, posed, small, plan, rhos, config.noise_gray)
+        coarse = winner_of(cost, small_gray[i], rhos, config)
         if learned:
-            picture = _small_color(posed.images[i], small)
-            penalties = config.smooth_small, config.smooth_large
-            coarse, sure = aggregate_costs(cost, picture, small_gray[i], rhos, penalties)
+            picture, penalties = (
+                _small_color(posed.images[i], small),
+                (config.smooth_small, config.smooth_large),
+            )
+            predicted, sure = aggregate_costs(cost, picture, small_gray[i], rhos, penalties)
+            predicted_all[i] = cv2.resize(predicted, fine_size, interpolation=cv2.INTER_NEAREST)
             surety_all[i] = cv2.resize(sure, fine_size, interpolation=cv2.INTER_NEAREST)
-        else:
-            coarse = winner_of(cost, small_gray[i], rhos, config)
-        rho = predicted = cv2.resize(coarse, fine_size, interpolation=cv2.INTER_NEAREST)
+        rho = cv2.resize(coarse, fine_size, interpolation=cv2.INTER_NEAREST)
         warps = [(fine_gray[sources], *_warps(posed, camera, i, sources)) for _, sources in parts]
         fitted, gx, gy = (np.empty(shape, np.float32) for _ in range(3))
         score = np.full(shape, -1.0, np.float32)
@@ -143,14 +147,11 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
                     fine_gray[i], seen, h_inf, shift, fitted, gx, gy, step_px, config.noise_gray, bounds, rho, score
                 )  # fmt: skip
         score_all[i] = score
-        if learned:  # where windows say nothing, the network does
-            rho_all[i] = np.where(score >= 0.6 * config.min_correlation, rho, predicted)
-            return
         fit_slopes(rho, 0.012, fitted, gx, gy)
         sharpen_edges(rho, gx, gy, score, _small_color(posed.images[i], camera), rho_all[i])
 
     workers.each(len(fine_gray), work, "measuring depth", progress)
-    return rho_all, score_all, surety_all
+    return rho_all, score_all, predicted_all, surety_all
 
 
 def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthConfig, workers, progress):
@@ -177,22 +178,43 @@ def _agree(posed, camera: Camera, plan: ViewPlan, depth, score, config: DepthCon
     return fused, count
 
 
-def _believe(
-    posed, camera: Camera, plan: ViewPlan, raw, surety, depth, config: DepthConfig, workers, progress
-) -> np.ndarray:
-    """Return predicted depth (n, h, w) where nothing is measured, the network is sure and others predict the same."""
+def _fill_predicted(
+    posed,
+    camera: Camera,
+    plan: ViewPlan,
+    predicted,
+    surety,
+    depth,
+    confidence,
+    config: DepthConfig,
+    workers,
+    progress,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill unknown depth where the network is sure and other views see or predict the same; return both maps anew.
+
+    Each frame's prediction is first bent onto the depth that is known around a hole.
+    """
     from reconstruction.depth.consistency import check_view, count_witnesses, remove_speckles
+    from reconstruction.depth.monocular import residual_field
 
     k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    said = np.where((depth > 0) | (surety < config.prior_surety), depth, raw)
+    said, taken = depth.copy(), np.zeros_like(depth)
     weight = np.where(depth > 0, 1.0, surety).astype(np.float32)
-    taken = np.zeros(depth.shape, np.float32)
+    reach, reach_px = config.prior_agree_depth, config.prior_agree_px
 
-    def work(i: int) -> None:
+    def bend(i: int) -> None:
+        rho = np.maximum(predicted[i], 1e-9)
+        ratio = 1.0 / (np.maximum(depth[i], 1e-9) * rho)
+        near = (depth[i] > 0) & (np.abs(ratio - 1) < 4 * reach)
+        bent = 1.0 / (rho * np.exp(residual_field(ratio, near, _BEND_REACH * camera.width)))
+        said[i] = np.where(
+            (depth[i] == 0) & (predicted[i] > 0) & (surety[i] >= config.prior_surety), bent, depth[i]
+        )
+
+    def believe(i: int) -> None:
         rows = plan.neighbors[i]
         relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
         count, fused = np.zeros(depth.shape[1:], np.uint8), np.zeros(depth.shape[1:], np.float32)
-        reach, reach_px = config.prior_agree_depth, config.prior_agree_px
         check_view(i, rows, said, weight, relative, k, reach, reach_px, count, fused)
         asked = (depth[i] == 0) & (said[i] > 0)
         agree, through = np.zeros_like(count), np.zeros_like(count)
@@ -201,8 +223,10 @@ def _believe(
         together = np.where(depth[i] > 0, depth[i], taken[i])
         taken[i] *= remove_speckles(together, config.min_speckle_px, reach)
 
-    workers.each(len(depth), work, "comparing predictions", progress)
-    return taken
+    workers.each(len(depth), bend, "bending predictions", progress)
+    workers.each(len(depth), believe, "comparing predictions", progress)
+    progress.note(f"depth: the network filled {100 * float((taken > 0).mean()):.1f} % of the pixels")
+    return np.where(taken > 0, taken, depth), np.where(taken > 0, 1, confidence).astype(np.uint8)
 
 
 def _resolve(
@@ -288,7 +312,7 @@ def estimate_depth(
     camera = sized_camera(posed.camera, config.depth_side_px)
     plan = plan_views(posed, config)
     workers = _Workers(config.threads)
-    rho, score, surety = _measure(posed, camera, plan, config, workers, progress)
+    rho, score, predicted, surety = _measure(posed, camera, plan, config, workers, progress)
     raw = np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0).astype(np.float32)
     depth, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
     confidence = np.where(depth > 0, 2, 0).astype(np.uint8)
@@ -298,20 +322,16 @@ def estimate_depth(
             f"depth: only {100 * share:.1f} % of the pixels could be measured. The frames are blurred, blank or do "
             "not move sideways: film textured things with steady sideways motion and enough light."
         )
-    predicted = np.zeros_like(depth)
-    if config.prior != "none":
-        predicted = _believe(posed, camera, plan, raw, surety, depth, config, workers, progress)
     if config.complete:
         from reconstruction.depth.complete import complete_depth
 
-        depth, confidence = complete_depth(
-            posed, camera, plan, depth, predicted, raw, config, workers.each, progress
-        )
-    else:
-        depth, confidence = np.where(depth > 0, depth, predicted), np.where(predicted > 0, 1, confidence)
-        confidence = confidence.astype(np.uint8)
+        depth, confidence = complete_depth(posed, camera, plan, depth, raw, config, workers.each, progress)
     if config.edge_rounds > 0:
         depth, confidence = _resolve(posed, camera, plan, depth, confidence, score, config, workers, progress)
+    if config.prior != "none":
+        depth, confidence = _fill_predicted(
+            posed, camera, plan, predicted, surety, depth, confidence, config, workers, progress
+        )
     if backend is not None:
         depth, confidence = fill_from_predictions(
             posed, camera, plan, depth, confidence, backend, config, workers.each, progress

@@ -2,12 +2,13 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from reconstruction.depth import aggregation
+from reconstruction.depth import DepthConfig, aggregation, estimate_depth
 from reconstruction.depth.aggregation import (
     BINS,
     PLANES,
@@ -15,9 +16,11 @@ from reconstruction.depth.aggregation import (
     bin_costs,
     line_of_places,
     place_of_depth,
+    smoothed_scores,
 )
 from reconstruction.depth.network import Aggregation, place_of
 from registry.errors import EnvironmentMissing
+from synthetic.capture import make_test_capture
 
 
 def test_a_bin_has_the_least_cost_of_its_planes():
@@ -36,19 +39,29 @@ def test_places_are_where_the_planes_are():
     assert line_of_places(far, near, PLANES) == (start, step)
 
 
-def test_the_untrained_network_is_winner_takes_all():
+def test_the_untrained_network_says_what_semi_global_aggregation_says():
     torch.manual_seed(0)
-    correlation = torch.rand(1, BINS, 16, 24) * 0.2
+    smoothed = torch.rand(1, BINS, 16, 24) * 0.6
     best = torch.randint(3, BINS - 3, (1, 1, 16, 24))
-    correlation.scatter_(1, best, 1.0)
+    smoothed.scatter_(1, best, 1.0)
+    correlation, color = torch.rand(1, BINS, 16, 24), torch.rand(1, 3, 16, 24)
     with torch.inference_mode():
-        logits, offset, affinity = Aggregation().eval()(correlation, torch.rand(1, 3, 16, 24))
+        logits, offset, affinity = Aggregation().eval()(correlation, smoothed, color)
     assert torch.equal(logits.argmax(1), best[:, 0])
     assert affinity.shape == (1, 6, 16, 24)
     place, total = place_of(logits.softmax(1), offset)
     assert (place - best[:, 0]).abs().max() < 0.6
     assert total.min() > 0
     assert total.max() <= 1 + 1e-6
+
+
+def test_smoothed_scores_put_the_least_cost_first_and_spread_it_over_blank_pixels():
+    cost = np.full((20, 30, BINS), 120, np.uint8)
+    cost[:, 8:, 30] = 10  # textured to the right, blank to the left
+    scores = smoothed_scores(cost, np.zeros((20, 30), np.float32), 0.06, 0.45)
+    assert (scores.argmax(2) == 30).all()
+    assert scores.max() == 255
+    assert scores[10, 20].astype(int)[[29, 31]].max() < 255
 
 
 def test_a_second_surface_has_no_say_in_the_place():
@@ -72,7 +85,9 @@ def test_missing_weights_say_what_to_do(tmp_path):
 def some_costs():
     rng = np.random.default_rng(1)
     cost = rng.integers(60, 200, (61, 83, 72)).astype(np.uint8)  # odd sizes, the fast preset's planes
-    return cost, rng.uniform(0, 255, (61, 83, 3)), np.linspace(0.2, 2.0, 72)
+    color = rng.uniform(0, 255, (61, 83, 3))
+    gray = (color.mean(2) - 128).astype(np.float32)
+    return cost, color, gray, np.linspace(0.2, 2.0, 72), (0.06, 0.45)
 
 
 def test_threads_do_not_change_the_result(some_costs):
@@ -92,3 +107,19 @@ def test_the_weights_are_small_and_load_quickly():
     started = time.process_time()
     aggregation.load_network()
     assert time.process_time() - started < 3.0  # .1 s on a machine at rest
+
+
+def test_predictions_fill_what_is_unknown_and_change_nothing_else():
+    capture = make_test_capture(10, 160, 120)
+    plain = DepthConfig(depth_side_px=160, sweep_side_px=160, complete=False)
+    before = estimate_depth(capture.posed, plain)
+    after = estimate_depth(capture.posed, replace(plain, prior="aggregation", prior_surety=0.3))
+    known = before.depth > 0
+    assert np.array_equal(before.depth[known], after.depth[known])
+    assert np.array_equal(before.confidence[known], after.confidence[known])
+    new = (after.depth > 0) & ~known
+    assert new.mean() > 0.005
+    assert (after.confidence[new] == 1).all()
+    truth = capture.depth.depth
+    off = np.abs(after.depth[new & (truth > 0)] / truth[new & (truth > 0)] - 1)
+    assert np.median(off) < 0.05
