@@ -56,7 +56,7 @@ class DepthConfig:
     prior: Literal["none", "aggregation"] = "none"
     """The network that aggregates the costs (docs/priors.md); "none": semi-global aggregation."""
 
-    prior_surety: float = 0.5
+    prior_surety: float = 0.7
     """Probability from which the network's depth is asked for where windows measure nothing."""
 
     prior_agree_depth: float = 0.03

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from reconstruction.depth.estimate import _sweep, _warps
+from reconstruction.depth.estimate import _warps, sweep_frame
 from reconstruction.depth.refine import fit_slopes, refine
 from reconstruction.depth.sweep import sweep_costs
 from reconstruction.depth.views import ViewPlan, frame_parts
@@ -72,7 +72,7 @@ def test_parts_with_the_same_sources_are_the_whole(images) -> None:
     posed = SimpleNamespace(world_from_camera=poses)
     rhos = np.array([0.2, 0.6, 0.9])
     plan = ViewPlan(np.tile(np.array([1, 2]), (3, 4, 1)), np.zeros((3, 0)), np.ones(3), np.ones(3))
-    parts = _sweep(0, images, posed, camera, plan, rhos, NOISE)
+    parts = sweep_frame(0, images, posed, camera, plan, rhos, NOISE)
     whole = np.empty((3, H, W), np.uint8)
     h_inf, shift = _warps(posed, camera, 0, np.array([1, 2]))
     sweep_costs(images[0], images[1:], h_inf, shift, rhos, NOISE, whole)
@@ -98,7 +98,7 @@ def test_part_without_sources_has_no_evidence(images) -> None:
     plan = ViewPlan(sources, np.zeros((1, 0)), np.ones(1), np.ones(1))
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[1:, 0, 3] = 0.2, -0.15
-    cost = _sweep(
+    cost = sweep_frame(
         0, images, SimpleNamespace(world_from_camera=poses), camera, plan, np.array([0.2, 0.9]), NOISE
     )
     top, bottom, left, right = frame_parts(H, W)[1]
