@@ -71,7 +71,7 @@ def filmed():
     rng = np.random.default_rng(0)
     vertices, faces, kinds = room()
     images, depth, kind_maps, poses, points, seen = [], [], [], [], [], []
-    for i, angle in enumerate(np.linspace(-0.45, 0.45, 11)):
+    for i, angle in enumerate(np.linspace(-0.45, 0.45, 14)):
         pose = look_at(
             (1.7 * np.sin(angle), -1.5 * np.cos(angle), 1.0 + 0.08 * np.sin(4 * angle)), (0, 0.1, 0.3)
         )
