@@ -20,6 +20,7 @@ from priors.rooms import SPLITS, Film, draw_film
 from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.depth.estimate import sized_camera
 from reconstruction.types import PosedFrames
+from registry.errors import InputError, UsageError
 from synthetic.film import render_truth
 
 FIGURES = ("known", "measured", "median_rel", "off", "on_things", "on_things_each", "ring")
@@ -40,14 +41,18 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--json", type=Path, help="write all figures there")
     options = parser.parse_args(arguments)
-    variants = {text: _config(text, parser) for text in options.set or ["prior=none", ""]}
+    variants = {text: _config(text, parser) for text in options.set or ["prior=none", "prior=aggregation"]}
     figures: dict[str, dict[str, list[dict]]] = {
         text: {split: [] for split in options.splits} for text in variants
     }
     for split in options.splits:
         for number in range(options.first, options.first + options.rooms):
-            film = draw_film(split, number, photographs=options.photographs)
-            posed, views = filmed(film, options.frames)
+            try:
+                film = draw_film(split, number, photographs=options.photographs)
+                posed, views = filmed(film, options.frames)
+            except (InputError, UsageError) as error:
+                print(f"{split} {number}: left out, {error}", flush=True)
+                continue
             names = {i: str(i) for view in views for i in np.unique(view.ids) if i > film.base_entities}
             for text, config in variants.items():
                 maps = estimate_depth(posed, config)

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-BINS = 48
-"""Bins of inverse depth between the far and the near end of a keyframe's range."""
+from reconstruction.depth.aggregation import BINS
+
 OFFSETS_PX = (1, 4, 12)
 """Distances at which the network says whether two pixels are of one thing, to the right and downwards."""
 

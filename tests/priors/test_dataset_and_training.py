@@ -10,7 +10,7 @@ import yaml
 from priors import dataset, train
 from priors.rooms import HELD_OUT, SPLITS, families_of
 from priors.samples import border_of, draw_sample, load_sample, open_rooms
-from reconstruction.depth.network import BINS
+from reconstruction.depth.aggregation import BINS
 
 FRAMES = 4
 
