@@ -1,7 +1,7 @@
 """Film generated rooms, run the pipeline's depth on them, and keep what it measured beside the truth.
 
     python -m priors.dataset OUT --rooms 200 [--split train] [--seed 0] [--frames 20] [--photographs DIR]
-                             [--until costs|winner|depth|gaussians|surface] [--cameras noisy|true] [--processes 2]
+                             [--keep costs winner depth gaussians surface] [--cameras noisy|true] [--processes 2]
 
 Every room is a folder `OUT/<split>/<number>` of arrays (see `priors.samples.ARRAYS`), written whole or not at all: kill
 and start again at any time. `manifest.json` lists every room with its families and the SHA-256 of its arrays.
@@ -22,13 +22,15 @@ from pathlib import Path
 import numpy as np
 
 from priors.rooms import SPLITS, Film, draw_film
-from reconstruction.types import PosedFrames
+from reconstruction.depth import DepthConfig
+from reconstruction.types import DepthMaps, PosedFrames
 from registry.errors import InputError, UsageError
 from synthetic.capture import posed_capture
 from synthetic.film import film_room, render_truth
 
 WIDTH, HEIGHT = 480, 360
-UNTIL = ("costs", "winner", "depth", "gaussians", "surface")
+KEEP = ("costs", "winner", "depth", "gaussians", "surface")
+_PREDICTED_FROM = 0.4  # surety from which predictions are offered to the mending network, to be judged by it
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -61,7 +63,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="number of the first room (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=20, help="keyframes a room (default: %(default)s)")
     parser.add_argument("--photographs", type=Path, help="folder of pictures that materials may show")
-    parser.add_argument("--until", choices=UNTIL, default="depth", help="last stage (default: %(default)s)")
+    parser.add_argument(
+        "--keep",
+        nargs="+",
+        choices=KEEP,
+        default=["costs", "depth"],
+        help="which arrays (default: costs depth)",
+    )
     parser.add_argument(
         "--cameras", choices=("noisy", "true"), default="noisy",
         help="noisy: moved by what estimated cameras are typically off by (default)",
@@ -98,14 +106,14 @@ def _write_room(options: argparse.Namespace, number: int) -> str:
     part.mkdir(parents=True)
     started = time.process_time()
     film = draw_film(options.split, number, photographs=options.photographs)
-    arrays = measure_film(film, options.frames, options.cameras, options.until)
+    arrays = measure_film(film, options.frames, options.cameras, set(options.keep))
     digests = {}
     for name, array in arrays.items():
         np.save(part / f"{name}.npy", array)
         digests[name] = hashlib.sha256((part / f"{name}.npy").read_bytes()).hexdigest()
     about = {
         "split": options.split, "number": number, "frames": options.frames, "cameras": options.cameras,
-        "until": options.until, "film": film.describe(), "sha256": digests,
+        "keep": sorted(options.keep), "film": film.describe(), "sha256": digests,
     }  # fmt: skip
     (part / "room.json").write_text(json.dumps(about, indent=1) + "\n")
     shutil.rmtree(final, ignore_errors=True)
@@ -122,18 +130,33 @@ def film_frames(film: Film, frames: int, cameras: str) -> tuple[PosedFrames, np.
     return (replace(posed, world_from_camera=film.shaken(path)) if cameras == "noisy" else posed), path
 
 
-def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str, np.ndarray]:
-    """Film a stretch of a walk and measure it; arrays by name, at sweep resolution (h, w) unless said otherwise."""
+def measure_film(film: Film, frames: int, cameras: str, keep: set[str]) -> dict[str, np.ndarray]:
+    """Film a stretch of a walk and measure it; arrays by name, see `priors.samples.ARRAYS`."""
+    from priors.surfaces import measure_surface
+
+    posed, path = film_frames(film, frames, cameras)
+    config = DepthConfig(threads=1, prior="aggregation", prior_surety=_PREDICTED_FROM)
+    out = {"world_from_camera": path}
+    if keep & {"costs", "winner"}:
+        out |= _measure_costs(film, posed, path, config, "winner" in keep)
+    if keep & {"depth", "gaussians", "surface"}:
+        found, maps = _measure_depth(film, posed, path, config)
+        out |= found
+        if keep & {"gaussians", "surface"}:
+            out |= measure_surface(film.film_set, posed, maps, "surface" in keep)
+    return out
+
+
+def _measure_costs(
+    film: Film, posed: PosedFrames, path: np.ndarray, config: DepthConfig, winner: bool
+) -> dict:
+    """Return the arrays at sweep resolution: costs, and the truth."""
     import cv2
 
-    from priors.surfaces import measure_surface
-    from reconstruction.depth import DepthConfig, estimate_depth
     from reconstruction.depth.aggregation import bin_costs, smoothed_scores
     from reconstruction.depth.estimate import gray_images, sized_camera, sweep_frame, winner_of
     from reconstruction.depth.views import plan_views
 
-    posed, path = film_frames(film, frames, cameras)
-    config = DepthConfig(threads=1)
     small = sized_camera(posed.camera, config.sweep_side_px)
     plan = plan_views(posed, config)
     gray = gray_images(posed.images, small)
@@ -144,7 +167,7 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
         cost = sweep_frame(row, gray, posed, small, plan, rhos, config.noise_gray)
         costs.append(bin_costs(cost))
         smoothed.append(smoothed_scores(costs[-1], gray[row], config.smooth_small, config.smooth_large))
-        if until != "costs":
+        if winner:
             winners.append(1.0 / winner_of(cost, gray[row], rhos, config))
     exact = [render_truth(film.film_set, small, pose) for pose in path]
     out = {
@@ -154,19 +177,41 @@ def measure_film(film: Film, frames: int, cameras: str, until: str) -> dict[str,
         "true_depth": np.stack([d for d, _ in exact]).astype(np.float32),
         "true_ids": np.stack([i for _, i in exact]),
         "range": np.stack([plan.far, plan.near], 1),
-        "world_from_camera": path,
         "intrinsics": np.array([small.fx, small.fy, small.cx, small.cy]),
     }
-    if until == "costs":
-        return out
-    out["winner"] = np.stack(winners).astype(np.float32)
-    if until == "winner":
-        return out
-    maps = estimate_depth(posed, config)
-    out |= {"depth": maps.depth.astype(np.float16), "confidence": maps.confidence}
-    if until in ("gaussians", "surface"):
-        out |= measure_surface(film.film_set, posed, maps, until)
-    return out
+    return out | ({"winner": np.stack(winners).astype(np.float32)} if winner else {})
+
+
+def _measure_depth(film: Film, posed: PosedFrames, path: np.ndarray, config: DepthConfig):
+    """Return the arrays at depth resolution, what the mending network sees and the truth; and the finished maps."""
+    import cv2
+
+    from reconstruction.depth.estimate import Workers, gather_evidence
+    from reconstruction.depth.evidence import PREDICTED, count_views
+
+    found = gather_evidence(posed, config)
+    camera, each = found.camera, Workers(1).each
+    agree, through = count_views(found.depth, posed, camera, found.neighbors, each)
+    agreed_agree, agreed_through = count_views(found.agreed, posed, camera, found.neighbors, each)
+    exact = [render_truth(film.film_set, camera, pose) for pose in path]
+    size = (camera.width, camera.height)
+    out = {
+        "picture": np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in posed.images]),
+        "depth": found.depth.astype(np.float16),
+        "origin": found.origin,
+        "agree": agree,
+        "through": through,
+        "agreed": found.agreed.astype(np.float16),
+        "agreed_agree": agreed_agree,
+        "agreed_through": agreed_through,
+        "correlation": np.round(100 * np.clip(found.correlation, 0, 1)).astype(np.uint8),
+        "surety": np.round(100 * found.surety).astype(np.uint8),
+        "exact_depth": np.stack([z for z, _ in exact]).astype(np.float16),
+        "exact_ids": np.stack([i for _, i in exact]).astype(np.uint16),
+        "focal": np.array([camera.fx, camera.fy]),
+    }
+    confidence = np.where(found.origin == PREDICTED, 1, found.origin).astype(np.uint8)
+    return out, DepthMaps(camera, found.depth, confidence)
 
 
 def write_manifest(out: Path) -> None:

@@ -14,8 +14,18 @@ ARRAYS = {
     "winner": "float32 (n, h, w) depth by semi-global aggregation, the hand-made way",
     "true_depth": "float32 (n, h, w) z-depth in metres, 0 = nothing",
     "true_ids": "uint16 (n, h, w) entities, 0 = nothing",
-    "depth": "float16 (n, H, W) the pipeline's finished depth at depth resolution, 0 = unknown",
-    "confidence": "uint8 (n, H, W) 0 unknown, 1 completed, 2 measured",
+    "picture": "uint8 (n, H, W, 3) keyframes at depth resolution",
+    "depth": "float16 (n, H, W) the pipeline's depth before mending, 0 = unknown",
+    "origin": "uint8 (n, H, W) 0 unknown, 1 completed, 2 measured, 3 predicted",
+    "agree": "uint8 (n, H, W) views that see the same point as `depth`",
+    "through": "uint8 (n, H, W) views that look through it",
+    "agreed": "float16 (n, H, W) what was measured and confirmed, before completion",
+    "agreed_agree": "uint8 (n, H, W) views that see the same point as `agreed`",
+    "agreed_through": "uint8 (n, H, W) views that look through it",
+    "correlation": "uint8 (n, H, W) of the refined windows, percent",
+    "surety": "uint8 (n, H, W) of predicted depth, percent",
+    "exact_depth": "float16 (n, H, W) z-depth in metres, 0 = nothing",
+    "exact_ids": "uint16 (n, H, W) entities, 0 = nothing",
     "range": "float64 (n, 2) far and near end of the sweep",
     "world_from_camera": "float64 (n, 4, 4) true cameras",
     "intrinsics": "float64 (4,) fx, fy, cx, cy at sweep resolution",
@@ -26,7 +36,7 @@ ARRAYS = {
     "mesh_superpoints": "int32 (v,) superpoint of each vertex",
     "mesh_true_ids": "uint16 (v,) true entity of each vertex, 0: farther than 2 cm from all",
 }
-"""What a room's folder may hold; `--until` says how far down the list."""
+"""What a room's folder may hold; `--keep` says which."""
 _CROP = (192, 224)
 _JUMP = 1.03  # ratio of depths from which two neighbors are two surfaces
 
@@ -40,15 +50,16 @@ class Room:
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
-        return len(self.arrays["color"])
+        return len(self.arrays["world_from_camera"])
 
 
-def open_rooms(folder: Path, limit: int = 0) -> list[Room]:
-    """Open the finished rooms of a split, in order."""
-    files = sorted(folder.glob("*/room.json"))[: limit or None]
-    return [
+def open_rooms(folder: Path, needed: tuple[str, ...] = ()) -> list[Room]:
+    """Open the finished rooms of a split that hold all the needed arrays, in order."""
+    files = sorted(folder.glob("*/room.json"))
+    rooms = [
         Room(f.parent, {p.stem: np.load(p, mmap_mode="r") for p in f.parent.glob("*.npy")}) for f in files
     ]
+    return [room for room in rooms if set(needed) <= set(room.arrays)]
 
 
 @dataclass(frozen=True)
@@ -91,7 +102,7 @@ def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
         )
     if rng.random() < 0.7:
         (correlation, smoothed), place, rho = _other_range((correlation, smoothed), place, rho, rng)
-    return Sample(correlation, smoothed, _other_light(color, rng), place, ids, rho)
+    return Sample(correlation, smoothed, other_light(color, rng), place, ids, rho)
 
 
 def _other_range(volumes, place, rho, rng):
@@ -107,7 +118,7 @@ def _other_range(volumes, place, rho, rng):
     return out, moved, (rho[0] + first * rho[1], step * rho[1])
 
 
-def _other_light(color, rng):
+def other_light(color, rng):
     """Another exposure, contrast and color, sometimes gray, blurred, noisy, or no picture at all."""
     import cv2
 

@@ -10,15 +10,15 @@ _ARTIFACT_M = 0.02  # farther from every true surface: what only occlusion borde
 
 
 def measure_surface(
-    film_set: FilmSet, posed: PosedFrames, maps: DepthMaps, until: str
+    film_set: FilmSet, posed: PosedFrames, maps: DepthMaps, mesh: bool
 ) -> dict[str, np.ndarray]:
-    """Return arrays by name: Gaussians' depth; with until="surface" also the mesh with its superpoints and true ids.
+    """Return arrays by name: Gaussians' depth; beside it the mesh with its superpoints and true ids.
 
     Args:
         film_set: The true room, metres.
         posed: Frames in world space, metres.
         maps: Their depth.
-        until: "gaussians" or "surface".
+        mesh: Whether to fuse it.
     """
     from reconstruction.gaussians import GaussiansConfig, make_gaussians
     from reconstruction.instances.superpoints import superpoints
@@ -27,7 +27,7 @@ def measure_surface(
 
     scene = make_gaussians(posed, maps, GaussiansConfig())
     out = {"gaussians_depth": scene.depth.depth.astype(np.float16)}
-    if until == "gaussians":
+    if not mesh:
         return out
     surface = fuse_surface(scene.posed(posed), scene.depth, SurfaceConfig())
     return out | {

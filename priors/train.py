@@ -1,10 +1,10 @@
-"""Train the aggregation network on a dataset of rooms, and export its weights.
+"""Train a network of the depth stage on a dataset of rooms, and export its weights.
 
     python -m priors.train CONFIG.yaml [--resume]
 
 Stop it at any time: `--resume` (or the same command again) goes on from the last checkpoint with the same samples as
 if it had not been stopped. On a CPU all is float32; where there is CUDA, bfloat16 under autocast. Curves:
-`tensorboard --logdir OUT`. The weights that are best on the held-out splits are written to `OUT/best.safetensors`.
+`tensorboard --logdir OUT`. The weights that are best on the held-out splits go to `OUT/best.safetensors`.
 """
 
 import argparse
@@ -17,16 +17,19 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from torch.nn import functional
 
-from priors.samples import Room, draw_sample, load_sample, open_rooms, stack
-from reconstruction.depth.network import OFFSETS_PX, WIDTHS, Aggregation, place_of
+from priors import aggregation, mending
+from priors.samples import Room, open_rooms
+
+NETWORKS = {"aggregation": aggregation, "mending": mending}
+"""What can be trained: modules of a network's samples, loss and figures."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """What is trained, on what, for how long."""
 
+    network: str
     data: str
     out: str
     steps: int = 4000
@@ -37,7 +40,7 @@ class TrainConfig:
     ema: float = 0.998
     seed: int = 0
     threads: int = 0
-    widths: tuple[int, ...] = WIDTHS
+    widths: tuple[int, ...] = ()  # channels at a half, a quarter, ... of the resolution; () = the usual ones
     border_weight: float = 3.0
     affinity_weight: float = 0.2
     check_every: int = 400
@@ -59,83 +62,10 @@ def main(arguments: list[str] | None = None) -> int:
     unknown = set(values) - {f.name for f in fields(TrainConfig)}
     if unknown:
         parser.error(f"{options.config}: unknown fields {sorted(unknown)}")
+    if values.get("network") not in NETWORKS:
+        parser.error(f"{options.config}: network must be one of {', '.join(NETWORKS)}")
     train(TrainConfig(**values), must_resume=options.resume)
     return 0
-
-
-def losses(net: Aggregation, batch, config: TrainConfig) -> dict[str, torch.Tensor]:
-    """Return the parts of the loss of a batch (see `samples.stack`)."""
-    correlation, smoothed, color, place, ids, border, rho = batch
-    logits, offset, affinity = net(correlation, smoothed, color)
-    known = place >= 0
-    weight = known * (1 + config.border_weight * border)
-    total = weight.sum().clamp_min(1)
-    log_share = functional.log_softmax(logits.float(), 1)
-    low = place.clamp_min(0).floor().long().clamp_max(logits.shape[1] - 2)
-    share = (place.clamp_min(0) - low).clamp(0, 1)
-    entropy = -(
-        (1 - share) * log_share.gather(1, low[:, None])[:, 0]
-        + share * log_share.gather(1, low[:, None] + 1)[:, 0]
-    )
-    found, _ = place_of(log_share.exp(), offset.float())
-    start, step = rho[:, 0, None, None], rho[:, 1, None, None]
-    # Relative depth in percent, where the right mode won.
-    error = 100 * step * (found - place).abs() / (start + step * place.clamp_min(0)).clamp_min(1e-6)
-    right = weight * ((found - place).abs() < 2)
-    precision = (
-        right * functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none")
-    ).sum() / total
-    return {
-        "entropy": (weight * entropy).sum() / total,
-        "precision": 0.25 * precision,
-        "affinity": config.affinity_weight * _affinity_loss(affinity.float(), ids),
-    }
-
-
-def _affinity_loss(affinity: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
-    """Cross entropy of `one thing` for pairs to the right and below; pairs of two things weigh more, being few."""
-    parts = []
-    for k, px in enumerate(OFFSETS_PX):
-        for channel, (a, b) in enumerate(((ids[:, :, :-px], ids[:, :, px:]), (ids[:, :-px], ids[:, px:]))):
-            said = affinity[:, 2 * k + channel]
-            said = said[:, :, :-px] if channel == 0 else said[:, :-px]
-            same = (a == b).float()
-            weight = ((a > 0) & (b > 0)) * (1 + 4 * (1 - same))
-            loss = functional.binary_cross_entropy_with_logits(said, same, reduction="none")
-            parts.append((weight * loss).sum() / weight.sum().clamp_min(1))
-    return torch.stack(parts).mean()
-
-
-@torch.inference_mode()
-def check(net: Aggregation, rooms: list[Room], keyframes: int) -> dict[str, float]:
-    """Measure whole keyframes, spread over the rooms: shares of pixels off; semi-global aggregation beside it."""
-    sums: dict[str, list[float]] = {}
-    rng = np.random.default_rng(0)
-    chosen = [(rooms[int(k)], int(rng.integers(1 << 30))) for k in np.linspace(0, len(rooms) - 1, keyframes)]
-    for room, number in chosen:
-        row = number % len(room)
-        sample = load_sample(room, row)
-        correlation, smoothed, color, place, _, border, _ = stack([sample])
-        logits, offset, _ = net(correlation, smoothed, color)
-        found, surety = place_of(logits.softmax(1), offset)
-        start, step = sample.rho
-        truth = (start + step * place[0]).numpy()
-        known, border = (place[0] >= 0).numpy(), border[0].numpy()
-        errors = {"net": (start + step * found[0]).numpy() / truth}
-        if "winner" in room.arrays:
-            errors["sgm"] = 1 / (np.asarray(room.arrays["winner"][row]) * truth)
-        for name, ratio in errors.items():
-            off = np.abs(ratio - 1)
-            for part, mask in (("", known), ("_border", known & border)):
-                if mask.any():
-                    sums.setdefault(f"{name}_off5{part}", []).append(float((off[mask] > 0.05).mean()))
-                    sums.setdefault(f"{name}_off2{part}", []).append(float((off[mask] > 0.02).mean()))
-            sums.setdefault(f"{name}_median", []).append(float(np.median(off[known])))
-        sure = known & (surety[0].numpy() > 0.6)
-        sums.setdefault("sure", []).append(float(sure.sum() / max(known.sum(), 1)))
-        off = np.abs(errors["net"] - 1)
-        sums.setdefault("sure_off5", []).append(float((off[sure] > 0.05).mean()) if sure.any() else 0.0)
-    return {name: float(np.mean(values)) for name, values in sums.items()}
 
 
 def rate_at(step: int, config: TrainConfig) -> float:
@@ -157,8 +87,9 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    net = Aggregation(config.widths).to(device)
-    slow = Aggregation(config.widths).to(device)
+    task = NETWORKS[config.network]
+    net = task.make_network(config).to(device)
+    slow = task.make_network(config).to(device)
     slow.load_state_dict(net.state_dict())
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=config.decay)
     first, best = 0, float("inf")
@@ -179,16 +110,16 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     started, seen = time.perf_counter(), 0
     for step in range(first, config.steps):
         if not rooms or step % config.refresh_every == 0:
-            rooms = open_rooms(data / "train")
-            held = {name: open_rooms(data / name) for name in config.held_out}
+            rooms = open_rooms(data / "train", task.ARRAYS)
+            held = {name: open_rooms(data / name, task.ARRAYS) for name in config.held_out}
         for group in optimizer.param_groups:
             group["lr"] = rate_at(step, config)
         rng = np.random.default_rng((config.seed, step))
-        batch = stack([draw_sample(rooms[int(rng.integers(len(rooms)))], rng) for _ in range(config.batch)])
-        batch = [tensor.to(device) for tensor in batch]
+        samples = [task.draw_sample(rooms[int(rng.integers(len(rooms)))], rng) for _ in range(config.batch)]
+        batch = [tensor.to(device) for tensor in task.stack(samples)]
         net.train()
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
-            parts = losses(net, batch, config)
+            parts = task.losses(net, batch, config)
         total = sum(parts.values())
         optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -213,7 +144,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
             figures = {}
             for name, split in [("train", rooms[-60:]), *held.items()]:
                 if split:
-                    figures[name] = check(
+                    figures[name] = task.check(
                         slow.cpu() if device == "cuda" else slow, split, config.check_keyframes
                     )
                     for key, value in figures[name].items():
@@ -226,7 +157,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
                     json.dumps({"step": step + 1, "seconds": time.perf_counter() - started, **figures}) + "\n"
                 )
             score = np.mean(
-                [figures[n]["net_off2"] for n in figures if n != "train"] or [figures["train"]["net_off2"]]
+                [figures[n][task.SCORE] for n in figures if n != "train"] or [figures["train"][task.SCORE]]
             )
             if score < best:
                 best = float(score)

@@ -3,12 +3,9 @@
 The network and what it was trained on: docs/priors.md. Weights ship with the project.
 """
 
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-
-from registry.errors import EnvironmentMissing
 
 WEIGHTS = Path(__file__).parent / "weights" / "aggregation.safetensors"
 PLANES, BINS = 96, 48  # of the sweeps that the network is trained on, and of its input
@@ -54,41 +51,6 @@ def place_of_depth(depth: np.ndarray, far: float, near: float) -> tuple[np.ndarr
     return np.where(inside, np.clip(place, 0, BINS - 1), -1.0), (start, step)
 
 
-@lru_cache(maxsize=2)
-def load_network(weights: Path = WEIGHTS):
-    """Return the network (`torch.nn.Module`) in evaluation mode, its normalizations folded into the convolutions.
-
-    Raises:
-        EnvironmentMissing: the file is not there or not what this version reads.
-    """
-    import torch
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-    from torch.nn.utils.fusion import fuse_conv_bn_eval
-
-    from reconstruction.depth.network import Aggregation
-
-    try:
-        state = load_file(weights)
-        network = Aggregation(tuple(state[f"unet.{name}.weight"].shape[0] for name in _first_layers(state)))
-        network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
-    except (OSError, KeyError, RuntimeError, SafetensorError) as error:
-        raise EnvironmentMissing(
-            f"depth: the weights {weights} cannot be read ({error}). Install the package again, or turn them off with "
-            "--set depth.prior=none."
-        ) from error
-    network.eval()
-    for module in network.modules():
-        if isinstance(module, torch.nn.Sequential) and isinstance(module[0], torch.nn.Conv2d):
-            module[0], module[1] = fuse_conv_bn_eval(module[0], module[1]), torch.nn.Identity()
-    return network
-
-
-def _first_layers(state: dict) -> list[str]:
-    deeper = sorted({int(k.split(".")[2]) for k in state if k.startswith("unet.down.")})
-    return ["enter.0", *(f"down.{i}.0.0" for i in deeper)]
-
-
 def aggregate_costs(
     cost: np.ndarray,
     color: np.ndarray,
@@ -112,6 +74,7 @@ def aggregate_costs(
     import torch
 
     from reconstruction.depth.network import place_of
+    from reconstruction.depth.weights import load_network
 
     torch.set_num_threads(1)
     h, w = cost.shape[:2]
@@ -125,7 +88,7 @@ def aggregate_costs(
         for array in (correlation, smoothed, picture)
     ]
     with torch.inference_mode():
-        logits, offset, _ = load_network(weights)(*tensors)
+        logits, offset, _ = load_network("aggregation", weights)(*tensors)
         place, surety = place_of(logits.softmax(1), offset)
     start, step = line_of_places(1.0 / rhos[0], 1.0 / rhos[-1], len(rhos))
     rho = start + step * place[0, :h, :w].numpy()

@@ -53,8 +53,9 @@ class DepthConfig:
     min_speckle_px: int = 60
     """Smaller islands of measured depth are dropped."""
 
-    prior: Literal["none", "aggregation"] = "none"
-    """The network that aggregates the costs (docs/priors.md); "none": semi-global aggregation."""
+    prior: Literal["none", "aggregation", "mending", "both"] = "none"
+    """The networks in use (docs/priors.md): one predicts depth from the costs where nothing was measured, one mends
+    finished maps beside occlusion borders."""
 
     prior_surety: float = 0.7
     """Probability from which the network's depth is asked for where windows measure nothing."""
@@ -64,6 +65,12 @@ class DepthConfig:
 
     prior_agree_px: float = 4.0
     """Reprojection error up to which they do, at depth resolution."""
+
+    mend_surety: float = 0.5
+    """Probability from which depth is believed after mending."""
+
+    mend_rounds: int = 1
+    """How often maps are mended."""
 
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from reconstruction.depth.config import DepthConfig
+from reconstruction.depth.evidence import PREDICTED, Evidence
 from reconstruction.depth.monocular import MonocularBackend, fill_from_predictions, load_monocular
 from reconstruction.depth.perturb import perturbed
 from reconstruction.depth.views import ViewPlan, plan_views
@@ -37,7 +38,8 @@ def gray_images(images: np.ndarray, camera: Camera) -> np.ndarray:
     return out
 
 
-def _small_color(image: np.ndarray, camera: Camera) -> np.ndarray:
+def small_color(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return a picture float32 (h, w, 3), 0 to 255, at the camera's resolution."""
     import cv2
 
     size = (camera.width, camera.height)
@@ -51,7 +53,7 @@ def _warps(posed: PosedFrames, camera: Camera, i: int, sources: np.ndarray) -> t
     return k @ relative[:, :3, :3] @ k_inv, relative[:, :3, 3] @ k.T
 
 
-class _Workers:
+class Workers:
     """Runs a function for every frame on a few threads; the kernels release the interpreter."""
 
     def __init__(self, threads: int):
@@ -110,7 +112,7 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
     from reconstruction.depth.edges import sharpen_edges
     from reconstruction.depth.refine import fit_slopes, refine
 
-    learned = config.prior != "none"
+    learned = config.prior in ("aggregation", "both")
     small = sized_camera(camera, config.sweep_side_px)
     fine_gray, small_gray = gray_images(posed.images, camera), gray_images(posed.images, small)
     shape = (camera.height, camera.width)
@@ -129,7 +131,7 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
         coarse = winner_of(cost, small_gray[i], rhos, config)
         if learned:
             picture, penalties = (
-                _small_color(posed.images[i], small),
+                small_color(posed.images[i], small),
                 (config.smooth_small, config.smooth_large),
             )
             predicted, sure = aggregate_costs(cost, picture, small_gray[i], rhos, penalties)
@@ -148,7 +150,7 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
                 )  # fmt: skip
         score_all[i] = score
         fit_slopes(rho, 0.012, fitted, gx, gy)
-        sharpen_edges(rho, gx, gy, score, _small_color(posed.images[i], camera), rho_all[i])
+        sharpen_edges(rho, gx, gy, score, small_color(posed.images[i], camera), rho_all[i])
 
     workers.each(len(fine_gray), work, "measuring depth", progress)
     return rho_all, score_all, predicted_all, surety_all
@@ -248,7 +250,7 @@ def _resolve(
         if not parts:
             return
         warps = [(gray[sources], *_warps(posed, camera, i, sources)) for _, sources in parts]
-        color = _small_color(posed.images[i], camera)
+        color = small_color(posed.images[i], camera)
         rho = np.where(depth[i] > 0, 1.0 / np.maximum(depth[i], 1e-12), 0).astype(np.float32)
         sure = np.choose(confidence[i], [np.float32(0), np.float32(_COMPLETED_SAY), score[i]]).astype(
             np.float32
@@ -291,6 +293,61 @@ def _resolve(
     return out, trust
 
 
+def gather_evidence(
+    posed: PosedFrames,
+    config: DepthConfig,
+    *,
+    backend: MonocularBackend | None = None,
+    progress: Progress = NO_PROGRESS,
+) -> Evidence:
+    """Measure every keyframe, complete it by planes and predictions; return the maps and where each pixel is from.
+
+    Args: as of `estimate_depth`.
+    """
+    camera = sized_camera(posed.camera, config.depth_side_px)
+    plan = plan_views(posed, config)
+    workers = Workers(config.threads)
+    rho, score, predicted, surety = _measure(posed, camera, plan, config, workers, progress)
+    raw = np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0).astype(np.float32)
+    agreed, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
+    depth, confidence = agreed, np.where(agreed > 0, 2, 0).astype(np.uint8)
+    share = float((confidence == 2).mean())
+    if share < 0.02:
+        raise InputError(
+            f"depth: only {100 * share:.1f} % of the pixels could be measured. The frames are blurred, blank or do "
+            "not move sideways: film textured things with steady sideways motion and enough light."
+        )
+    if config.complete:
+        from reconstruction.depth.complete import complete_depth
+
+        depth, confidence = complete_depth(posed, camera, plan, depth, raw, config, workers.each, progress)
+    if config.edge_rounds > 0:
+        depth, confidence = _resolve(posed, camera, plan, depth, confidence, score, config, workers, progress)
+    filled = np.zeros(depth.shape, bool)
+    if len(predicted):
+        unknown = depth == 0
+        depth, confidence = _fill_predicted(
+            posed, camera, plan, predicted, surety, depth, confidence, config, workers, progress
+        )
+        filled = unknown & (depth > 0)
+    if backend is not None:
+        depth, confidence = fill_from_predictions(
+            posed, camera, plan, depth, confidence, backend, config, workers.each, progress
+        )
+    progress.note(
+        f"depth: {100 * share:.0f} % of the pixels measured, {100 * float((confidence == 1).mean()):.0f} % completed"
+    )
+    return Evidence(
+        camera,
+        plan.neighbors,
+        agreed,
+        depth,
+        np.where(filled, PREDICTED, confidence).astype(np.uint8),
+        score,
+        surety,
+    )
+
+
 def estimate_depth(
     posed: PosedFrames,
     config: DepthConfig,
@@ -309,36 +366,13 @@ def estimate_depth(
     backend = backend or load_monocular(
         config
     )  # a model that is not there is told before the work, not after
-    camera = sized_camera(posed.camera, config.depth_side_px)
-    plan = plan_views(posed, config)
-    workers = _Workers(config.threads)
-    rho, score, predicted, surety = _measure(posed, camera, plan, config, workers, progress)
-    raw = np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0).astype(np.float32)
-    depth, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
-    confidence = np.where(depth > 0, 2, 0).astype(np.uint8)
-    share = float((confidence == 2).mean())
-    if share < 0.02:
-        raise InputError(
-            f"depth: only {100 * share:.1f} % of the pixels could be measured. The frames are blurred, blank or do "
-            "not move sideways: film textured things with steady sideways motion and enough light."
-        )
-    if config.complete:
-        from reconstruction.depth.complete import complete_depth
+    found = gather_evidence(posed, config, backend=backend, progress=progress)
+    if config.prior in ("mending", "both"):
+        from reconstruction.depth.mending import mend_depth
 
-        depth, confidence = complete_depth(posed, camera, plan, depth, raw, config, workers.each, progress)
-    if config.edge_rounds > 0:
-        depth, confidence = _resolve(posed, camera, plan, depth, confidence, score, config, workers, progress)
-    if config.prior != "none":
-        depth, confidence = _fill_predicted(
-            posed, camera, plan, predicted, surety, depth, confidence, config, workers, progress
-        )
-    if backend is not None:
-        depth, confidence = fill_from_predictions(
-            posed, camera, plan, depth, confidence, backend, config, workers.each, progress
-        )
-    progress.note(
-        f"depth: {100 * share:.0f} % of the pixels measured, {100 * float((confidence == 1).mean()):.0f} % completed"
-    )
+        for _ in range(config.mend_rounds):
+            found = mend_depth(found, posed, config.mend_surety, Workers(config.threads).each, progress)
+    depth, confidence = found.depth, np.where(found.origin == PREDICTED, 1, found.origin).astype(np.uint8)
     if config.perturb:
         depth = perturbed(depth, config.perturb)
-    return DepthMaps(camera, depth, confidence)
+    return DepthMaps(found.camera, depth, confidence)

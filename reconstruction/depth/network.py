@@ -12,6 +12,8 @@ from torch import nn
 from torch.nn import functional
 
 from reconstruction.depth.aggregation import BINS
+from reconstruction.depth.candidates import OFFSETS
+from reconstruction.depth.mending import FEATURES
 
 OFFSETS_PX = (1, 4, 12)
 """Distances at which the network says whether two pixels are of one thing, to the right and downwards."""
@@ -19,6 +21,8 @@ OFFSETS_PX = (1, 4, 12)
 
 WIDTHS = (48, 64, 96, 128, 128)
 """Channels at a half, a quarter, ... of the resolution."""
+MENDING_WIDTHS = (40, 64, 96, 128, 128)
+"""The same of the mending network."""
 
 
 def _block(a: int, b: int) -> nn.Sequential:
@@ -49,6 +53,34 @@ class UNet(nn.Module):
             wide = functional.interpolate(narrow(x), size=skip.shape[-2:], mode="bilinear")
             x = up(torch.cat([wide, skip], 1))
         return x
+
+
+class Mending(nn.Module):
+    """Which of a pixel's candidate depths are right, and whether neighbors belong to one thing.
+
+    Beside the candidates (`candidates.OFFSETS`) stands "none of them". As in `Aggregation`, convolutions run on blocks
+    of 2x2 pixels.
+    """
+
+    def __init__(self, widths: tuple[int, ...] = MENDING_WIDTHS) -> None:
+        """Make the layers; the last one starts at zero but for a lean toward a pixel's own depth."""
+        super().__init__()
+        self.unet = UNet(4 * FEATURES, tuple(widths))
+        self.candidates = len(OFFSETS)
+        self.leave = nn.Conv2d(widths[0], 4 * (self.candidates + 1 + 2 * len(OFFSETS_PX)), 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+        with torch.no_grad():
+            self.leave.bias[:4] = 3.0
+
+    def forward(self, features: torch.Tensor):
+        """Return logits (b, candidates + 1, h, w), the last of "none", and affinity logits (b, 6, h, w).
+
+        Args:
+            features: (b, FEATURES, h, w) of `mending.mending_features`; height and width are even.
+        """
+        out = functional.pixel_shuffle(self.leave(self.unet(functional.pixel_unshuffle(features, 2))), 2)
+        return out[:, : self.candidates + 1], out[:, self.candidates + 1 :]
 
 
 class Aggregation(nn.Module):

@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from priors import dataset, train
+from priors import dataset, mending, train
 from priors.rooms import HELD_OUT, SPLITS, families_of
 from priors.samples import border_of, draw_sample, load_sample, open_rooms
 from reconstruction.depth.aggregation import BINS
@@ -21,7 +21,7 @@ def data(tmp_path_factory):
     out = tmp_path_factory.mktemp("data")
     for split in ("train", "shapes"):
         arguments = [str(out), "--split", split, "--rooms", "1", "--frames", str(FRAMES), "--processes", "1"]
-        assert dataset.main([*arguments, "--until", "winner"]) == 0
+        assert dataset.main([*arguments, "--keep", "costs", "winner", "depth"]) == 0
     return out
 
 
@@ -40,7 +40,7 @@ def test_a_finished_room_is_kept_and_a_torn_one_is_made_again(data, capsys):
     room = data / "train" / "00000"
     before = (room / "cost.npy").stat().st_mtime_ns
     (data / "train" / "00001.part").mkdir()
-    arguments = [str(data), "--rooms", "1", "--frames", str(FRAMES), "--processes", "1", "--until", "winner"]
+    arguments = [str(data), "--rooms", "1", "--frames", str(FRAMES), "--processes", "1"]
     assert dataset.main(arguments) == 0
     assert "1 of 1 rooms are there" in capsys.readouterr().out
     assert (room / "cost.npy").stat().st_mtime_ns == before
@@ -76,10 +76,10 @@ def test_another_range_keeps_costs_and_truth_together(data):
         assert 0 <= sample.color.min() <= sample.color.max() <= 1
 
 
-def _train(data, out, steps):
+def _train(network, data, out, steps):
     values = {
-        "data": str(data), "out": str(out), "steps": steps, "batch": 1, "check_every": 2, "check_keyframes": 1,
-        "widths": [16, 16, 16], "held_out": ["shapes"], "threads": 1, "warm_up": 1000,
+        "network": network, "data": str(data), "out": str(out), "steps": steps, "batch": 1, "check_every": 2,
+        "check_keyframes": 1, "widths": [16, 16, 16], "held_out": ["shapes"], "threads": 1, "warm_up": 1000,
     }  # fmt: skip
     config = out.with_suffix(".yaml")
     config.write_text(yaml.safe_dump(values))
@@ -87,22 +87,60 @@ def _train(data, out, steps):
     return torch.load(out / "checkpoint.pt", weights_only=True)
 
 
-def test_stopped_training_goes_on_to_the_same_weights(data, tmp_path):
-    whole = _train(data, tmp_path / "whole", 4)
-    _train(data, tmp_path / "parts", 2)
-    parts = _train(data, tmp_path / "parts", 4)
+@pytest.mark.parametrize(
+    ("network", "figures"),
+    [
+        ("aggregation", {"net_off5", "sgm_off5", "net_off5_border"}),
+        ("mending", {"entropy", "off_before", "off_after_steps", "agreed_known_after"}),
+    ],
+)
+def test_stopped_training_goes_on_to_the_same_weights(network, figures, data, tmp_path):
+    whole = _train(network, data, tmp_path / "whole", 4)
+    _train(network, data, tmp_path / "parts", 2)
+    parts = _train(network, data, tmp_path / "parts", 4)
     assert parts["step"] == whole["step"] == 4
     for name, value in whole["slow"].items():
         assert torch.equal(value, parts["slow"][name]), name
     assert (tmp_path / "whole" / "best.safetensors").is_file()
     curve = [json.loads(line) for line in (tmp_path / "whole" / "curve.jsonl").read_text().splitlines()]
     assert [entry["step"] for entry in curve] == [2, 4]
-    assert {"net_off5", "sgm_off5", "net_off5_border"} <= set(curve[0]["shapes"])
+    assert figures <= set(curve[0]["shapes"])
+
+
+def test_samples_for_mending_hold_the_right_candidates(data):
+    room = open_rooms(data / "train", mending.ARRAYS)[0]
+    sample = mending.load_sample(room, 1)
+    there, right, weight = mending.right_candidates(sample)
+    assert not (right & ~there).any()
+    assert right.any(0).all()  # "none" where no other is
+    own = right[0] & (sample.truth > 0)
+    assert np.abs(sample.candidates[0] * sample.truth - 1)[own].max() < 0.025
+    assert own.sum() > 0.5 * (sample.candidates[0] > 0).sum()
+    # Beside steps of depth some pixels are wrong that a neighbor's surface puts right.
+    assert (right[1:-1].any(0) & there[0] & ~right[0]).sum() > 50
+    steps = mending.beside_steps(sample.truth)
+    assert weight[steps].max() > weight[~steps].max()
+    crop = mending.draw_sample(room, np.random.default_rng(0))
+    assert crop.features.shape[1:] == crop.truth.shape == crop.candidates.shape[1:]
+
+
+def test_without_predictions_and_completion_what_was_measured_stays(data):
+    room = open_rooms(data / "train", mending.ARRAYS)[0]
+    whole, fewer = (mending.load_sample(room, 1, predictions=flag) for flag in (True, False))
+    measured = mending.load_sample(room, 1, agreed=True)
+    known = [s.candidates[0] > 0 for s in (whole, fewer, measured)]
+    assert known[0].sum() > known[1].sum()
+    assert np.array_equal(whole.candidates[0][known[1]], fewer.candidates[0][known[1]])
+    assert np.array_equal(known[2], np.asarray(room.arrays["agreed"][1]) > 0)
 
 
 def test_unknown_fields_of_a_config_are_refused(tmp_path, capsys):
     config = tmp_path / "c.yaml"
-    config.write_text("data: x\nout: y\nsteppes: 3\n")
+    config.write_text("network: mending\ndata: x\nout: y\nsteppes: 3\n")
     with pytest.raises(SystemExit):
         train.main([str(config)])
     assert "steppes" in capsys.readouterr().err
+    config.write_text("data: x\nout: y\n")
+    with pytest.raises(SystemExit):
+        train.main([str(config)])
+    assert "aggregation, mending" in capsys.readouterr().err

@@ -19,6 +19,7 @@ from reconstruction.depth.aggregation import (
     smoothed_scores,
 )
 from reconstruction.depth.network import Aggregation, place_of
+from reconstruction.depth.weights import load_network
 from registry.errors import EnvironmentMissing
 from synthetic.capture import make_test_capture
 
@@ -74,11 +75,11 @@ def test_a_second_surface_has_no_say_in_the_place():
 
 def test_missing_weights_say_what_to_do(tmp_path):
     with pytest.raises(EnvironmentMissing, match=r"depth\.prior=none"):
-        aggregation.load_network(tmp_path / "none.safetensors")
+        load_network("aggregation", tmp_path / "none.safetensors")
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes(b"not weights")
     with pytest.raises(EnvironmentMissing, match=r"depth\.prior=none"):
-        aggregation.load_network(broken)
+        load_network("aggregation", broken)
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +104,9 @@ def test_threads_do_not_change_the_result(some_costs):
 
 def test_the_weights_are_small_and_load_quickly():
     assert aggregation.WEIGHTS.stat().st_size < 6e6
-    aggregation.load_network.cache_clear()
+    load_network.cache_clear()
     started = time.process_time()
-    aggregation.load_network()
+    load_network("aggregation", aggregation.WEIGHTS)
     assert time.process_time() - started < 3.0  # .1 s on a machine at rest
 
 

@@ -1,0 +1,194 @@
+"""Training of the mending network: its samples, its loss, and its figures on whole keyframes."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from priors.affinities import affinity_loss
+from priors.samples import Room, other_light
+from reconstruction.depth.candidates import OFFSETS, SAME, candidate_depths, choose_candidates
+from reconstruction.depth.evidence import MEASURED, PREDICTED
+from reconstruction.depth.mending import mending_features
+from reconstruction.depth.network import Mending
+
+ARRAYS = ("picture", "depth", "origin", "agreed", "correlation", "surety", "exact_depth", "exact_ids")
+"""What a room's folder must hold."""
+SCORE = "entropy"
+"""The figure that is least for the best weights."""
+_CROP = (192, 224)
+_LEFT_OUT, _AGREED = (
+    0.3,
+    0.3,
+)  # shares of samples without predictions, and of those with what was measured alone
+_BESIDE_PX, _JUMP = 9, 1.03  # around steps of the true depth a pixel weighs more
+_OFF = 0.05
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One keyframe's maps, or a crop of them."""
+
+    features: np.ndarray  # float32 (FEATURES, h, w)
+    candidates: np.ndarray  # float32 (k, h, w) inverse depths, 0 = none
+    truth: np.ndarray  # float32 (h, w) true depth, 0 = unknown
+    ids: np.ndarray  # int32 (h, w)
+
+
+def make_network(config: Any) -> Mending:
+    """Return the untrained network."""
+    return Mending(config.widths) if config.widths else Mending()
+
+
+def load_sample(
+    room: Room, row: int, window: tuple[slice, slice] = (slice(None), slice(None)), *,
+    agreed: bool = False, predictions: bool = True, rng: np.random.Generator | None = None, flip: bool = False,
+) -> Sample:  # fmt: skip
+    """Read a keyframe, or a window of it.
+
+    Args:
+        room: Its room.
+        row: Its number in the room.
+        window: Rows and columns.
+        agreed: Whether what was measured alone stands in place of the completed maps.
+        predictions: Whether predictions of the aggregation network stay.
+        rng: Disturbs the picture; None: left as it is.
+        flip: Whether to mirror it.
+    """
+
+    def read(name: str) -> np.ndarray:
+        cut = room.arrays[name][row][window]
+        return np.ascontiguousarray(cut[:, ::-1] if flip else cut)
+
+    kind = "agreed" if agreed else "depth"
+    counts = ("agreed_agree", "agreed_through") if agreed else ("agree", "through")
+    depth = read(kind).astype(np.float32)
+    origin = np.where(depth > 0, MEASURED, 0).astype(np.uint8) if agreed else read("origin")
+    if not predictions:
+        depth[origin == PREDICTED] = 0
+        origin = np.where(origin == PREDICTED, 0, origin)
+    picture = read("picture").astype(np.float32) / 255
+    if rng is not None:
+        picture = other_light(picture.transpose(2, 0, 1), rng).transpose(1, 2, 0)
+    agree, through = (np.where(depth > 0, read(name), 0) for name in counts)
+    features = mending_features(
+        picture, depth, origin, read("correlation").astype(np.float32) / 100, agree, through,
+        read("surety").astype(np.float32) / 100,
+    )  # fmt: skip
+    rho = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), 0).astype(np.float32)
+    truth = read("exact_depth").astype(np.float32)
+    return Sample(features, candidate_depths(rho), truth, read("exact_ids").astype(np.int32))
+
+
+def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
+    """Draw a keyframe, a crop of it, the maps it comes with, and disturb the picture."""
+    row = int(rng.integers(len(room)))
+    h, w = room.arrays["depth"].shape[1:3]
+    y, x = int(rng.integers(h - _CROP[0] + 1)), int(rng.integers(w - _CROP[1] + 1))
+    window = (slice(y, y + _CROP[0]), slice(x, x + _CROP[1]))
+    agreed, predictions = rng.random() < _AGREED, rng.random() >= _LEFT_OUT
+    return load_sample(
+        room, row, window, agreed=agreed, predictions=predictions, rng=rng, flip=rng.random() < 0.5
+    )
+
+
+def stack(samples: list[Sample]) -> list[torch.Tensor]:
+    """Return features, right candidates (b, k + 1, h, w), weights (b, h, w) and ids as tensors with a batch axis."""
+    parts = [right_candidates(s) for s in samples]
+    columns = [
+        np.stack([s.features for s in samples]), np.stack([p[0] for p in parts]), np.stack([p[1] for p in parts]),
+        np.stack([p[2] for p in parts]), np.stack([s.ids for s in samples]),
+    ]  # fmt: skip
+    return [torch.from_numpy(np.ascontiguousarray(c)) for c in columns]
+
+
+def right_candidates(sample: Sample) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which candidates there are, which are right, bool (k + 1, h, w) with "none" last, and weights (h, w)."""
+    shape = (len(sample.candidates) + 1, *sample.truth.shape)
+    there, right = np.empty(shape, bool), np.empty(shape, bool)
+    _compare(sample.candidates, sample.truth, there, right)
+    weight = (sample.truth > 0) * (1 + 3 * beside_steps(sample.truth)) * there[:-1].any(0)
+    return there, right, weight.astype(np.float32)
+
+
+@numba.njit(cache=True)
+def _compare(candidates, truth, there, right):  # pragma: no cover - compiled
+    k, h, w = candidates.shape
+    there[k] = True
+    right[k] = True
+    for j in range(k):
+        for y in range(h):
+            for x in range(w):
+                c = candidates[j, y, x]
+                good = abs(c * truth[y, x] - np.float32(1)) < np.float32(SAME)
+                there[j, y, x] = c > 0
+                right[j, y, x] = good
+                if good:
+                    right[k, y, x] = False
+
+
+def beside_steps(depth: np.ndarray) -> np.ndarray:
+    """Return which pixels (h, w) lie within a few pixels of a step of the true depth."""
+    import cv2
+
+    step = np.zeros(depth.shape, np.uint8)
+    for axis in (0, 1):
+        a, b = np.moveaxis(depth, axis, 0)[1:], np.moveaxis(depth, axis, 0)[:-1]
+        jump = (np.maximum(a, b) > _JUMP * np.minimum(a, b)).astype(np.uint8)
+        view = np.moveaxis(step, axis, 0)
+        view[1:] |= jump
+        view[:-1] |= jump
+    return cv2.dilate(step, np.ones((2 * _BESIDE_PX + 1, 2 * _BESIDE_PX + 1), np.uint8)) > 0
+
+
+def _entropy(logits: torch.Tensor, there, right, weight) -> torch.Tensor:
+    """Cross entropy of "one of the right ones": -log of the probability of all right candidates together."""
+    logits = logits.float().masked_fill(~there, -1e4)
+    wrong = torch.logsumexp(logits, 1) - torch.logsumexp(logits.masked_fill(~right, -1e4), 1)
+    return (weight * wrong).sum() / weight.sum().clamp_min(1)
+
+
+def losses(net: Mending, batch, config: Any) -> dict[str, torch.Tensor]:
+    """Return the parts of the loss of a batch (see `stack`)."""
+    features, there, right, weight, ids = batch
+    logits, affinity = net(features)
+    return {
+        "entropy": _entropy(logits, there, right, weight),
+        "affinity": config.affinity_weight * affinity_loss(affinity.float(), ids),
+    }
+
+
+@torch.inference_mode()
+def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
+    """Measure whole keyframes, spread over the rooms: known and off before and after, everywhere and beside steps."""
+    sums: dict[str, list[float]] = {}
+
+    def add(name: str, value: float) -> None:
+        sums.setdefault(name, []).append(float(value))
+
+    rng = np.random.default_rng(0)
+    chosen = [(rooms[int(k)], int(rng.integers(1 << 30))) for k in np.linspace(0, len(rooms) - 1, keyframes)]
+    for room, number in chosen:
+        for agreed in (False, True):
+            sample = load_sample(room, number % len(room), agreed=agreed)
+            batch = stack([sample])
+            features, there, right, weight, ids = batch
+            logits, affinity = net(features)
+            share = logits.float().masked_fill(~there, -1e4).softmax(1)[0].numpy()
+            mark = "agreed_" if agreed else ""
+            add(mark + "entropy", _entropy(logits, there, right, weight))
+            add(mark + "affinity", affinity_loss(affinity.float(), ids))
+            found, trust = (np.zeros(sample.truth.shape, np.float32) for _ in range(2))
+            choose_candidates(
+                sample.candidates, share[: len(OFFSETS)], np.float32(SAME), np.float32(0.5), found, trust
+            )
+            steps = beside_steps(sample.truth)
+            for name, rho in (("before", sample.candidates[0]), ("after", found)):
+                for part, mask in (("", sample.truth > 0), ("_steps", (sample.truth > 0) & steps)):
+                    known = mask & (rho > 0)
+                    off = np.abs(rho * sample.truth - 1) > _OFF
+                    add(f"{mark}known_{name}{part}", known.sum() / max(mask.sum(), 1))
+                    add(f"{mark}off_{name}{part}", off[known].mean() if known.any() else 0.0)
+    return {name: float(np.mean(values)) for name, values in sums.items()}

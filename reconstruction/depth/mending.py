@@ -1,0 +1,136 @@
+"""Mending of finished depth maps: maps with the origin of every pixel's depth -> maps that end where things end.
+
+A network says for every pixel on which of the surfaces around it the pixel lies, or on none of them (displacement of
+depth at occlusion borders: Ramamonjisoa et al., CVPR 2020, as a choice among plane hypotheses of neighbors). What it
+was trained on: docs/priors.md. Weights ship with the project.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.depth.candidates import SAME, candidate_depths, choose_candidates
+from reconstruction.depth.evidence import COMPLETED, MEASURED, PREDICTED, Evidence, count_views
+from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.types import PosedFrames
+
+WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
+FEATURES = 13
+_AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against
+_MANY_VIEWS = 10.0
+
+
+def mending_features(
+    picture: np.ndarray,
+    depth: np.ndarray,
+    origin: np.ndarray,
+    correlation: np.ndarray,
+    agree: np.ndarray,
+    through: np.ndarray,
+    surety: np.ndarray,
+) -> np.ndarray:
+    """Return the network's input float32 (FEATURES, h, w); it does not change with the scale of depth.
+
+    Args:
+        picture: float32 (h, w, 3), 0 to 1.
+        depth: float32 (h, w), 0 = unknown.
+        origin: uint8 (h, w), see `evidence`.
+        correlation: float32 (h, w), 0 to 1.
+        agree: uint8 (h, w) views that see the same point.
+        through: uint8 (h, w) views that look through it.
+        surety: float32 (h, w), probability of predicted depth.
+    """
+    import cv2
+
+    known = depth > 0
+    log = np.where(known, np.log(np.maximum(depth, 1e-9)), 0).astype(np.float32)
+    amount = cv2.boxFilter(known.astype(np.float32), -1, (_AROUND, _AROUND), normalize=False)
+    around = cv2.boxFilter(log, -1, (_AROUND, _AROUND), normalize=False) / np.maximum(amount, 1)
+    middle = np.median(log[known]) if known.any() else 0.0
+    beside = np.where(known, log - around, 0)
+    out = np.empty((FEATURES, *depth.shape), np.float32)
+    out[:3] = picture.transpose(2, 0, 1) - 0.5
+    out[3] = np.clip(4 * beside, -2, 2)
+    out[4] = np.clip(40 * beside, -2, 2)
+    out[5] = np.where(known, np.clip(log - middle, -1.5, 1.5), 0)
+    for channel, kind in enumerate((MEASURED, COMPLETED, PREDICTED), start=6):
+        out[channel] = origin == kind
+    out[9] = np.where(origin == MEASURED, np.clip(correlation, 0, 1), 0)
+    out[10] = np.minimum(agree / _MANY_VIEWS, 1)
+    out[11] = np.minimum(through / _MANY_VIEWS, 1)
+    out[12] = np.where(origin == PREDICTED, surety, 0)
+    return out
+
+
+def candidate_shares(features: np.ndarray, there: np.ndarray, weights: Path = WEIGHTS) -> np.ndarray:
+    """Return the probability float32 (k, h, w) that each candidate is right; what is missing to 1 is "none of them".
+
+    One thread, so that the result does not depend on how many there are; call it from several.
+
+    Args:
+        features: of `mending_features`.
+        there: bool (k, h, w), candidates that exist.
+        weights: Of the network.
+    """
+    import torch
+
+    from reconstruction.depth.weights import load_network
+
+    torch.set_num_threads(1)
+    h, w = features.shape[1:]
+    padded = np.pad(features, ((0, 0), (0, h % 2), (0, w % 2)), mode="edge")
+    with torch.inference_mode():
+        logits, _ = load_network("mending", weights)(torch.from_numpy(padded)[None])
+        logits = logits[0, :, :h, :w]
+        logits[:-1].masked_fill_(torch.from_numpy(~there), -1e4)
+        return logits.softmax(0)[:-1].numpy()
+
+
+def mend_depth(
+    found: Evidence,
+    posed: PosedFrames,
+    least: float,
+    each: Callable,
+    progress: Progress = NO_PROGRESS,
+    weights: Path = WEIGHTS,
+) -> Evidence:
+    """Return the evidence with mended maps: every pixel on the surface that it most probably lies on, or unknown.
+
+    Args:
+        found: Maps and the origin of every pixel.
+        posed: Their frames.
+        least: Probability from which depth is believed.
+        each: Runs a function for every frame: each(n, work, label, progress).
+        progress: Where steps and shares are reported.
+        weights: Of the network.
+    """
+    from reconstruction.depth.estimate import small_color
+
+    agree, through = count_views(found.depth, posed, found.camera, found.neighbors, each, progress)
+    depth, origin = np.zeros_like(found.depth), np.zeros_like(found.origin)
+    nothing = np.zeros(found.depth.shape[1:], np.float32)
+
+    def work(i: int) -> None:
+        picture = small_color(posed.images[i], found.camera) / np.float32(255)
+        surety = found.surety[i] if len(found.surety) else nothing
+        features = mending_features(
+            picture, found.depth[i], found.origin[i], found.correlation[i], agree[i], through[i], surety
+        )
+        own = np.where(found.depth[i] > 0, 1.0 / np.maximum(found.depth[i], 1e-12), 0).astype(np.float32)
+        candidates = candidate_depths(own)
+        share = candidate_shares(features, candidates > 0, weights)
+        rho, trust = np.empty_like(own), np.empty_like(own)
+        choose_candidates(candidates, share, np.float32(SAME), np.float32(least), rho, trust)
+        kept = rho == own
+        depth[i] = np.where(kept, found.depth[i], np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0))
+        origin[i] = np.where(depth[i] > 0, np.where(kept, found.origin[i], COMPLETED), 0)
+
+    each(len(depth), work, "mending depth", progress)
+    was, now = found.depth > 0, depth > 0
+    shares = [100 * float(m.mean()) for m in (was & ~now, was & now & (depth != found.depth), now & ~was)]
+    progress.note(
+        f"depth: mending dropped {shares[0]:.1f} % of the pixels, moved {shares[1]:.1f} % and filled {shares[2]:.1f} %"
+    )
+    return replace(found, depth=depth, origin=origin)

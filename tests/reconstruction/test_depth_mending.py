@@ -1,0 +1,113 @@
+"""Mending of depth maps: candidates, the choice among them, and what it does to a filmed table with things."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.depth_figures import ring_counts
+from reconstruction.depth import DepthConfig, estimate_depth, mending
+from reconstruction.depth.candidates import OFFSETS, SAME, candidate_depths, choose_candidates
+from reconstruction.depth.mending import candidate_shares, mending_features
+from reconstruction.depth.weights import load_network
+from synthetic.capture import make_test_capture
+
+
+@pytest.fixture(scope="module")
+def step():
+    """Inverse depth of a slanted plane, left, and a nearer one, right, 0 at a hole."""
+    y, x = np.mgrid[:60, :80].astype(np.float32)
+    left, right = 0.5 + 0.0005 * x + 0.001 * y, 0.8 - 0.0007 * x
+    rho = np.where(x < 40, left, right).astype(np.float32)
+    rho[20:24, 10:14] = 0
+    return rho, left, right
+
+
+def test_candidates_are_the_surfaces_around_extended_as_planes(step):
+    rho, left, right = step
+    out = candidate_depths(rho)
+    assert np.array_equal(out[0], rho)
+    for k, (dy, dx) in enumerate(OFFSETS[1:], start=1):
+        j, i = 30 + dy, 38 + dx
+        expected = (left if i < 40 else right)[30, 38]
+        assert out[k, 30, 38] == pytest.approx(expected, rel=2e-3), (j, i)
+    assert (out[1:, 21, 11] > 0).any()  # a hole has candidates, none of its own
+    assert out[0, 21, 11] == 0
+    assert (out[:, 0, 0][OFFSETS.min(1) < 0] == 0).all()  # nothing from outside of the picture
+
+
+def _choose(candidates, share, least):
+    out, trust = (np.full(candidates.shape[1:], -1, np.float32) for _ in range(2))
+    choose_candidates(candidates, share, np.float32(SAME), np.float32(least), out, trust)
+    return out, trust
+
+
+def test_a_surface_wins_with_all_that_speak_for_it():
+    candidates = np.array([1.0, 2.0, 2.01, 1.99, 0.0], np.float32).reshape(-1, 1, 1)
+    share = np.array([0.35, 0.2, 0.2, 0.2, 0.0], np.float32).reshape(-1, 1, 1)
+    rho, trust = _choose(candidates, share, 0.5)
+    assert rho.item() == pytest.approx(2.0, rel=1e-3)
+    assert trust.item() == pytest.approx(0.6)
+    share[0], share[1:4] = 0.5, 0.1
+    assert _choose(candidates, share, 0.5)[0].item() == candidates[0].item()  # its own, to the last bit
+    share[0] = 0.4
+    rho, trust = _choose(candidates, share, 0.5)  # what nobody is sure of is unknown
+    assert rho.item() == 0
+    assert trust.item() == pytest.approx(0.4)
+    assert _choose(candidates, share, 0.3)[0].item() == 1
+
+
+def test_features_do_not_know_the_scale():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 3, (30, 41)).astype(np.float32)
+    depth[:5] = 0
+    rest = (
+        np.where(depth > 0, 2, 0).astype(np.uint8),
+        depth / 4,
+        depth.astype(np.uint8),
+        depth.astype(np.uint8),
+        depth,
+    )
+    picture = rng.uniform(0, 1, (30, 41, 3)).astype(np.float32)
+    one, other = (mending_features(picture, s * depth, *rest) for s in (1, 37))
+    assert np.abs(one - other).max() < 1e-3
+    assert np.isfinite(one).all()
+
+
+def test_threads_do_not_change_the_result():
+    rng = np.random.default_rng(0)
+    features = rng.normal(0, 1, (mending.FEATURES, 61, 83)).astype(np.float32)  # odd sizes
+    there = rng.random((len(OFFSETS), 61, 83)) < 0.7
+    alone = candidate_shares(features, there)
+    assert alone.shape == there.shape
+    assert (alone[~there] == 0).all()
+    assert alone.sum(0).max() <= 1 + 1e-5
+    with ThreadPoolExecutor(3) as pool:
+        for share in pool.map(lambda _: candidate_shares(features, there), range(4)):
+            assert np.array_equal(share, alone)
+
+
+def test_the_weights_are_small_and_load_quickly():
+    assert mending.WEIGHTS.stat().st_size < 3.1e6  # 6 MB together with the aggregation's
+    load_network.cache_clear()
+    started = time.process_time()
+    load_network("mending", mending.WEIGHTS)
+    assert time.process_time() - started < 3.0  # .1 s on a machine at rest
+
+
+def test_things_end_where_they_end():
+    capture = make_test_capture(12, 240, 180)
+    plain = DepthConfig(depth_side_px=240, sweep_side_px=240)
+    rings, right = [], []
+    things = [i for i in np.unique(capture.id_maps) if i > len(capture.room.base)]
+    for prior in ("none", "mending"):
+        maps = estimate_depth(capture.posed, replace(plain, prior=prior))
+        truth = capture.depth.depth
+        counts = sum(ring_counts(d, t, i, things) for d, t, i in zip(maps.depth, truth, capture.id_maps))
+        rings.append(counts[1] / counts[0])
+        on = np.isin(capture.id_maps, things)
+        right.append(float((np.abs(maps.depth[on] / truth[on] - 1) < 0.02).mean()))
+    assert rings[1] < 0.7 * rings[0]
+    assert right[1] > right[0] - 0.02
