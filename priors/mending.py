@@ -25,6 +25,9 @@ _LEFT_OUT, _AGREED = (
 )  # shares of samples without predictions, and of those with what was measured alone
 _BESIDE_PX, _JUMP = 9, 1.03  # around steps of the true depth a pixel weighs more
 _OFF = 0.05
+_SPREAD = 0.015  # scale of a right candidate's relative error, the noise of the measurement (Laplace)
+_NONE = -3.0  # log likelihood of "none of them": that of a candidate three spreads off
+_MISSING = -1e4
 
 
 @dataclass(frozen=True)
@@ -95,38 +98,37 @@ def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
 
 
 def stack(samples: list[Sample]) -> list[torch.Tensor]:
-    """Return features, right candidates (b, k + 1, h, w), weights (b, h, w) and ids as tensors with a batch axis."""
-    parts = [right_candidates(s) for s in samples]
+    """Return features, log likelihoods (b, k + 1, h, w), weights (b, h, w) and ids as tensors with a batch axis."""
     columns = [
-        np.stack([s.features for s in samples]), np.stack([p[0] for p in parts]), np.stack([p[1] for p in parts]),
-        np.stack([p[2] for p in parts]), np.stack([s.ids for s in samples]),
+        np.stack([s.features for s in samples]), np.stack([likelihoods(s) for s in samples]),
+        np.stack([_weights(s) for s in samples]), np.stack([s.ids for s in samples]),
     ]  # fmt: skip
     return [torch.from_numpy(np.ascontiguousarray(c)) for c in columns]
 
 
-def right_candidates(sample: Sample) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which candidates there are, which are right, bool (k + 1, h, w) with "none" last, and weights (h, w)."""
-    shape = (len(sample.candidates) + 1, *sample.truth.shape)
-    there, right = np.empty(shape, bool), np.empty(shape, bool)
-    _compare(sample.candidates, sample.truth, there, right)
-    weight = (sample.truth > 0) * (1 + 3 * beside_steps(sample.truth)) * there[:-1].any(0)
-    return there, right, weight.astype(np.float32)
+def likelihoods(sample: Sample) -> np.ndarray:
+    """Return the log likelihood float32 (k + 1, h, w) of the true depth under each candidate, "none" last."""
+    out = np.empty((len(sample.candidates) + 1, *sample.truth.shape), np.float32)
+    out[-1] = _NONE
+    _compare(sample.candidates, sample.truth, out)
+    return out
+
+
+def _weights(sample: Sample) -> np.ndarray:
+    there = (sample.candidates > 0).any(0)
+    return (there * (sample.truth > 0) * (1 + 3 * beside_steps(sample.truth))).astype(np.float32)
 
 
 @numba.njit(cache=True)
-def _compare(candidates, truth, there, right):  # pragma: no cover - compiled
+def _compare(candidates, truth, out):  # pragma: no cover - compiled
     k, h, w = candidates.shape
-    there[k] = True
-    right[k] = True
     for j in range(k):
         for y in range(h):
             for x in range(w):
                 c = candidates[j, y, x]
-                good = abs(c * truth[y, x] - np.float32(1)) < np.float32(SAME)
-                there[j, y, x] = c > 0
-                right[j, y, x] = good
-                if good:
-                    right[k, y, x] = False
+                out[j, y, x] = -abs(c * truth[y, x] - np.float32(1)) / np.float32(_SPREAD)
+                if c <= 0:
+                    out[j, y, x] = np.float32(_MISSING)
 
 
 def beside_steps(depth: np.ndarray) -> np.ndarray:
@@ -143,19 +145,19 @@ def beside_steps(depth: np.ndarray) -> np.ndarray:
     return cv2.dilate(step, np.ones((2 * _BESIDE_PX + 1, 2 * _BESIDE_PX + 1), np.uint8)) > 0
 
 
-def _entropy(logits: torch.Tensor, there, right, weight) -> torch.Tensor:
-    """Cross entropy of "one of the right ones": -log of the probability of all right candidates together."""
-    logits = logits.float().masked_fill(~there, -1e4)
-    wrong = torch.logsumexp(logits, 1) - torch.logsumexp(logits.masked_fill(~right, -1e4), 1)
-    return (weight * wrong).sum() / weight.sum().clamp_min(1)
+def _entropy(logits: torch.Tensor, likelihood, weight) -> torch.Tensor:
+    """Negative log likelihood of the true depth: a mixture of the candidates and of "none of them"."""
+    logits = logits.float().masked_fill(likelihood <= 0.5 * _MISSING, _MISSING)
+    told = torch.logsumexp(logits + likelihood, 1) - torch.logsumexp(logits, 1)
+    return -(weight * told).sum() / weight.sum().clamp_min(1)
 
 
 def losses(net: Mending, batch, config: Any) -> dict[str, torch.Tensor]:
     """Return the parts of the loss of a batch (see `stack`)."""
-    features, there, right, weight, ids = batch
+    features, likelihood, weight, ids = batch
     logits, affinity = net(features)
     return {
-        "entropy": _entropy(logits, there, right, weight),
+        "entropy": _entropy(logits, likelihood, weight),
         "affinity": config.affinity_weight * affinity_loss(affinity.float(), ids),
     }
 
@@ -174,11 +176,11 @@ def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
         for agreed in (False, True):
             sample = load_sample(room, number % len(room), agreed=agreed)
             batch = stack([sample])
-            features, there, right, weight, ids = batch
+            features, likelihood, weight, ids = batch
             logits, affinity = net(features)
-            share = logits.float().masked_fill(~there, -1e4).softmax(1)[0].numpy()
+            share = logits.float().masked_fill(likelihood <= 0.5 * _MISSING, _MISSING).softmax(1)[0].numpy()
             mark = "agreed_" if agreed else ""
-            add(mark + "entropy", _entropy(logits, there, right, weight))
+            add(mark + "entropy", _entropy(logits, likelihood, weight))
             add(mark + "affinity", affinity_loss(affinity.float(), ids))
             found, trust = (np.zeros(sample.truth.shape, np.float32) for _ in range(2))
             choose_candidates(

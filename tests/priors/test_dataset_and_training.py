@@ -107,21 +107,22 @@ def test_stopped_training_goes_on_to_the_same_weights(network, figures, data, tm
     assert figures <= set(curve[0]["shapes"])
 
 
-def test_samples_for_mending_hold_the_right_candidates(data):
+def test_samples_for_mending_say_how_likely_each_candidate_is(data):
     room = open_rooms(data / "train", mending.ARRAYS)[0]
     sample = mending.load_sample(room, 1)
-    there, right, weight = mending.right_candidates(sample)
-    assert not (right & ~there).any()
-    assert right.any(0).all()  # "none" where no other is
-    own = right[0] & (sample.truth > 0)
-    assert np.abs(sample.candidates[0] * sample.truth - 1)[own].max() < 0.025
-    assert own.sum() > 0.5 * (sample.candidates[0] > 0).sum()
-    # Beside steps of depth some pixels are wrong that a neighbor's surface puts right.
-    assert (right[1:-1].any(0) & there[0] & ~right[0]).sum() > 50
+    likelihood = mending.likelihoods(sample)
+    own, best = likelihood[0], likelihood[1:-1].max(0)
+    known = (sample.candidates[0] > 0) & (sample.truth > 0)
+    assert (likelihood[:-1][sample.candidates == 0] < -100).all()
+    assert (own[known] > likelihood[-1][known]).mean() > 0.5  # most depth is nearly right
+    # Beside steps of depth, pixels are wrong that a neighbor's surface puts right.
     steps = mending.beside_steps(sample.truth)
-    assert weight[steps].max() > weight[~steps].max()
+    wrong = known & (own < likelihood[-1])
+    assert (best > -1)[wrong & steps].sum() > 50
     crop = mending.draw_sample(room, np.random.default_rng(0))
     assert crop.features.shape[1:] == crop.truth.shape == crop.candidates.shape[1:]
+    batch = mending.stack([crop, crop])
+    assert batch[2][:, mending.beside_steps(crop.truth)].max() == 4
 
 
 def test_without_predictions_and_completion_what_was_measured_stays(data):
