@@ -23,9 +23,10 @@ class Capture:
     source: Path  # what `simrecon reconstruct` is given: a video file or a folder of images
     ground_truth: Path | None
     truth: Truth
+    labels: Path | None = None  # outlines drawn by hand, CONTRACT section 5
 
     def digest(self) -> str:
-        """Digest what goes into the figures: the input, and the cameras and entities of the truth."""
+        """Digest what goes into the figures: the input, cameras and entities of the truth, and the labels."""
         digest = hashlib.sha256(digest_input(self.source).encode())
         if self.ground_truth:
             for name in ("scene.json", "cameras.json"):
@@ -35,6 +36,8 @@ class Capture:
             # Meshes and images of the truth by name and size: reading them all takes long.
             for file in sorted(p for p in self.ground_truth.rglob("*") if p.is_file()):
                 digest.update(f"{file.relative_to(self.ground_truth)} {file.stat().st_size}\n".encode())
+        if self.labels:
+            digest.update(b"labels\0" + self.labels.read_bytes())
         return digest.hexdigest()[:16]
 
 
@@ -90,7 +93,9 @@ def _capture(folder: Path, name: str) -> Capture:
     source = _source(folder)
     assert source is not None
     truth_folder = folder / "ground_truth"
+    beside = folder.parent / "labels" / f"{folder.name}.json"
+    labels = beside if beside.is_file() else None
     for truth, file in (("scene", "scene.json"), ("cameras", "cameras.json")):
         if (truth_folder / file).is_file():
-            return Capture(name, source, truth_folder, truth)
-    return Capture(name, source, None, "none")
+            return Capture(name, source, truth_folder, truth, labels)
+    return Capture(name, source, None, "none", labels)

@@ -94,6 +94,17 @@ REAL = (
     TIME,
     MEMORY,
 )
+# Against outlines that were drawn by hand on a few frames.
+OUTLINES = (
+    Column("outline_recall_25", "recall@.25 ", 2, "↑"),
+    Column("outline_precision_25", "prec@.25 ", 2, "↑"),
+    Column("outline_recall_50", "recall@.5 ", 2, "↑"),
+    Column("outline_precision_50", "prec@.5 ", 2, "↑"),
+    Column("outline_edges", "right parents ", 2, "↑"),
+    Column("outline_things", "things asked for ", 0, ""),
+    Column("outline_objects", "objects judged ", 0, ""),
+    Column("outline_frames", "frames ", 0, ""),
+)
 # What the truth in place of a stage changes.
 ORACLE = (*FOUND, CD, F_5CM, NC, OBJECT_CD, OBJECT_F, GRAPH_F1, PSNR, STABLE)
 

@@ -14,6 +14,7 @@ _GROUPS = {  # as `left_out` of an evaluation names them
     "geometry": ("cd_cm", "f_5cm", "nc"),
     "objects": ("object_",),
     "graph": ("graph_",),
+    "outlines": ("outline_",),
 }
 Status = Literal["done", "reconstruct failed", "evaluate failed"]
 

@@ -211,7 +211,8 @@ def run_variant(
     found = _bundle_facts(registry, scene)
     figures = log.with_suffix(".evaluation")
     figures.unlink(missing_ok=True)
-    truth = ["--ground-truth", str(capture.ground_truth)] if capture.ground_truth else []
+    known = [path for path in (capture.ground_truth, capture.labels) if path is not None]
+    truth = [word for path in known for word in ("--ground-truth", str(path))]
     exit_code, error = command("evaluate", scene, *truth, "--json", str(figures))
     if exit_code != 0:
         return result("evaluate failed", exit_code, error, **found)

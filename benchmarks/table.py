@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from string import Template
 
-from benchmarks.columns import GROUPS, ORACLE, PAPER, PAPER_ROWS, REAL, Column
+from benchmarks.columns import GROUPS, ORACLE, OUTLINES, PAPER, PAPER_ROWS, REAL, Column
 from benchmarks.machine import ROOT, describe_code, machine_line
 from benchmarks.results import Result, last_line, load_results
 from benchmarks.spread import PooledResult, Spread, pool, save_spreads, spread_of
@@ -64,6 +64,8 @@ def render_page(results: Sequence[Result], code: dict) -> str:
     keys = {id(result): f"r{number}" for number, result in enumerate(results, start=1)}
     full = [result for result in results if result.truth == "scene"]
     real = [result for result in results if result.truth != "scene"]
+    labelled = {r.capture for r in results if r.metrics.get(OUTLINES[0].key) is not None}
+    outlined = [result for result in results if result.capture in labelled]
     stale = sum(result.sources != code["sources"] for result in results)
     state = f"{stale} of {len(results)} runs are of an older state of the code and marked †." if stale else ""
     counts = sorted({len(result.runs) for result in results if isinstance(result, PooledResult)})
@@ -80,6 +82,7 @@ def render_page(results: Sequence[Result], code: dict) -> str:
         oracles=_oracles(full) or _NOTHING,
         captures=_captures(full, keys) or _NOTHING,
         times=_times(results) or _NOTHING,
+        outlines=_rows(outlined, OUTLINES, keys, with_capture=True) if outlined else _NOTHING,
         real=_rows(real, REAL, keys, with_capture=True) if real else _NOTHING,
         runs=_runs(results, keys, code) if results else _NOTHING,
     )

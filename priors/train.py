@@ -11,6 +11,7 @@ import argparse
 import json
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -68,6 +69,14 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+def draw_batch(task, rooms: list[Room], config: TrainConfig, step: int) -> list[torch.Tensor]:
+    """Draw the samples of a step; the same ones whenever it is asked for."""
+    rng = np.random.default_rng((config.seed, step))
+    return task.stack(
+        [task.draw_sample(rooms[int(rng.integers(len(rooms)))], rng) for _ in range(config.batch)]
+    )
+
+
 def rate_at(step: int, config: TrainConfig) -> float:
     """Return the learning rate: a linear start, then half a cosine down to zero."""
     if step < config.warm_up:
@@ -108,15 +117,18 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     rooms: list[Room] = []
     held: dict[str, list[Room]] = {}
     started, seen = time.perf_counter(), 0
+    ahead, coming = ThreadPoolExecutor(1), None
     for step in range(first, config.steps):
         if not rooms or step % config.refresh_every == 0:
             rooms = open_rooms(data / "train", task.ARRAYS)
             held = {name: open_rooms(data / name, task.ARRAYS) for name in config.held_out}
         for group in optimizer.param_groups:
             group["lr"] = rate_at(step, config)
-        rng = np.random.default_rng((config.seed, step))
-        samples = [task.draw_sample(rooms[int(rng.integers(len(rooms)))], rng) for _ in range(config.batch)]
-        batch = [tensor.to(device) for tensor in task.stack(samples)]
+        # The next samples are drawn while this step is computed, but for those that may come from newer rooms.
+        coming = coming or ahead.submit(draw_batch, task, rooms, config, step)
+        batch = [tensor.to(device) for tensor in coming.result()]
+        fresh = (step + 1) % config.refresh_every == 0 or step + 1 == config.steps
+        coming = None if fresh else ahead.submit(draw_batch, task, rooms, config, step + 1)
         net.train()
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
             parts = task.losses(net, batch, config)
@@ -182,6 +194,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
             }  # fmt: skip
             torch.save(state, checkpoint.with_suffix(".part"))
             checkpoint.with_suffix(".part").replace(checkpoint)
+    ahead.shutdown()
     log.close()
 
 

@@ -7,22 +7,21 @@ from pathlib import Path
 def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Register the verb."""
     from reconstruction.cli import add_common
+    from reconstruction.commands.truth import add_ground_truth
 
     parser = verbs.add_parser(
         "report",
         help="one HTML page that shows what every stage made, what it cost and where it is wrong",
         description="Write one self-contained HTML page about a scene: frames, depth, surface, instances, objects, "
-        "scene graph, assembly, physics and timings; with --ground-truth also what is wrong, and by how much.",
+        "scene graph, assembly, physics and timings; with --ground-truth also what is wrong, and by how much, or "
+        "outlines drawn by hand over what was found.",
     )
     parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.html", help="where to write it (default: SCENE.html)"
     )
-    parser.add_argument(
-        "--ground-truth",
-        type=Path,
-        metavar="DIR",
-        help="the truth of the video (docs/evaluation.md); adds error maps",
+    add_ground_truth(
+        parser, "the truth of the video (docs/evaluation.md), adds error maps; or a file of outlines"
     )
     parser.add_argument(
         "--evaluation",
@@ -44,6 +43,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write the page."""
     from reconstruction.commands.reporting import make_listener
+    from reconstruction.commands.truth import split_truth
     from reconstruction.evaluation.stage_results import StageResults
     from reconstruction.report.collect import by_reason
     from reconstruction.report.page import build_page, read_evaluation
@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path(f"{arguments.scene}.html")
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise UsageError(f"--out {out}: give the name of a file in a folder that exists")
+    ground_truth, labels = split_truth(arguments.ground_truth)
     registry = SceneRegistry(arguments.registry)
     bundle = registry.load(arguments.scene)
     stages = StageResults.find(bundle, registry.root, arguments.work_dir)
@@ -60,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     listener = make_listener(quiet=arguments.quiet)
     with listener:
         listener.begin_stage("report", 1, 1, False)
-        page = build_page(bundle, stages, arguments.ground_truth, evaluation, progress=listener)
+        page = build_page(bundle, stages, ground_truth, evaluation, labels=labels, progress=listener)
         listener.end_stage("report", None)
     out.write_text(page, encoding="utf-8")
     for reason, names in by_reason(stages.missing).items():

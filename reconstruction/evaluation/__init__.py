@@ -1,7 +1,22 @@
-"""The ruler: a scene bundle and the truth in, the metrics of CONTRACT section 4 out, per stage where that is kept."""
+"""The ruler: a scene bundle and the truth in, the metrics of CONTRACT sections 4 and 5 out, per stage where kept."""
 
 from reconstruction.evaluation.evaluate import Evaluation, evaluate_scene
 from reconstruction.evaluation.ground_truth import GroundTruth, TrueEntity
+from reconstruction.evaluation.outline_files import load_outlines
+from reconstruction.evaluation.outline_labels import LabelledFrame, Outline, OutlineLabels
+from reconstruction.evaluation.outline_scores import OutlineScores, score_outlines
 from reconstruction.evaluation.stage_results import StageResults
 
-__all__ = ["Evaluation", "GroundTruth", "StageResults", "TrueEntity", "evaluate_scene"]
+__all__ = [
+    "Evaluation",
+    "GroundTruth",
+    "LabelledFrame",
+    "Outline",
+    "OutlineLabels",
+    "OutlineScores",
+    "StageResults",
+    "TrueEntity",
+    "evaluate_scene",
+    "load_outlines",
+    "score_outlines",
+]

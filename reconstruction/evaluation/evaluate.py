@@ -1,4 +1,4 @@
-"""Measure a scene: every metric of CONTRACT section 4, and every stage whose result is still at hand."""
+"""Measure a scene: every metric of CONTRACT sections 4 and 5, and every stage whose result is still at hand."""
 
 import json
 from collections.abc import Callable
@@ -12,6 +12,7 @@ from reconstruction.evaluation.alignment import Alignment, align
 from reconstruction.evaluation.ground_truth import GroundTruth
 from reconstruction.evaluation.object_boxes import instance_box_figures
 from reconstruction.evaluation.object_scores import score_graph, score_objects
+from reconstruction.evaluation.outlines import measure_outlines
 from reconstruction.evaluation.perceptual import perceptual_scores
 from reconstruction.evaluation.rendering import render_views, score_pictures, video_frames
 from reconstruction.evaluation.scene import (
@@ -46,7 +47,7 @@ _PHYSICS_KEYS = (
 
 @dataclass
 class Evaluation:
-    """What was measured of one scene. `metrics` has the names of CONTRACT section 4; None is in `left_out`."""
+    """What was measured of one scene. `metrics` has the names of CONTRACT 4 and 5; None is in `left_out`."""
 
     scene: str
     revision: str
@@ -56,6 +57,8 @@ class Evaluation:
     extra: list[dict[str, Any]] = field(default_factory=list)  # found objects that match none of them
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)  # metric or stage -> why
+    labels: str | None = None  # the file of outlines
+    outlines: dict[str, Any] = field(default_factory=dict)  # `OutlineScores.to_json()`
 
     def to_json(self) -> dict[str, Any]:
         """Return strict JSON values: what is not finite becomes null."""
@@ -70,6 +73,7 @@ def evaluate_scene(
     bundle: SceneBundle,
     ground_truth: Path | None,
     *,
+    labels: Path | None = None,
     stages: StageResults | None = None,
     video: Path | None = None,
     composition_points: int = COMPOSITION_POINTS,
@@ -80,19 +84,21 @@ def evaluate_scene(
     Args:
         bundle: the scene.
         ground_truth: folder of CONTRACT section 3, or of cameras and depth only; None where there is no truth.
+        labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); None where there are none.
         stages: the results of the scene's stages, for the figures per stage; None leaves them out.
         video: the video, for kept-out frames, where the stages' results are gone; None: the one beside the truth.
         composition_points: drawn on each side's whole surface; the contract's figures need the default.
         progress: told of each part.
 
     Raises:
-        UsageError: the truth is malformed, or not of this video.
+        UsageError: the truth or the labels are malformed, or not of this video.
     """
     truth = None if ground_truth is None else GroundTruth.load(ground_truth)
     out = Evaluation(bundle.scene["id"], bundle.revision, None if ground_truth is None else str(ground_truth))
     stages = stages or StageResults({}, {})
     scene = placed_meshes(bundle)
     parts: list[Callable[[], None]] = [
+        lambda: _outlines(bundle, scene, labels, stages, video, out),
         lambda: _cost(bundle, out),
         lambda: _physics(bundle, out),
         lambda: _rendering(bundle, scene, stages, _video_of(video, ground_truth), out),
@@ -108,7 +114,8 @@ def evaluate_scene(
             lambda: _stage_figures(truth, stages, alignment, out),
         ]
     else:
-        out.left_out["cameras, geometry, objects, graph"] = "no ground truth was given"
+        reason = "no ground truth was given" if labels is None else "labels have outlines only"
+        out.left_out["cameras, geometry, objects, graph"] = reason
     parts.append(lambda: _gaussians(truth, alignment, stages, out))
     progress.start(len(parts), "measuring")
     for part in parts:
@@ -138,6 +145,29 @@ def _cost(bundle: SceneBundle, out: Evaluation) -> None:
     if registration:
         out.metrics["frames_chosen"] = registration["keyframes"]
         out.metrics["frames_registered"] = registration["registered"]
+
+
+def _outlines(
+    bundle: SceneBundle,
+    scene: list[PlacedMesh],
+    labels: Path | None,
+    stages: StageResults,
+    video: Path | None,
+    out: Evaluation,
+) -> None:
+    if labels is None:
+        out.left_out["outlines"] = "no labels were given"
+        return
+    scores = measure_outlines(bundle, scene, labels, stages, video)
+    out.labels, out.outlines = str(labels), scores.to_json()
+    out.metrics.update(scores.metrics)
+    if scores.metrics["outline_edges"] is None:
+        out.left_out["outline_edges"] = (
+            "no thing and its parent are both found, or the labels have no parents"
+        )
+    if scores.without_camera:
+        numbers = ", ".join(map(str, scores.without_camera))
+        out.left_out[f"outlines of frame {numbers}"] = "the scene has no camera of it"
 
 
 def _physics(bundle: SceneBundle, out: Evaluation) -> None:

@@ -8,6 +8,11 @@ _ROWS: tuple[tuple[str, str, str], ...] = (
     ("object_recall_50", "{:.2f}", "objects found, box IoU >= 0.5"),
     ("object_precision_25", "{:.2f}", "found objects that are real, IoU >= 0.25"),
     ("object_precision_50", "{:.2f}", "found objects that are real, IoU >= 0.5"),
+    ("outline_recall_25", "{:.2f}", "things outlined by hand that were found, IoU >= 0.25"),
+    ("outline_recall_50", "{:.2f}", "the same, IoU >= 0.5"),
+    ("outline_precision_25", "{:.2f}", "objects in the labelled frames that are such things, IoU >= 0.25"),
+    ("outline_precision_50", "{:.2f}", "the same, IoU >= 0.5"),
+    ("outline_edges", "{:.2f}", "things found that have the right parent"),
     ("ate_cm", "{:.2f} cm", "camera error after alignment"),
     ("rotation_median_deg", "{:.2f} deg", "camera rotation error, median"),
     ("scale_error", "{:.1%}", "error of the metric scale"),
@@ -69,7 +74,7 @@ def as_table(evaluation: Evaluation) -> str:
             lines.append(f"  {name:<26} {form.format(value):>10}   {meaning}")
         elif name in evaluation.left_out:
             lines.append(f"  {name:<26} {'left out':>10}   {evaluation.left_out[name]}")
-    lines += _objects(evaluation) + _stages(evaluation)
+    lines += _objects(evaluation) + _outlines(evaluation) + _stages(evaluation)
     known = {name for name, _, _ in _ROWS}
     reasons: dict[str, list[str]] = {}
     for name, why in evaluation.left_out.items():
@@ -94,6 +99,21 @@ def _objects(evaluation: Evaluation) -> list[str]:
             )
         lines.append(f"  {item['name']:<16} {verdict}")
     lines += [f"  {'(not real)':<16} {item['id']} ({item['label']})" for item in evaluation.extra]
+    return lines
+
+
+def _outlines(evaluation: Evaluation) -> list[str]:
+    if not evaluation.outlines:
+        return []
+    frames = ", ".join(map(str, evaluation.outlines["frames"]))
+    lines = [f"outlines of frame {frames}"]
+    for item in evaluation.outlines["things"]:
+        verdict = f"missed (best IoU {item['iou']:.2f})"
+        if item["match"] is not None:
+            parent = {True: "right", False: "wrong", None: "not asked"}[item["parent_right"]]
+            verdict = f"is {item['match']} ({item['found_label']}), IoU {item['iou']:.2f}, parent {parent}"
+        lines.append(f"  {item['name']:<16} {verdict}")
+    lines += [f"  {'(not outlined)':<16} {o['id']} ({o['label']})" for o in evaluation.outlines["extra"]]
     return lines
 
 

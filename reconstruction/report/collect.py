@@ -22,6 +22,7 @@ from reconstruction.types import (
 from registry import SceneBundle
 
 if TYPE_CHECKING:
+    from reconstruction.evaluation.outline_scores import OutlineScores
     from reconstruction.report.truth import Truth
 
 
@@ -33,6 +34,7 @@ class Gathered:
     stages: StageResults
     truth: "Truth | None" = None
     evaluation: dict[str, Any] | None = None  # `Evaluation.to_json()`
+    outlines: "OutlineScores | None" = None
 
     @property
     def scene(self) -> dict:
@@ -156,9 +158,10 @@ def gather(
     stages: StageResults,
     truth: "Truth | None" = None,
     evaluation: dict[str, Any] | None = None,
+    outlines: "OutlineScores | None" = None,
 ) -> Gathered:
     """Put together what a report is made from."""
-    return Gathered(bundle, stages, truth, evaluation)
+    return Gathered(bundle, stages, truth, evaluation, outlines)
 
 
 def by_reason(missing: dict[str, str]) -> dict[str, list[str]]:

@@ -199,10 +199,11 @@ def outlined(
     labels: dict[int, str] | None = None,
     tint: float = 0.28,
     smallest: float = 3e-4,
+    line_px: int = 2,
 ) -> np.ndarray:
     """Tint, outline and label (with their ids) what an id map (h, w) shows; the rest of the picture is paled.
 
-    What covers less than `smallest` of the picture is left out.
+    What covers less than `smallest` of the picture is left out. Without `line_px` there are no outlines.
     """
     height, width = image.shape[:2]
     ids = cv2.resize(ids.astype(np.uint16), (width, height), interpolation=cv2.INTER_NEAREST)
@@ -215,8 +216,9 @@ def outlined(
         smooth = cv2.medianBlur(mask.astype(np.uint8), 5)
         picture[mask] = ((1 - tint) * image[mask] + tint * np.array(colors[number])).astype(np.uint8)
         contours, _ = cv2.findContours(smooth, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, contours, -1, (255, 255, 255), 3, cv2.LINE_AA)
-        cv2.drawContours(picture, contours, -1, colors[number], 2, cv2.LINE_AA)
+        if line_px:
+            cv2.drawContours(picture, contours, -1, (255, 255, 255), line_px + 1, cv2.LINE_AA)
+            cv2.drawContours(picture, contours, -1, colors[number], line_px, cv2.LINE_AA)
         inner = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
         row, column = np.unravel_index(int(np.argmax(inner)), inner.shape)
         places.append((number, int(column), int(row)))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction.evaluation.ground_truth import GroundTruth
+from reconstruction.evaluation.scene import placed_meshes
 from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.report import pictures, sections
@@ -22,6 +23,7 @@ def build_page(
     ground_truth: Path | None = None,
     evaluation: dict[str, Any] | None = None,
     *,
+    labels: Path | None = None,
     progress: Progress = NO_PROGRESS,
 ) -> str:
     """Return the report of a scene as one self-contained HTML page.
@@ -31,10 +33,11 @@ def build_page(
         stages: what its stages made, as far as that is kept; what is missing is left out and said so.
         ground_truth: folder of CONTRACT section 3; None: there are no error maps.
         evaluation: what `Evaluation.to_json` gave for this scene; None: measured here where there is a truth.
+        labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); None: there is no such section.
         progress: told of each part.
 
     Raises:
-        UsageError: the truth is malformed, or not of this video.
+        UsageError: the truth or the labels are malformed, or not of this video.
     """
     truth = None
     if ground_truth is not None:
@@ -44,7 +47,12 @@ def build_page(
         truth = Truth.of(bundle, GroundTruth.load(ground_truth))
         if evaluation is None:
             evaluation = evaluate_scene(bundle, ground_truth, stages=stages, progress=progress).to_json()
-    return render(gather(bundle, stages, truth, evaluation))
+    outlines = None
+    if labels is not None:
+        from reconstruction.evaluation.outlines import measure_outlines
+
+        outlines = measure_outlines(bundle, placed_meshes(bundle), labels, stages)
+    return render(gather(bundle, stages, truth, evaluation, outlines))
 
 
 def read_evaluation(path: Path, bundle: SceneBundle) -> dict[str, Any]:

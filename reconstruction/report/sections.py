@@ -31,12 +31,13 @@ from reconstruction.report.contact_sheet import anchor_text
 def all_sections(g: Gathered) -> list[Section]:
     """Return the page's sections in order."""
     from reconstruction.report.against_truth import truth_section
+    from reconstruction.report.outline_section import outline_section
     from reconstruction.report.report_card import cost_section, notes_section, physics_section
 
     makers = (
-        truth_section, cameras_section, depth_section, gaussians_section, surface_section, instances_section,
-        objects_section, graph_section, assembly_section, kept_out_section, physics_section, cost_section,
-        notes_section,
+        truth_section, outline_section, cameras_section, depth_section, gaussians_section, surface_section,
+        instances_section, objects_section, graph_section, assembly_section, kept_out_section, physics_section,
+        cost_section, notes_section,
     )  # fmt: skip
     made = [maker(g) for maker in makers]
     return [section for section in made if section is not None]
@@ -55,9 +56,8 @@ def summary_tiles(g: Gathered) -> Tiles:
         depth = physics["spawn_penetration_mm"]
         tiles.append(Tile(f"{depth:.1f} mm", "deepest overlap", graded(-depth, -1.0, -5.0)))
     sigma = scale["uncertainty"]
-    tiles.append(
-        Tile(f"± {sigma:.0%}", "scale", graded(-sigma, -0.05, -0.2), scale["method"].replace("-", " "))
-    )
+    status = "bad" if sigma is None else graded(-sigma, -0.05, -0.2)
+    tiles.append(Tile(_uncertainty(scale), "scale", status, scale["method"].replace("-", " ")))
     if "registration" in report:
         found = report["registration"]
         share = found["registered"] / max(found["keyframes"], 1)
@@ -67,6 +67,11 @@ def summary_tiles(g: Gathered) -> Tiles:
     memory = f"peak {report['peak_memory_mb'] / 1024:.1f} GB"
     tiles.append(Tile(f"{total / 60:.1f} min" if total >= 90 else f"{total:.0f} s", "time", detail=memory))
     return Tiles(tiles)
+
+
+def _uncertainty(scale: dict) -> str:
+    """Return the relative uncertainty of metres as text; a scene of unknown scale has none."""
+    return "unknown" if scale["uncertainty"] is None else f"± {scale['uncertainty']:.0%}"
 
 
 def cameras_section(g: Gathered) -> Section:
@@ -96,7 +101,8 @@ def cameras_section(g: Gathered) -> Section:
     rows.append(("camera", f"{c.width}×{c.height}, focal length {c.fx:.0f} px, field of view {_fov(c):.0f}°"))
     scale = scene["scale"]
     detail = f"; {scale['detail']}" if scale.get("detail") else ""
-    rows.append(("scale", f"{scale['method']}, ± {scale['uncertainty']:.0%} (1 σ){detail}"))
+    spread = "" if scale["uncertainty"] is None else f", {_uncertainty(scale)} (1 σ)"
+    rows.append(("scale", f"{scale['method']}{spread}{detail}"))
     world = scene.get("world")
     if world:
         floor = "seen" if world["floor_observed"] else "assumed below everything seen"

@@ -81,6 +81,19 @@ def test_the_digest_covers_input_and_truth(shelf):
     assert len({before, changed_truth, capture.digest()}) == 3
 
 
+def test_labels_beside_captures_are_found_by_name_and_digested(shelf):
+    (shelf / "labels").mkdir()
+    before = find_captures([shelf / "scan"])[0]
+    (shelf / "labels" / "scan.json").write_text("{}")
+    (shelf / "labels" / "other.json").write_text("{}")
+    found = find_captures([shelf])
+    assert [c.labels and c.labels.name for c in found] == [None, None, None, "scan.json"]
+    assert before.labels is None
+    digests = {before.digest(), found[3].digest()}
+    (shelf / "labels" / "scan.json").write_text("[]")
+    assert len(digests | {found[3].digest()}) == 3
+
+
 def test_an_oracle_needs_the_truth_that_it_gives(shelf):
     room, kitchen, photos, _ = find_captures([shelf])
     by_name = {variant.name: variant for variant in VARIANTS}

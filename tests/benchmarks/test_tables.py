@@ -170,6 +170,22 @@ def test_captures_without_entities_have_a_table_of_their_own():
     assert "### dorm" not in page
 
 
+def test_captures_with_labels_have_a_table_of_outlines():
+    figures = {"outline_recall_25": 0.41, "outline_precision_25": 0.85, "outline_recall_50": 0.3}
+    figures |= {"outline_precision_50": 0.6, "outline_things": 46, "outline_objects": 20, "outline_frames": 6}
+    kitchen = made("kitchen", truth="cameras", **figures, outline_edges=None)
+    lost = failed("kitchen", "fast", truth="cameras")
+    page = render_page([made("a"), made("fox", truth="none"), kitchen, lost], CODE)
+    section = "## Outlines drawn by hand"
+    row = rows(page, section, "kitchen")[0]
+    assert row[3:7] == ["0.41", "0.85", "0.30", "0.60"]
+    assert row[7].startswith("–")
+    assert row[8:] == ["46", "20", "6"]
+    assert rows(page, section, "kitchen")[1][3] == "failed"
+    assert not rows(page, section, "fox")
+    assert "Not measured yet." in render_page([made("a")], CODE).split(section)[1]
+
+
 def test_every_row_leads_to_machine_commit_and_date_and_old_code_is_marked():
     old = replace(made("b"), commit="old99", sources="before", dirty=True)
     page = render_page([made("a"), old], CODE)

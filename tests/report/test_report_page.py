@@ -14,9 +14,11 @@ import pytest
 from reconstruction.cli import main
 from reconstruction.evaluation.evaluate import evaluate_scene
 from reconstruction.evaluation.ground_truth import GroundTruth
+from reconstruction.evaluation.outlines import measure_outlines
 from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.report import pictures
 from reconstruction.report.collect import gather
+from reconstruction.report.outline_section import outline_section
 from reconstruction.report.page import build_page
 from reconstruction.report.truth import Truth
 
@@ -164,6 +166,24 @@ def test_with_the_truth_there_are_error_maps_and_figures(page, page_with_truth, 
         "lacks of the truth",
     ):
         assert text in page_with_truth
+
+
+def test_outlines_are_drawn_over_the_kept_frames(reconstructed, tmp_path):
+    """The true table of a kept-out frame, outlined by hand, lies on the frame as filmed and is found."""
+    g = gathered(reconstructed)
+    index, pose = int(g.posed.held_out_indices[0]), g.posed.held_out_world_from_camera[0]
+    _, ids = g.truth.frame(index, pose, g.camera)
+    table = next(e for e in g.truth.known.entities if e.name == "table")
+    border = max(cv2.findContours((ids == table.id).astype(np.uint8), 0, 1)[0], key=len)[:, 0] + 0.5
+    thing = {"name": "table", "polygon": border.tolist()}
+    frame = {"index": index, "width": g.camera.width, "height": g.camera.height, "things": [thing]}
+    labels = tmp_path / "labels.json"
+    labels.write_text(json.dumps({"frames": [frame], "things": {"table": {"parent": "floor"}}}))
+    scores = measure_outlines(g.bundle, g.meshes, labels, g.stages)
+    assert scores.things[0]["iou"] > 0.6
+    assert scores.things[0]["parent_right"]
+    shown = next(b for b in outline_section(replace(g, outlines=scores)).blocks if b.kind == "pictures")
+    assert [item.caption for item in shown.items] == [f"frame {index}"]
 
 
 def gathered(reconstructed):
