@@ -9,7 +9,7 @@ import torch
 
 from priors.affinities import affinity_loss
 from priors.samples import Room, other_light
-from reconstruction.depth.candidates import OFFSETS, SAME, candidate_depths, choose_candidates
+from reconstruction.depth.candidates import OFFSETS, candidate_depths, choose_candidates
 from reconstruction.depth.evidence import MEASURED, PREDICTED
 from reconstruction.depth.mending import mending_features
 from reconstruction.depth.network import Mending
@@ -183,9 +183,7 @@ def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
             add(mark + "entropy", _entropy(logits, likelihood, weight))
             add(mark + "affinity", affinity_loss(affinity.float(), ids))
             found, trust = (np.zeros(sample.truth.shape, np.float32) for _ in range(2))
-            choose_candidates(
-                sample.candidates, share[: len(OFFSETS)], np.float32(SAME), np.float32(0.5), found, trust
-            )
+            choose_candidates(sample.candidates, share[: len(OFFSETS)], np.float32(0.5), found, trust)
             steps = beside_steps(sample.truth)
             for name, rho in (("before", sample.candidates[0]), ("after", found)):
                 for part, mask in (("", sample.truth > 0), ("_steps", (sample.truth > 0) & steps)):

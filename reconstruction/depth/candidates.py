@@ -16,8 +16,10 @@ OFFSETS = np.array(
     np.int64,
 )
 """(k, 2) rows and columns from a pixel to the pixels whose surfaces it may lie on; the first is itself."""
-SAME = 0.025
-"""Relative difference of depths up to which two candidates say the same."""
+SPREAD = np.float32(0.02)
+"""Relative difference of depths at which a candidate has half a say in another one's probability."""
+_KEPT = np.float32(0.9)  # share of the mode's probability from which a pixel keeps its own depth
+_NO_MODE = np.float32(0.01)  # candidates less probable than this are no mode
 _JUMP = np.float32(
     0.012
 )  # relative change of inverse depth from pixel to pixel up to which a surface goes on
@@ -92,42 +94,44 @@ def candidate_depths(rho: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True)
-def choose_candidates(candidates, share, same, least, out, trust):  # pragma: no cover - compiled
-    """Write the inverse depth that most probability stands behind, and that probability; a pixel's own where it wins.
+def _support(candidates, share, at, y, x, spread):  # pragma: no cover - compiled
+    """Return the probability of a depth's neighborhood: all candidates, weighed by how near they are."""
+    total = np.float32(0.0)
+    for j in range(len(candidates)):
+        c = candidates[j, y, x]
+        if c > 0.0:
+            off = (c - at) / (spread * at)
+            total += share[j, y, x] / (np.float32(1.0) + off * off)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def choose_candidates(candidates, share, least, out, trust):  # pragma: no cover - compiled
+    """Write the mode of a pixel's candidates as a mixture, and the probability around it.
+
+    A pixel's own depth is kept where it is nearly the mode.
 
     Args:
         candidates: (k, h, w) inverse depths, 0 = none; the first is the pixel's own.
         share: (k, h, w) probability that each is right.
-        same: Relative difference up to which two say the same.
         least: Probability from which depth is believed; less: unknown.
-        out: float32 (h, w), written.
-        trust: float32 (h, w), written.
+        out: float32 (h, w) inverse depth, written.
+        trust: float32 (h, w) probability, written.
     """
     k, h, w = candidates.shape
     for y in range(h):
         for x in range(w):
-            own = candidates[0, y, x]
-            best, value = np.float32(0.0), np.float32(0.0)
-            if own > 0.0:
-                for j in range(k):
-                    c = candidates[j, y, x]
-                    if c > 0.0 and abs(c - own) < same * own:
-                        best += share[j, y, x]
-                value = own
-            if best < np.float32(0.5):
-                for i in range(1, k):
-                    at = candidates[i, y, x]
-                    # A group's share is at most what the others left over.
-                    if at <= 0.0 or share[i, y, x] < np.float32(0.01):
-                        continue
-                    total, mean = np.float32(0.0), np.float32(0.0)
-                    for j in range(k):
-                        c = candidates[j, y, x]
-                        if c > 0.0 and abs(c - at) < same * at:
-                            total += share[j, y, x]
-                            mean += share[j, y, x] * c
-                    if total > best:
-                        best = total
-                        value = mean / total
+            own, best, value = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            for i in range(k):
+                at = candidates[i, y, x]
+                if at <= 0.0 or (i > 0 and share[i, y, x] < _NO_MODE):
+                    continue
+                total = _support(candidates, share, at, y, x, SPREAD)
+                if i == 0:
+                    own = total
+                if total > best:
+                    best, value = total, at
+            if own >= _KEPT * best and own > 0.0:
+                best, value = own, candidates[0, y, x]
             trust[y, x] = best
             out[y, x] = value if best >= least else np.float32(0.0)

@@ -69,8 +69,8 @@ class DepthConfig:
     mend_surety: float = 0.5
     """Probability from which depth is believed after mending."""
 
-    mend_rounds: int = 1
-    """How often maps are mended."""
+    mend_rounds: int = 2
+    """How often maps are mended before views are compared once more."""
 
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""

@@ -368,10 +368,12 @@ def estimate_depth(
     )  # a model that is not there is told before the work, not after
     found = gather_evidence(posed, config, backend=backend, progress=progress)
     if config.prior in ("mending", "both"):
-        from reconstruction.depth.mending import mend_depth
+        from reconstruction.depth.mending import drop_unconfirmed, mend_depth
 
+        each = Workers(config.threads).each
         for _ in range(config.mend_rounds):
-            found = mend_depth(found, posed, config.mend_surety, Workers(config.threads).each, progress)
+            found = mend_depth(found, posed, config.mend_surety, each, progress)
+        found = drop_unconfirmed(found, posed, config.min_agreeing, each, progress)
     depth, confidence = found.depth, np.where(found.origin == PREDICTED, 1, found.origin).astype(np.uint8)
     if config.perturb:
         depth = perturbed(depth, config.perturb)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.depth.candidates import SAME, candidate_depths, choose_candidates
+from reconstruction.depth.candidates import candidate_depths, choose_candidates
 from reconstruction.depth.evidence import COMPLETED, MEASURED, PREDICTED, Evidence, count_views
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import PosedFrames
@@ -20,6 +20,7 @@ WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
 FEATURES = 13
 _AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against
 _MANY_VIEWS = 10.0
+_LOOK_THROUGH = 2  # views that see something beyond a point, from which it may be dropped
 
 
 def mending_features(
@@ -96,7 +97,7 @@ def mend_depth(
     progress: Progress = NO_PROGRESS,
     weights: Path = WEIGHTS,
 ) -> Evidence:
-    """Return the evidence with mended maps: every pixel on the surface that it most probably lies on, or unknown.
+    """Return the evidence with maps mended once: every pixel on the surface that it most probably lies on, or unknown.
 
     Args:
         found: Maps and the origin of every pixel.
@@ -122,7 +123,7 @@ def mend_depth(
         candidates = candidate_depths(own)
         share = candidate_shares(features, candidates > 0, weights)
         rho, trust = np.empty_like(own), np.empty_like(own)
-        choose_candidates(candidates, share, np.float32(SAME), np.float32(least), rho, trust)
+        choose_candidates(candidates, share, np.float32(least), rho, trust)
         kept = rho == own
         depth[i] = np.where(kept, found.depth[i], np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0))
         origin[i] = np.where(depth[i] > 0, np.where(kept, found.origin[i], COMPLETED), 0)
@@ -134,3 +135,25 @@ def mend_depth(
         f"depth: mending dropped {shares[0]:.1f} % of the pixels, moved {shares[1]:.1f} % and filled {shares[2]:.1f} %"
     )
     return replace(found, depth=depth, origin=origin)
+
+
+def drop_unconfirmed(
+    found: Evidence, posed: PosedFrames, least: int, each: Callable, progress: Progress = NO_PROGRESS
+) -> Evidence:
+    """Return the evidence without depth that too few views see, or that more look through.
+
+    Args:
+        found: Maps and the origin of every pixel.
+        posed: Their frames.
+        least: Other views that have to see the same point.
+        each: Runs a function for every frame: each(n, work, label, progress).
+        progress: Where steps and shares are reported.
+    """
+    agree, through = count_views(found.depth, posed, found.camera, found.neighbors, each, progress)
+    drop = (agree < least) | ((through >= _LOOK_THROUGH) & (through > agree + 1))
+    progress.note(
+        f"depth: views did not confirm {100 * float((drop & (found.depth > 0)).mean()):.1f} % of the pixels"
+    )
+    return replace(
+        found, depth=np.where(drop, 0, found.depth), origin=np.where(drop, 0, found.origin).astype(np.uint8)
+    )
