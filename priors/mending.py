@@ -19,6 +19,8 @@ ARRAYS = ("picture", "depth", "origin", "agreed", "correlation", "surety", "exac
 SCORE = "entropy"
 """The figure that is least for the best weights."""
 _CROP = (192, 224)
+_ZOOM = (0.55, 1.25)
+_EXCHANGED = 0.3  # share of samples whose rows and columns are exchanged
 _LEFT_OUT, _AGREED = (
     0.3,
     0.3,
@@ -47,7 +49,7 @@ def make_network(config: Any) -> Mending:
 
 def load_sample(
     room: Room, row: int, window: tuple[slice, slice] = (slice(None), slice(None)), *,
-    agreed: bool = False, predictions: bool = True, rng: np.random.Generator | None = None, flip: bool = False,
+    agreed: bool = False, predictions: bool = True, disturb: "Disturbance | None" = None,
 ) -> Sample:  # fmt: skip
     """Read a keyframe, or a window of it.
 
@@ -57,24 +59,23 @@ def load_sample(
         window: Rows and columns.
         agreed: Whether what was measured alone stands in place of the completed maps.
         predictions: Whether predictions of the aggregation network stay.
-        rng: Disturbs the picture; None: left as it is.
-        flip: Whether to mirror it.
+        disturb: Changes what does not matter; None: left as it is.
     """
 
-    def read(name: str) -> np.ndarray:
-        cut = room.arrays[name][row][window]
-        return np.ascontiguousarray(cut[:, ::-1] if flip else cut)
+    def read(name: str, smooth: bool = False) -> np.ndarray:
+        cut = np.asarray(room.arrays[name][row][window])
+        return cut if disturb is None else disturb.reshape(cut, smooth)
 
     kind = "agreed" if agreed else "depth"
     counts = ("agreed_agree", "agreed_through") if agreed else ("agree", "through")
     depth = read(kind).astype(np.float32)
-    origin = np.where(depth > 0, MEASURED, 0).astype(np.uint8) if agreed else read("origin")
+    origin = np.where(depth > 0, MEASURED, 0).astype(np.uint8) if agreed else read("origin").copy()
     if not predictions:
         depth[origin == PREDICTED] = 0
-        origin = np.where(origin == PREDICTED, 0, origin)
-    picture = read("picture").astype(np.float32) / 255
-    if rng is not None:
-        picture = other_light(picture.transpose(2, 0, 1), rng).transpose(1, 2, 0)
+        origin[origin == PREDICTED] = 0
+    picture = read("picture", smooth=True).astype(np.float32) / 255
+    if disturb is not None:
+        picture = other_light(picture.transpose(2, 0, 1), disturb.rng).transpose(1, 2, 0)
     agree, through = (np.where(depth > 0, read(name), 0) for name in counts)
     features = mending_features(
         picture, depth, origin, read("correlation").astype(np.float32) / 100, agree, through,
@@ -85,16 +86,43 @@ def load_sample(
     return Sample(features, candidate_depths(rho), truth, read("exact_ids").astype(np.int32))
 
 
+@dataclass(frozen=True)
+class Disturbance:
+    """Another size, mirrored, rows and columns exchanged, and another light (`other_light`, by `rng`)."""
+
+    size: tuple[int, int]  # rows and columns, before they are exchanged
+    mirrored: bool
+    exchanged: bool
+    rng: np.random.Generator
+
+    def reshape(self, array: np.ndarray, smooth: bool) -> np.ndarray:
+        """Return an array (h, w, ...) in the other size; `smooth` mixes neighbors, as pictures may."""
+        import cv2
+
+        kind = array.dtype
+        wide = array.astype(np.float32) if kind in (np.float16, np.uint16) else array
+        shrinks = self.size[0] < len(array)
+        how = (cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR) if smooth else cv2.INTER_NEAREST
+        out = cv2.resize(np.ascontiguousarray(wide), self.size[::-1], interpolation=how).astype(kind)
+        out = out[:, ::-1] if self.mirrored else out
+        return np.ascontiguousarray(np.swapaxes(out, 0, 1) if self.exchanged else out)
+
+
 def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
-    """Draw a keyframe, a crop of it, the maps it comes with, and disturb the picture."""
+    """Draw a keyframe, a crop of it, the maps it comes with, and disturb what does not matter."""
     row = int(rng.integers(len(room)))
     h, w = room.arrays["depth"].shape[1:3]
-    y, x = int(rng.integers(h - _CROP[0] + 1)), int(rng.integers(w - _CROP[1] + 1))
-    window = (slice(y, y + _CROP[0]), slice(x, x + _CROP[1]))
-    agreed, predictions = rng.random() < _AGREED, rng.random() >= _LEFT_OUT
+    exchanged = bool(rng.random() < _EXCHANGED)
+    size = _CROP[::-1] if exchanged else _CROP
+    zoom = float(np.exp(rng.uniform(*np.log(_ZOOM))))
+    zoom = max(zoom, size[0] / h, size[1] / w)
+    high, wide = (min(round(s / zoom), limit) for s, limit in zip(size, (h, w), strict=True))
+    y, x = int(rng.integers(h - high + 1)), int(rng.integers(w - wide + 1))
+    disturb = Disturbance(size, bool(rng.random() < 0.5), exchanged, rng)
     return load_sample(
-        room, row, window, agreed=agreed, predictions=predictions, rng=rng, flip=rng.random() < 0.5
-    )
+        room, row, (slice(y, y + high), slice(x, x + wide)), disturb=disturb,
+        agreed=bool(rng.random() < _AGREED), predictions=bool(rng.random() >= _LEFT_OUT),
+    )  # fmt: skip
 
 
 def stack(samples: list[Sample]) -> list[torch.Tensor]:
