@@ -30,7 +30,6 @@ from synthetic.film import film_room, render_truth
 
 WIDTH, HEIGHT = 480, 360
 KEEP = ("costs", "winner", "depth", "gaussians", "surface")
-_PREDICTED_FROM = 0.4  # surety from which predictions are offered to the mending network, to be judged by it
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -135,7 +134,7 @@ def measure_film(film: Film, frames: int, cameras: str, keep: set[str]) -> dict[
     from priors.surfaces import measure_surface
 
     posed, path = film_frames(film, frames, cameras)
-    config = DepthConfig(threads=1, prior="aggregation", prior_surety=_PREDICTED_FROM)
+    config = DepthConfig(threads=1, prior="both")
     out = {"world_from_camera": path}
     if keep & {"costs", "winner"}:
         out |= _measure_costs(film, posed, path, config, "winner" in keep)

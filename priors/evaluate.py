@@ -1,8 +1,8 @@
 """Measure the depth stage on rooms of held-out families, with one or several settings side by side.
 
-    python -m priors.evaluate --splits shapes rooms --rooms 4 --photographs DIR --set prior=none --set prior=aggregation
+    python -m priors.evaluate --splits shapes rooms --rooms 4 --photographs DIR --set prior=none --set prior=both
 
-Every `--set` is one variant (several fields with commas: `--set prior=aggregation,edge_rounds=0`). Rooms are numbered
+Every `--set` is one variant (several fields with commas: `--set prior=both,edge_rounds=0`). Rooms are numbered
 from `--first`, apart from those of the dataset, and filmed anew; the whole depth stage runs, nothing else.
 """
 
@@ -41,7 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--json", type=Path, help="write all figures there")
     options = parser.parse_args(arguments)
-    variants = {text: _config(text, parser) for text in options.set or ["prior=none", "prior=aggregation"]}
+    variants = {
+        text: _config(text, parser) for text in options.set or ["prior=none", "prior=mending", "prior=both"]
+    }
     figures: dict[str, dict[str, list[dict]]] = {
         text: {split: [] for split in options.splits} for text in variants
     }

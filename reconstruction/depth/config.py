@@ -53,11 +53,11 @@ class DepthConfig:
     min_speckle_px: int = 60
     """Smaller islands of measured depth are dropped."""
 
-    prior: Literal["none", "aggregation", "mending", "both"] = "none"
-    """The networks in use (docs/priors.md): one predicts depth from the costs where nothing was measured, one mends
-    finished maps beside occlusion borders."""
+    prior: Literal["none", "mending", "both"] = "none"
+    """The networks in use (docs/priors.md): "mending" puts every pixel on one of the surfaces around it or on none; "both"
+    predicts depth from the costs before that, where nothing was measured."""
 
-    prior_surety: float = 0.7
+    prior_surety: float = 0.4
     """Probability from which the network's depth is asked for where windows measure nothing."""
 
     prior_agree_depth: float = 0.03

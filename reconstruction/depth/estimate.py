@@ -112,7 +112,7 @@ def _measure(posed, camera: Camera, plan: ViewPlan, config: DepthConfig, workers
     from reconstruction.depth.edges import sharpen_edges
     from reconstruction.depth.refine import fit_slopes, refine
 
-    learned = config.prior in ("aggregation", "both")
+    learned = config.prior == "both"
     small = sized_camera(camera, config.sweep_side_px)
     fine_gray, small_gray = gray_images(posed.images, camera), gray_images(posed.images, small)
     shape = (camera.height, camera.width)
@@ -367,7 +367,7 @@ def estimate_depth(
         config
     )  # a model that is not there is told before the work, not after
     found = gather_evidence(posed, config, backend=backend, progress=progress)
-    if config.prior in ("mending", "both"):
+    if config.prior != "none":
         from reconstruction.depth.mending import drop_unconfirmed, mend_depth
 
         each = Workers(config.threads).each

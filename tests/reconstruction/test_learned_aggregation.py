@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from reconstruction.depth import DepthConfig, aggregation, estimate_depth
+from reconstruction.depth import DepthConfig, aggregation
 from reconstruction.depth.aggregation import (
     BINS,
     PLANES,
@@ -18,6 +18,8 @@ from reconstruction.depth.aggregation import (
     place_of_depth,
     smoothed_scores,
 )
+from reconstruction.depth.estimate import gather_evidence
+from reconstruction.depth.evidence import PREDICTED
 from reconstruction.depth.network import Aggregation, place_of
 from reconstruction.depth.weights import load_network
 from registry.errors import EnvironmentMissing
@@ -113,14 +115,14 @@ def test_the_weights_are_small_and_load_quickly():
 def test_predictions_fill_what_is_unknown_and_change_nothing_else():
     capture = make_test_capture(10, 160, 120)
     plain = DepthConfig(depth_side_px=160, sweep_side_px=160, complete=False)
-    before = estimate_depth(capture.posed, plain)
-    after = estimate_depth(capture.posed, replace(plain, prior="aggregation", prior_surety=0.3))
+    before = gather_evidence(capture.posed, plain)
+    after = gather_evidence(capture.posed, replace(plain, prior="both", prior_surety=0.3))
     known = before.depth > 0
     assert np.array_equal(before.depth[known], after.depth[known])
-    assert np.array_equal(before.confidence[known], after.confidence[known])
+    assert np.array_equal(before.origin[known], after.origin[known])
     new = (after.depth > 0) & ~known
     assert new.mean() > 0.005
-    assert (after.confidence[new] == 1).all()
+    assert (after.origin[new] == PREDICTED).all()
     truth = capture.depth.depth
     off = np.abs(after.depth[new & (truth > 0)] / truth[new & (truth > 0)] - 1)
     assert np.median(off) < 0.05
