@@ -54,8 +54,8 @@ class DepthConfig:
     """Smaller islands of measured depth are dropped."""
 
     prior: Literal["none", "mending", "both"] = "none"
-    """The networks in use (docs/priors.md): "mending" puts every pixel on one of the surfaces around it or on none; "both"
-    predicts depth from the costs before that, where nothing was measured."""
+    """The networks in use (docs/priors.md): "mending" puts every pixel on one of the surfaces around it or on none;
+    with "both", depth is predicted from the costs before that, where nothing was measured."""
 
     prior_surety: float = 0.4
     """Probability from which the network's depth is asked for where windows measure nothing."""

@@ -8,6 +8,10 @@ from typing import Literal
 class InstancesConfig:
     """How the surface is cut into things."""
 
+    cut: Literal["rules", "partition"] = "rules"
+    """Without masks, what cuts: `rules` of shape, contact and color, or `partition`, one multicut by learned
+    affinities."""
+
     masks: Literal["embedded", "folder", "sam2", "sam3", "mask2former"] = "embedded"
     """Where the cut comes from: `embedded` (geometry and color, nothing to install), `folder` (id images that any other
     tool made), `sam2`, `sam3` or `mask2former` (through transformers)."""

@@ -15,6 +15,7 @@ from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
 from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.outlined import add_outlined
+from reconstruction.instances.partition import cut_by_partition
 from reconstruction.instances.refine import refine_by_views
 from reconstruction.instances.rules import cut_by_rules
 from reconstruction.instances.scraps import without_unseen
@@ -48,13 +49,16 @@ def find_instances(
     shell = Shell.of(surface, progress)
     progress.advance()
     frames = sightings(surface, posed, depth)
-    if masks is None:
+    by_rules = masks is None and config.cut == "rules"
+    if masks is None and config.cut == "partition":
+        cut = cut_by_partition(shell, surface, frames, config, progress)
+    elif masks is None:
         cut = cut_by_rules(shell, surface, posed, depth, frames, config, progress)
         cut = refine_by_views(shell, cut, surface, posed, depth, config, progress)
     else:
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     taken = without_doubts(shell, cut.things, frames, progress)
-    if masks is None:
+    if by_rules:
         again = cut_cleaned_stacks(shell.graph, surface, cut.things, posed, depth, config, progress)
         cut = replace(cut, things=again)
     progress.advance()

@@ -61,7 +61,7 @@ def cut_by_masks(
         thing.rests_on = things[carrier] if carrier >= 0 else None
     for thing in things:
         _drop_skirts(graph, thing, [t for t in things if t.rests_on is thing])
-    _mark_attached(shell, things)
+    mark_attached(shell, things)
     return Cut(things, owner, _named(masks.resized(depth.camera.width, depth.camera.height), lifted, names))
 
 
@@ -168,7 +168,7 @@ def _drop_skirts(graph: MeshGraph, carrier: Thing, carried: list[Thing]) -> None
             carrier.vertices = carrier.vertices[~near]
 
 
-def _mark_attached(shell: Shell, things: list[Thing]) -> None:
+def mark_attached(shell: Shell, things: list[Thing]) -> None:
     """Mark things that touch a wall and have nothing below them."""
     graph = shell.graph
     for thing in things:

@@ -1,0 +1,169 @@
+"""Graphs with truth from rooms on disk: fused surfaces, features of superpoints and borders, true entities; cached."""
+
+import hashlib
+import shutil
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from priors.rooms import draw_film
+from priors.samples import Room
+from reconstruction import artifacts
+from reconstruction.cache import source_digest
+from reconstruction.instances.cut import Shell
+from reconstruction.instances.partition.features import Shapes, View, edge_features, node_features
+from reconstruction.instances.partition.graph import region_graph
+from reconstruction.instances.sightings import sightings
+from reconstruction.progress import NO_PROGRESS
+from reconstruction.surface import SurfaceConfig, fuse_surface
+from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
+from synthetic.capture import posed_capture
+from synthetic.film import FilmSet
+
+NEEDED = ("picture", "depth", "origin", "exact_depth", "exact_ids", "world_from_camera", "focal")
+_PREDICTED = 3  # in `origin`: depth that a network made up
+_FEATURE_MODULES = (
+    "priors.partition_rooms",
+    *(
+        f"reconstruction.instances.{name}"
+        for name in (
+            "superpoints",
+            "sightings",
+            "partition.graph",
+            "partition.evidence",
+            "partition.features",
+        )
+    ),
+)
+_SAMPLES = 2_000_000  # of the true surface
+_OFF_M, _OFF_SHARE = 0.02, 0.02  # farther from every true surface, also as a share of the depth: an artifact
+_LEAST_PURITY = 0.6  # of a superpoint's known surface must be of one entity
+
+
+@dataclass(frozen=True)
+class Example:
+    """One room's graph and its truth."""
+
+    nodes: np.ndarray  # float32 (n, F) features of regions
+    edges: np.ndarray  # float32 (e, G) features of borders
+    pairs: np.ndarray  # int32 (e, 2)
+    centers: np.ndarray  # float32 (n, 3) of regions, world metres
+    region: np.ndarray  # int32 (v,) region of each vertex
+    areas: np.ndarray  # float64 (v,) m2
+    true_ids: np.ndarray  # uint16 (v,) entity, 0 = artifact
+    base_entities: np.ndarray  # int () ids 1 to this one are floor and walls
+    pixels: np.ndarray  # float64 (ids,) greatest share of a keyframe that shows each entity
+
+    def region_ids(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the entity int (n,) with most surface in each region, and whether the region is pure."""
+        count, ids = len(self.nodes), int(self.true_ids.max()) + 1
+        table = np.zeros((count, ids))
+        np.add.at(table, (self.region, self.true_ids), np.maximum(self.areas, 1e-12))
+        return table.argmax(axis=1), table.max(axis=1) > _LEAST_PURITY * table.sum(axis=1)
+
+
+def frames_and_depth(room: Room) -> tuple[PosedFrames, DepthMaps]:
+    """Return the keyframes with true cameras, and their depth as measured, without what a network predicted."""
+    a = room.arrays
+    origin = np.asarray(a["origin"])
+    depth = np.where(origin == _PREDICTED, 0, a["depth"]).astype(np.float32)
+    height, width = depth.shape[1:]
+    fx, fy = (float(f) for f in a["focal"])
+    camera = Camera(width, height, fx, fy, 0.5 * width, 0.5 * height)
+    posed = posed_capture(
+        camera, np.asarray(a["world_from_camera"]), np.asarray(a["picture"]), depth, room.folder.name
+    )
+    return posed, DepthMaps(camera, depth, np.where(origin == _PREDICTED, 0, origin).astype(np.uint8))
+
+
+def fused(room: Room, cache: Path) -> Surface:
+    """Return the fused surface of a room, from the cache if it is there."""
+    folder = cache / "surfaces" / room.folder.parent.name / room.folder.name
+    if not folder.is_dir():
+        posed, depth = frames_and_depth(room)
+        part = folder.with_name(folder.name + ".part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        artifacts.save(fuse_surface(posed, depth, SurfaceConfig()), part)
+        part.rename(folder)
+    return artifacts.load(Surface, folder)
+
+
+def example(room: Room, cache: Path, photographs: Path | None) -> Example:
+    """Return the graph of a room with its truth, from the cache if the code that made it is the same."""
+    digest = hashlib.sha256("".join(source_digest(name) for name in _FEATURE_MODULES).encode()).hexdigest()[
+        :12
+    ]
+    split, number = room.folder.parent.name, room.folder.name
+    file = cache / "graphs" / digest / split / f"{number}.npz"
+    if not file.is_file():
+        write_example(file, _made(room, cache, photographs))
+    return read_example(file)
+
+
+def write_example(file: Path, made: Example) -> None:
+    """Write a graph with its truth, whole or not at all."""
+    _write(file, **{f.name: getattr(made, f.name) for f in fields(Example)})
+
+
+def read_example(file: Path) -> Example:
+    """Read what `write_example` wrote."""
+    with np.load(file) as stored:
+        return Example(**{f.name: stored[f.name] for f in fields(Example)})
+
+
+def _made(room: Room, cache: Path, photographs: Path | None) -> Example:
+    surface = fused(room, cache)
+    posed, depth = frames_and_depth(room)
+    shell = Shell.of(surface, NO_PROGRESS)
+    view = View.of(shell.graph, surface, sightings(surface, posed, depth))
+    graph = region_graph(shell.graph)
+    shapes = Shapes.of(shell.graph, graph)
+    truth = _truth(room, surface, cache, photographs)
+    return Example(
+        node_features(view, graph, shapes), edge_features(view, graph, shapes), graph.pairs,
+        shapes.center.astype(np.float32), graph.region, shell.graph.areas, **truth,
+    )  # fmt: skip
+
+
+def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) -> dict[str, np.ndarray]:
+    """Return the last three fields of a room's example, from the cache if they are there."""
+    split, number = room.folder.parent.name, room.folder.name
+    file = cache / "truth" / split / f"{number}.npz"
+    if not file.is_file():
+        film = draw_film(split, int(number), photographs=photographs)
+        eyes = np.asarray(room.arrays["world_from_camera"])[:, :3, 3]
+        ids = true_ids(film.film_set, np.asarray(surface.vertices, np.float64), eyes)
+        exact = np.asarray(room.arrays["exact_ids"])
+        count = int(max(exact.max(), film.film_set.face_entity.max())) + 1
+        pixels = np.stack([np.bincount(row.ravel(), minlength=count) for row in exact]).max(axis=0)
+        _write(file, true_ids=ids, base_entities=np.array(film.base_entities), pixels=pixels / exact[0].size)
+    with np.load(file) as stored:
+        return dict(stored)
+
+
+def _write(file: Path, **arrays: np.ndarray) -> None:
+    """Write arrays whole or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_suffix(".part.npz")
+    np.savez(part, **arrays)
+    part.rename(file)
+
+
+def true_ids(film_set: FilmSet, points: np.ndarray, eyes: np.ndarray) -> np.ndarray:
+    """Return the entity uint16 (v,) whose true surface is nearest to each point (v, 3), metres.
+
+    0 where that is farther than 2 cm and than 2 % of the distance to the nearest of the cameras' centers (n, 3).
+    """
+    from scipy.spatial import cKDTree
+
+    corners = film_set.vertices[film_set.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    rng = np.random.default_rng(0)
+    face = np.r_[rng.choice(len(area), _SAMPLES, p=area / area.sum()), np.arange(len(area))]
+    share = rng.dirichlet((1, 1, 1), len(face))
+    samples = np.einsum("nk,nkj->nj", share, corners[face])
+    distance, nearest = cKDTree(samples).query(points)
+    allowed = np.maximum(_OFF_M, _OFF_SHARE * cKDTree(eyes).query(points)[0])
+    return np.where(distance <= allowed, film_set.face_entity[face[nearest]], 0).astype(np.uint16)

@@ -1,0 +1,99 @@
+"""The learned cut: superpoints are scored, partitioned once, and read off as base, things and artifacts."""
+
+import numpy as np
+
+from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.contacts import carriers
+from reconstruction.instances.cut import Cut, Shell
+from reconstruction.instances.mask_cut import mark_attached
+from reconstruction.instances.partition.features import Shapes, View, edge_features, node_features
+from reconstruction.instances.partition.graph import RegionGraph, region_graph
+from reconstruction.instances.partition.model import LABELS, Model, Scores, load_models
+from reconstruction.instances.partition.multicut import multicut, partition_with_labels
+from reconstruction.instances.segmentation import Thing
+from reconstruction.instances.sightings import Sighting
+from reconstruction.progress import Progress
+from reconstruction.types import Surface
+
+_THING, _BASE = LABELS.index("thing"), LABELS.index("base")
+_SURE = 0.9  # probability of one thing from which a first look merges
+
+
+def cut_by_partition(
+    shell: Shell, surface: Surface, frames: list[Sighting], config: InstancesConfig, progress: Progress
+) -> Cut:
+    """Partition the surface into base, things and artifacts by learned affinities.
+
+    Args:
+        shell: the surface, and the planes that bound the room.
+        surface: the same surface, world metres.
+        frames: keyframes, the surface drawn into them.
+        config: the least size of things.
+        progress: told how many things there are.
+
+    Raises:
+        EnvironmentMissing: the weights cannot be read.
+    """
+    models = load_models()
+    label, cluster = np.zeros(0, np.int32), np.zeros(0, np.int32)
+    if len(shell.graph.edges):
+        view = View.of(shell.graph, surface, frames)
+        label, cluster = partition_surface(view, region_graph(shell.graph), models)
+    chosen = clusters_of_things(shell.graph.areas, label, cluster, config)
+    things = [Thing(np.flatnonzero(cluster == number)) for number in chosen]
+    for thing, carrier in zip(things, carriers(shell.graph, [t.vertices for t in things])):
+        thing.rests_on = things[carrier] if carrier >= 0 else None
+    mark_attached(shell, things)
+    artifact = float(shell.graph.areas[label > _BASE].sum() / max(shell.graph.areas.sum(), 1e-12))
+    progress.note(
+        f"One partition of the surface: {len(things)} things; {artifact:.0%} of it are artifacts of depth"
+    )
+    return Cut(things, _base_owner(shell, label))
+
+
+def partition_surface(
+    view: View, graph: RegionGraph, models: tuple[Model, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row in LABELS, and the cluster, of each vertex, int32 (v,) each.
+
+    All models but the last merge regions that are surely one thing; the next one sees the features of the unions.
+    """
+    for model in models[:-1]:
+        graph = graph.merged(sure_unions(graph, model.scores(*features(view, graph), graph.pairs)))
+    scores = models[-1].scores(*features(view, graph), graph.pairs)
+    label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
+    return label[graph.region], cluster[graph.region]
+
+
+def features(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray]:
+    """Return the features of a graph's regions and borders."""
+    shapes = Shapes.of(view.mesh, graph)
+    return node_features(view, graph, shapes), edge_features(view, graph, shapes)
+
+
+def sure_unions(graph: RegionGraph, scores: Scores) -> np.ndarray:
+    """Return the union int32 (n,) of each region: a multicut in which a border counts only beyond `_SURE`."""
+    return multicut(graph.count, graph.pairs, scores.affinity - np.log(_SURE / (1.0 - _SURE)))
+
+
+def clusters_of_things(
+    areas: np.ndarray, label: np.ndarray, cluster: np.ndarray, config: InstancesConfig
+) -> np.ndarray:
+    """Return the clusters that are things and not smaller than the config asks for."""
+    thing = label == _THING
+    count = int(cluster.max()) + 1 if len(cluster) else 0
+    vertices = np.bincount(cluster[thing], minlength=count)
+    area = np.bincount(cluster[thing], weights=areas[thing], minlength=count)
+    return np.flatnonzero((vertices >= config.min_object_vertices) & (area >= config.min_object_area_m2))
+
+
+def _base_owner(shell: Shell, label: np.ndarray) -> np.ndarray:
+    """Return the base entity int32 (v,) of each vertex: of those that are base the nearest plane, 0 for others."""
+    owner = np.zeros(len(shell.graph.points), np.int32)
+    base = np.flatnonzero(label == _BASE) if len(label) else owner[:0]
+    if not shell.planes or not len(base):
+        return owner
+    distance = np.stack([np.abs(plane.distance(shell.graph.points[base])) for plane in shell.planes])
+    numbers = np.array([shell.entity_id(k) for k in range(len(shell.planes))], np.int32)
+    owner[base] = np.where(shell.owner[base] > 0, shell.owner[base], numbers[np.argmin(distance, axis=0)])
+    return owner

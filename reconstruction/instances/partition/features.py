@@ -1,0 +1,248 @@
+"""Features of regions and of their borders, from the mesh and from what keyframes say of its vertices.
+
+Lengths are metres, gravity is -z. Every feature of a border is the same whichever side comes first.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from reconstruction.instances.colors import LIGHTNESS_WEIGHT
+from reconstruction.instances.partition.evidence import FrameLook, VertexEvidence, gather, look
+from reconstruction.instances.partition.graph import RegionGraph
+from reconstruction.instances.sightings import Sighting
+from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.types import Surface
+
+NODE_FEATURES = (
+    "log_area", "length", "width", "thickness", "flatness", "coherence", "normal_z", "height", "height_of_foot",
+    "gap_below", "to_side", "of_height", "on_floor", "on_wall", "on_ceiling", "on_support", "wall_distance",
+    "shown", "unseen", "agreed", "through", "before", "facing", "edge", "jump", "spread", "weight",
+    "free_front", "free_back", "color_spread",
+)  # fmt: skip
+EDGE_FEATURES = (
+    "touching", "gap", "log_border", "border_share", "concavity", "concavity_low", "angle", "convexity",
+    "step_out", "color_step", "color_far", "color_relative", "edge", "edge_relative", "jump", "chord_free",
+    "chord_depth", "slope", "agreed", "through", "facing", "in_common",
+)  # fmt: skip
+_BELOW_REACH_M, _BELOW_STEP_M, _UP = 0.08, 0.01, 0.7
+_FREE_REACH_M = 0.04
+_CHORD_CAP_M = 0.05
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class View:
+    """The surface with all that features are computed from."""
+
+    mesh: MeshGraph
+    surface: Surface
+    frames: list[Sighting]
+    looks: list[FrameLook]
+    evidence: VertexEvidence
+
+    @classmethod
+    def of(cls, mesh: MeshGraph, surface: Surface, frames: list[Sighting]) -> "View":
+        """Look at the surface from every keyframe."""
+        looks = [look(frame, mesh.points, mesh.normals) for frame in frames]
+        return cls(mesh, surface, frames, looks, gather(looks))
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Area-weighted shape of each region."""
+
+    area: np.ndarray  # float64 (n,)
+    center: np.ndarray  # float64 (n, 3)
+    normal: np.ndarray  # float64 (n, 3) unit
+    coherence: np.ndarray  # float64 (n,) length of the mean normal
+    spread: np.ndarray  # float64 (n, 3) standard deviations along the main axes, ascending
+    color: np.ndarray  # float64 (n, 3) weighted CIELAB
+    color_spread: np.ndarray  # float64 (n,)
+
+    @classmethod
+    def of(cls, mesh: MeshGraph, graph: RegionGraph) -> "Shapes":
+        """Measure the regions."""
+        weight = np.maximum(mesh.areas, _TINY)
+        area = np.bincount(graph.region, weights=weight, minlength=graph.count)
+        center = _means(graph, weight, mesh.points)
+        normal = _means(graph, weight, mesh.normals)
+        coherence = np.linalg.norm(normal, axis=1)
+        away = mesh.points - center[graph.region]
+        products = (away[:, :, None] * away[:, None, :]).reshape(-1, 9)
+        covariance = _means(graph, weight, products).reshape(-1, 3, 3)
+        spread = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+        lab = mesh.lab.astype(np.float64) * LIGHTNESS_WEIGHT
+        color = _means(graph, weight, lab)
+        off = ((lab - color[graph.region]) ** 2).sum(axis=1)
+        return cls(
+            area, center, normal / np.maximum(coherence, _TINY)[:, None], coherence, spread, color,
+            np.sqrt(_means(graph, weight, off[:, None])[:, 0]),
+        )  # fmt: skip
+
+
+def node_features(view: View, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
+    """Return float32 (n, len(NODE_FEATURES)) for the regions of a graph."""
+    mesh, evidence = view.mesh, view.evidence
+    weight = np.maximum(mesh.areas, _TINY)
+    seen = np.stack(
+        [np.log1p(evidence.shown), evidence.shown == 0, evidence.agreed, evidence.through, evidence.before,
+         evidence.facing, np.log1p(evidence.edge), evidence.jump_m, np.log1p(evidence.spread),
+         np.log1p(view.surface.weights)], axis=1,
+    )  # fmt: skip
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    center = shapes.center
+    to_side = np.minimum(center - low, high - center)[:, :2].min(axis=1)
+    foot = np.full(graph.count, np.inf)
+    np.minimum.at(foot, graph.region, mesh.points[:, 2])
+    free = [view.surface.space.lookup(mesh.points + s * _FREE_REACH_M * mesh.normals) == 1 for s in (1, -1)]
+    own = np.column_stack(
+        [np.log(shapes.area), shapes.spread[:, ::-1], shapes.spread[:, 0] / (shapes.spread[:, 1] + _TINY),
+         shapes.coherence, shapes.normal[:, 2], center[:, 2], foot, _gap_below(shapes, foot), to_side,
+         center[:, 2] / max(high[2], _TINY)]
+    )  # fmt: skip
+    planes = _means(graph, weight, _on_planes(view))
+    views = _means(graph, weight, seen)
+    around = _means(graph, weight, np.stack(free, axis=1).astype(np.float64))
+    parts = [own, planes, views, around, np.log1p(shapes.color_spread)[:, None]]
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def edge_features(view: View, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
+    """Return float32 (e, len(EDGE_FEATURES)) for the pairs of a graph."""
+    mesh, evidence = view.mesh, view.evidence
+    p, q = graph.links[:, 0], graph.links[:, 1]
+    step = mesh.points[q] - mesh.points[p]
+    length = np.linalg.norm(step, axis=1)
+    direction = step / np.maximum(length, _TINY)[:, None]
+    bend = ((mesh.normals[q] - mesh.normals[p]) * direction).sum(axis=1)  # > 0: convex
+    color = np.linalg.norm(mesh.lab[p] * LIGHTNESS_WEIGHT - mesh.lab[q] * LIGHTNESS_WEIGHT, axis=1)
+    both = np.stack(
+        [length, bend, color, np.abs(direction[:, 2]), np.minimum(evidence.agreed[p], evidence.agreed[q]),
+         np.maximum(evidence.through[p], evidence.through[q]), np.minimum(evidence.facing[p], evidence.facing[q])],
+        axis=1,
+    )  # fmt: skip
+    mean = _link_means(graph, both)
+    lowest = np.full(len(graph.pairs), np.inf)
+    np.minimum.at(lowest, graph.link_pair, bend)
+    a, b = graph.pairs[:, 0], graph.pairs[:, 1]
+    border = np.bincount(graph.link_pair, minlength=len(graph.pairs)) * mesh.spacing_m
+    share = border / np.sqrt(np.minimum(shapes.area[a], shapes.area[b]))
+    far = np.linalg.norm(shapes.color[a] - shapes.color[b], axis=1)
+    relative = far / (1.0 + shapes.color_spread[a] + shapes.color_spread[b])
+    edge, jump, common = _along_borders(view, graph)
+    inside = np.log1p(_means(graph, np.maximum(mesh.areas, _TINY), evidence.edge[:, None])[:, 0])
+    chord_free, chord_depth = _chords(view, shapes.center[a], shapes.center[b])
+    return np.column_stack(
+        [graph.touching, mean[:, 0], np.log(border), np.log(share), mean[:, 1], lowest,
+         *_bends(shapes, a, b), np.log1p(mean[:, 2]), np.log1p(far), relative, np.log1p(edge),
+         np.log1p(edge) - np.minimum(inside[a], inside[b]), jump, chord_free, chord_depth, mean[:, 3:], common]
+    ).astype(np.float32)  # fmt: skip
+
+
+def _bends(shapes: Shapes, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return angle between two regions (1 - cosine), how convex they meet, and how far one is off the other's plane."""
+    apart = shapes.center[b] - shapes.center[a]
+    distance = np.maximum(np.linalg.norm(apart, axis=1), _TINY)[:, None]
+    angle = 1.0 - (shapes.normal[a] * shapes.normal[b]).sum(axis=1)
+    convexity = ((shapes.normal[b] - shapes.normal[a]) * apart / distance).sum(axis=1)
+    off = [np.abs((shapes.normal[k] * apart).sum(axis=1)) for k in (a, b)]
+    return angle, convexity, np.minimum(*off)
+
+
+def _means(graph: RegionGraph, weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the weighted means (n, k) of vertices' values (v, k) over each region."""
+    total = np.bincount(graph.region, weights=weight, minlength=graph.count)
+    sums = [np.bincount(graph.region, weights=weight * column, minlength=graph.count) for column in values.T]
+    return np.stack(sums, axis=1) / total[:, None]
+
+
+def _link_means(graph: RegionGraph, values: np.ndarray) -> np.ndarray:
+    count = len(graph.pairs)
+    total = np.bincount(graph.link_pair, minlength=count)
+    sums = [np.bincount(graph.link_pair, weights=column, minlength=count) for column in values.T]
+    return np.stack(sums, axis=1) / total[:, None]
+
+
+def _on_planes(view: View) -> np.ndarray:
+    """Return (v, 5): whether a vertex is on the floor, a wall, the ceiling, a support; distance to the nearest wall."""
+    labels = ("floor", "wall", "ceiling", "support")
+    out = np.zeros((len(view.mesh.points), len(labels) + 1))
+    nearest = np.full(len(out), 1.0)
+    for plane in view.surface.planes:
+        out[plane.vertices, labels.index(plane.label)] = 1.0
+        if plane.label == "wall":
+            distance = view.mesh.points @ plane.surface.plane[:3] + plane.surface.plane[3]
+            nearest = np.where(np.abs(distance) < np.abs(nearest), distance, nearest)
+    out[:, -1] = nearest
+    return out
+
+
+def _gap_below(shapes: Shapes, foot: np.ndarray) -> np.ndarray:
+    """Return how far the nearest up-facing region in plan is below the foot of each region, metres; else its height."""
+    up = np.flatnonzero(shapes.normal[:, 2] > _UP)
+    out = foot.copy()
+    if len(up) == 0:
+        return out
+    tree, every = cKDTree(shapes.center[up, :2]), cKDTree(shapes.center[:, :2])
+    near = every.sparse_distance_matrix(tree, _BELOW_REACH_M, output_type="coo_matrix")
+    gap = foot[near.row] - shapes.center[up[near.col], 2]
+    below = gap > -_BELOW_STEP_M
+    np.minimum.at(out, near.row[below], gap[below])
+    return out
+
+
+def _along_borders(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return per pair the median color gradient and distance to depth edges of the frames that show the border.
+
+    The third array is the share of the frames showing either side of a border that show both.
+    """
+    count, frames = len(graph.pairs), len(view.looks)
+    edge, jump = (np.full((frames, count), np.nan, np.float32) for _ in range(2))
+    both, either = np.zeros(count), np.zeros(count)
+    p, q = graph.links[:, 0], graph.links[:, 1]
+    for row, seen in enumerate(view.looks):
+        there = seen.shown[p] & seen.shown[q]
+        pair = graph.link_pair[there]
+        shown = np.bincount(pair, minlength=count)
+        has = shown > 0
+        p_there, q_there = p[there], q[there]
+        sums = np.bincount(pair, weights=0.5 * (seen.edge[p_there] + seen.edge[q_there]), minlength=count)
+        edge[row, has] = sums[has] / shown[has]
+        sums = np.bincount(
+            pair, weights=np.minimum(seen.jump_m[p_there], seen.jump_m[q_there]), minlength=count
+        )
+        jump[row, has] = sums[has] / shown[has]
+        both += shown
+        either += np.bincount(graph.link_pair[seen.shown[p] | seen.shown[q]], minlength=count)
+    return _median(edge), _median(jump), both / np.maximum(either, 1)
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """Return the lower median (e,) of columns (k, e) without nan; 0 where there is nothing."""
+    known = np.isfinite(values).sum(axis=0)
+    ordered = np.sort(values, axis=0)  # nan last
+    out = ordered[np.maximum(known - 1, 0) // 2, np.arange(values.shape[1])]
+    return np.where(known > 0, out, 0.0)
+
+
+def _chords(view: View, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share of frames that look through the middle of each chord, and by how much on average, metres.
+
+    A chord between two sides of a convex thing runs inside of it: frames measure depth before its middle.
+    """
+    middle = 0.5 * (first + second)
+    free, judged, ahead = (np.zeros(len(middle)) for _ in range(3))
+    for frame in view.frames:
+        row, column, z = frame.seen_at(middle)
+        measured = frame.measured[row, column]
+        margin = np.clip(measured - z, -_CHORD_CAP_M, _CHORD_CAP_M)
+        known = (
+            (z > 0) & (measured > 0) & (measured > z - _CHORD_CAP_M)
+        )  # farther before it: something hides it
+        judged += known
+        free += known & (margin > 0)
+        ahead += np.where(known, margin, 0.0)
+    judged = np.maximum(judged, 1)
+    return free / judged, ahead / judged

@@ -1,0 +1,85 @@
+"""The graph that is partitioned: superpoints of the fused mesh, joined where they touch or nearly touch."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from reconstruction.instances.superpoints import superpoints
+from reconstruction.surface.mesh_graph import MeshGraph
+
+GAP_M = 0.03  # superpoints this near to each other are joined across a gap
+
+
+@dataclass(frozen=True)
+class RegionGraph:
+    """Regions of a mesh (superpoints, or unions of them) as nodes, and pairs of neighbors as edges.
+
+    A link is a pair of vertices of two regions: a mesh edge across their border, or vertices near each other across a
+    gap.
+    """
+
+    region: np.ndarray  # int32 (v,) region of each vertex, from 0
+    count: int  # of regions
+    pairs: np.ndarray  # int32 (e, 2) neighbors, the smaller number first, sorted
+    touching: np.ndarray  # bool (e,) joined by mesh edges, else across a gap
+    links: np.ndarray  # int32 (l, 2) vertices; the first is of the pair's first region
+    link_pair: np.ndarray  # int32 (l,) row in `pairs` of each link
+
+    def merged(self, label: np.ndarray) -> "RegionGraph":
+        """Return the graph of unions of regions, `label` int (count,) numbered from 0."""
+        a, b = self.region[self.links[:, 0]], self.region[self.links[:, 1]]
+        crossing = label[a] != label[b]
+        touching = self.touching[self.link_pair][crossing]
+        return _of_links(label[self.region].astype(np.int32), self.links[crossing], touching)
+
+
+def region_graph(mesh: MeshGraph, gap_m: float = GAP_M) -> RegionGraph:
+    """Return the graph of a mesh's superpoints.
+
+    Superpoints without a mesh edge between them and without a common neighbor are joined where vertices of both are
+    within `gap_m`.
+    """
+    region = superpoints(mesh)
+    a, b = region[mesh.edges[:, 0]], region[mesh.edges[:, 1]]
+    links = mesh.edges[a != b]
+    across = _gap_links(mesh, region, links, gap_m)
+    touching = np.r_[np.ones(len(links), bool), np.zeros(len(across), bool)]
+    return _of_links(region, np.concatenate([links, across]), touching)
+
+
+def _gap_links(mesh: MeshGraph, region: np.ndarray, links: np.ndarray, gap_m: float) -> np.ndarray:
+    """Return pairs of vertices (k, 2) within a gap of each other, of regions that are not neighbors of neighbors."""
+    if len(region) == 0:
+        return np.zeros((0, 2), np.int32)
+    near = cKDTree(mesh.points).query_pairs(gap_m, output_type="ndarray")
+    near = near[region[near[:, 0]] != region[near[:, 1]]]
+    count = int(region.max()) + 1
+    ends = region[links]
+    ones = np.ones(2 * len(ends) + count, np.int32)
+    rows, columns = np.r_[ends[:, 0], ends[:, 1], :count], np.r_[ends[:, 1], ends[:, 0], :count]
+    step = csr_matrix((ones, (rows, columns)), shape=(count, count))
+    step.data[:] = 1
+    reached = (step @ step).tocoo()
+    known = np.sort(reached.row.astype(np.int64) * count + reached.col)
+    keys = region[near[:, 0]].astype(np.int64) * count + region[near[:, 1]]
+    place = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+    near = near[known[place] != keys]
+    return near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int32)
+
+
+def _of_links(region: np.ndarray, links: np.ndarray, touching: np.ndarray) -> RegionGraph:
+    count = int(region.max()) + 1 if len(region) else 0
+    ends = region[links].astype(np.int64)
+    swap = ends[:, 0] > ends[:, 1]
+    links = np.where(swap[:, None], links[:, ::-1], links)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    keys, link_pair = np.unique(low * count + high, return_inverse=True)
+    pairs = np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1).astype(np.int32)
+    joined = np.zeros(len(pairs), bool)
+    joined[link_pair[touching]] = True
+    kept = touching | ~joined[link_pair]  # gaps say nothing where the mesh itself joins two regions
+    return RegionGraph(
+        region, count, pairs, joined, links[kept].astype(np.int32), link_pair[kept].astype(np.int32)
+    )

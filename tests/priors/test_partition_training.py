@@ -1,0 +1,133 @@
+"""Graphs with truth from generated rooms, the ruler, and training of the learned cut's weights."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from priors import dataset, partition
+from priors.partition_figures import area_under_curve, by_truth
+from priors.partition_network import Network
+from priors.partition_rooms import NEEDED, example
+from priors.partition_ruler import Figures, compare
+from priors.samples import open_rooms
+from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
+from reconstruction.instances.partition.model import load_models
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    out = tmp_path_factory.mktemp("data")
+    for split in ("train", "shapes"):
+        arguments = [str(out), "--split", split, "--rooms", "1", "--frames", str(FRAMES), "--processes", "1"]
+        assert dataset.main([*arguments, "--keep", "depth"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def graph(data):
+    return example(open_rooms(data / "shapes", NEEDED)[0], data / "cache", None)
+
+
+def test_true_ids_of_vertices_are_the_ids_that_keyframes_show(data, graph):
+    from priors.partition_rooms import fused
+    from registry.geometry import invert_rigid
+
+    room = open_rooms(data / "shapes", NEEDED)[0]
+    points = np.asarray(fused(room, data / "cache").vertices, np.float64)
+    a, right, judged = room.arrays, 0, 0
+    fx, fy = a["focal"]
+    height, width = a["exact_ids"].shape[1:]
+    for row, pose in enumerate(a["world_from_camera"]):
+        inverse = invert_rigid(np.asarray(pose))
+        local = points @ inverse[:3, :3].T + inverse[:3, 3]
+        u, v = (fx * local[:, 0] / local[:, 2] + width / 2), (fy * local[:, 1] / local[:, 2] + height / 2)
+        there = (local[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < width) & (v < height) & (graph.true_ids > 0)
+        u, v, z = u[there].astype(int), v[there].astype(int), local[there, 2]
+        near = np.abs(a["exact_depth"][row][v, u] - z) < 0.01
+        right += (a["exact_ids"][row][v, u] == graph.true_ids[there])[near].sum()
+        judged += near.sum()
+    assert judged > 1000
+    assert right > 0.95 * judged
+
+
+def test_superpoints_and_targets_hold_the_truth(graph):
+    targets = partition.Targets.of(graph)
+    ids, pure = graph.region_ids()
+    assert len(ids) == len(graph.nodes) == graph.region.max() + 1
+    assert np.isfinite(graph.nodes).all()
+    assert np.isfinite(graph.edges).all()
+    assert pure.mean() > 0.9
+    a, b = graph.pairs.T
+    two_things = (ids[a] != ids[b]) & (ids[a] > graph.base_entities) & (ids[b] > graph.base_entities)
+    assert two_things.any()
+    assert (targets.same[two_things] == 0).all()
+    assert (targets.same_weight[~(pure[a] & pure[b])] == 0).all()
+
+
+def test_the_truth_scores_best_and_merged_things_less(graph):
+    base = int(graph.base_entities)
+    perfect, _ = compare(
+        np.where(graph.true_ids > base, graph.true_ids, 0), graph.true_ids, base, graph.areas, graph.pixels
+    )
+    assert perfect.true > 2
+    seen = perfect.hits[0]
+    assert perfect.hits == (seen, seen)  # things without any surface cannot be found
+    superpoints, matched = compare(by_truth(graph), graph.true_ids, base, graph.areas, graph.pixels)
+    assert 0 < superpoints.hits[1] <= superpoints.hits[0] <= seen
+    assert max(matched.values()) > 0.8
+    one, _ = compare((graph.true_ids > base).astype(int), graph.true_ids, base, graph.areas, graph.pixels)
+    assert one.hits[0] <= 1
+    assert one.found == 1
+    assert Figures(4, 5, (3, 2)).shares() == {"recall_25": 0.75, "precision_25": 0.6, "recall_50": 0.5}
+
+
+def test_area_under_curve_of_known_orders():
+    positive = np.array([False, False, True, True])
+    assert area_under_curve(np.array([1.0, 2, 3, 4]), positive) == 1.0
+    assert area_under_curve(np.array([4.0, 3, 2, 1]), positive) == 0.0
+    assert area_under_curve(np.array([1.0, 1, 1, 1]), positive) == 0.5
+
+
+def test_numpy_says_what_pytorch_says(tmp_path):
+    torch.manual_seed(0)
+    network = Network(16, 2)
+    rng = np.random.default_rng(0)
+    nodes = rng.normal(size=(30, len(NODE_FEATURES))).astype(np.float32)
+    pairs = np.unique(
+        np.sort(rng.integers(0, 29, (60, 2)), axis=1), axis=0
+    )  # the last region has no neighbor
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    edges = rng.normal(size=(len(pairs), len(EDGE_FEATURES))).astype(np.float32)
+    with torch.no_grad():
+        affinity, label = network(*(torch.from_numpy(x) for x in (nodes, edges, pairs)))
+    partition.export([network], tmp_path / "w.safetensors")
+    scores = load_models(tmp_path / "w.safetensors")[0].scores(nodes, edges, pairs)
+    np.testing.assert_allclose(scores.affinity, affinity.numpy(), atol=1e-4)
+    np.testing.assert_allclose(scores.label, label.numpy(), atol=1e-4)
+
+
+def test_training_learns_writes_weights_and_says_figures(data, tmp_path):
+    arguments = [
+        str(data),
+        "--out",
+        str(tmp_path),
+        "--cache",
+        str(data / "cache"),
+        "--width",
+        "16",
+        "--rounds",
+        "1",
+    ]
+    assert partition.main([*arguments, "--steps", "1"]) == 0
+    early = json.loads((tmp_path / "figures.json").read_text())["train, look 1"]
+    assert partition.main([*arguments, "--steps", "150"]) == 0
+    late = json.loads((tmp_path / "figures.json").read_text())
+    assert late["train, look 1"]["log_loss"] < 0.8 * early["log_loss"]
+    assert late["train, look 1"]["auc"] > 0.7
+    wanted = {"asa", "auc", "recall_25", "precision_25", "recall_50", "superpoints_recall_25"}
+    assert wanted <= set(late["shapes, look 2"])
+    assert [model.rounds for model in load_models(tmp_path / "partition.safetensors")] == [1, 1]

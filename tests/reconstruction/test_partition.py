@@ -1,0 +1,194 @@
+"""The learned cut: multicut against brute force, the graph and its features on known solids, and the cut itself."""
+
+import itertools
+
+import numpy as np
+import pytest
+from fused_surfaces import box, fused
+from surfaces import frames_of, with_planes
+
+from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.instances.cut import Shell
+from reconstruction.instances.partition import multicut as solver
+from reconstruction.instances.partition.features import (
+    EDGE_FEATURES,
+    Shapes,
+    View,
+    edge_features,
+    node_features,
+)
+from reconstruction.instances.partition.graph import region_graph
+from reconstruction.instances.partition.model import LABELS, load_models
+from reconstruction.instances.sightings import sightings
+from reconstruction.progress import NO_PROGRESS
+from registry.errors import EnvironmentMissing
+
+TABLE = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.3), (120, 80, 50))
+TOY = box((-0.05, -0.05, 0.3), (0.07, 0.05, 0.42), (200, 30, 30))
+
+
+def all_partitions(count):
+    """Every partition of a few nodes, as labels."""
+    found = [[0]]
+    for _ in range(count - 1):
+        found = [[*labels, k] for labels in found for k in range(max(labels) + 2)]
+    return np.array(found)
+
+
+def best_energy(pairs, weights, partitions):
+    """Energy of the best partition of a few nodes, by trying all."""
+    return max(solver.energy(pairs, weights, labels) for labels in partitions)
+
+
+def random_graph(rng, count):
+    pairs = np.array([e for e in itertools.combinations(range(count), 2) if rng.random() < 0.6]).reshape(
+        -1, 2
+    )
+    return pairs, rng.normal(size=len(pairs))
+
+
+def test_multicut_is_nearly_as_good_as_trying_all_partitions():
+    rng, partitions = np.random.default_rng(0), all_partitions(6)
+    assert len(partitions) == 203  # Bell number
+    found, best = [], []
+    for _ in range(25):
+        pairs, weights = random_graph(rng, 6)
+        found.append(solver.energy(pairs, weights, solver.multicut(6, pairs, weights)))
+        best.append(best_energy(pairs, weights, partitions))
+    found, best = np.array(found), np.array(best)
+    assert (found <= best + 1e-9).all()
+    assert (found > best - 1e-9).mean() > 0.8
+    assert found.sum() > 0.97 * best.sum()
+
+
+def test_multicut_does_not_depend_on_the_order_or_direction_of_edges():
+    rng = np.random.default_rng(1)
+    pairs, weights = random_graph(rng, 60)
+    whole = solver.multicut(60, pairs, weights)
+    order = rng.permutation(len(pairs))
+    np.testing.assert_array_equal(whole, solver.multicut(60, pairs[order][:, ::-1], weights[order]))
+    assert 1 < whole.max() < 59
+
+
+def test_moves_and_joins_never_lose_against_contraction_alone():
+    rng = np.random.default_rng(2)
+    gains = []
+    for _ in range(10):
+        pairs, weights = random_graph(rng, 40)
+        alone = solver._contract(40, pairs, weights)
+        gains.append(
+            solver.energy(pairs, weights, solver.multicut(40, pairs, weights))
+            - solver.energy(pairs, weights, alone)
+        )
+    assert min(gains) > -1e-9
+    assert max(gains) > 0
+
+
+def test_labels_follow_the_unaries_unless_neighbors_outweigh_them():
+    pairs = np.array([[0, 1], [1, 2], [2, 3]])
+    unary = np.log([[0.9, 0.1], [0.4, 0.6], [0.1, 0.9], [0.1, 0.9]])
+    alone, _ = solver.partition_with_labels(pairs, np.zeros(3), unary)
+    np.testing.assert_array_equal(alone, [0, 1, 1, 1])
+    joined, cluster = solver.partition_with_labels(pairs, np.array([5.0, -5.0, 0.0]), unary)
+    np.testing.assert_array_equal(joined, [0, 0, 1, 1])
+    assert cluster[0] == cluster[1] != cluster[2]
+    assert cluster[2] == cluster[3]  # one label has one cluster, whatever lies between
+
+
+def room(*solids):
+    surface = with_planes(fused(list(solids)))
+    posed, depth = frames_of(surface)
+    shell = Shell.of(surface, NO_PROGRESS)
+    return surface, posed, depth, shell, View.of(shell.graph, surface, sightings(surface, posed, depth))
+
+
+@pytest.fixture(scope="module")
+def toy_room():
+    return room(TABLE, TOY)
+
+
+def test_borders_are_concave_where_things_touch_and_convex_around_them(toy_room):
+    view = toy_room[-1]
+    graph = region_graph(view.mesh)
+    shapes = Shapes.of(view.mesh, graph)
+    features = edge_features(view, graph, shapes)
+    concavity = features[:, EDGE_FEATURES.index("concavity")]
+    angle = features[:, EDGE_FEATURES.index("angle")]
+    middle = 0.5 * (shapes.center[graph.pairs[:, 0]] + shapes.center[graph.pairs[:, 1]])
+    around_toy = (np.abs(middle[:, :2]) < 0.09).all(axis=1) & graph.touching
+    tilt = np.abs(shapes.normal[graph.pairs[:, 0], 2] - shapes.normal[graph.pairs[:, 1], 2])
+    foot = around_toy & (np.abs(middle[:, 2] - 0.31) < 0.02) & (tilt > 0.5)
+    rim = around_toy & (np.abs(middle[:, 2] - 0.41) < 0.02) & (angle > 0.5)
+    assert foot.sum() > 3
+    assert rim.sum() > 3
+    assert (concavity[foot] < 0).mean() > 0.8  # some pairs at the foot meet at an upright, convex edge
+    assert (concavity[rim] > 0).mean() > 0.8
+
+
+def test_features_of_borders_do_not_depend_on_which_side_comes_first(toy_room):
+    view = toy_room[-1]
+    graph = region_graph(view.mesh)
+    turned = graph.merged(graph.count - 1 - np.arange(graph.count))
+    first = edge_features(view, graph, Shapes.of(view.mesh, graph))
+    second = edge_features(view, turned, Shapes.of(view.mesh, turned))
+    numbers = graph.count - 1 - graph.pairs
+    order = np.lexsort((numbers.max(axis=1), numbers.min(axis=1)))
+    np.testing.assert_array_equal(np.sort(numbers[order], axis=1), turned.pairs)
+    np.testing.assert_allclose(first[order], second, atol=1e-4)
+
+
+@pytest.mark.parametrize(("gap_m", "joined"), [(0.02, True), (0.06, False)])
+def test_regions_are_joined_across_small_gaps_only(gap_m, joined):
+    boards = [box((-0.2, -0.2, 0.5), (-gap_m / 2, 0.2, 0.6), (90, 90, 90)),
+              box((gap_m / 2, -0.2, 0.5), (0.2, 0.2, 0.6), (90, 90, 90))]  # fmt: skip
+    mesh = room(*boards)[3].graph
+    graph = region_graph(mesh)
+    x = np.bincount(graph.region, weights=mesh.points[:, 0]) / np.bincount(graph.region)
+    z = np.bincount(graph.region, weights=mesh.points[:, 2]) / np.bincount(graph.region)
+    a, b = graph.pairs.T
+    between = (x[a] * x[b] < 0) & (np.minimum(z[a], z[b]) > 0.4)
+    assert between.any() == joined
+    assert not graph.touching[between].any()
+
+
+def test_merging_regions_keeps_their_outer_borders(toy_room):
+    graph = region_graph(toy_room[-1].mesh)
+    label = np.arange(graph.count) // 7
+    union = graph.merged(label)
+    assert union.count == label.max() + 1
+    np.testing.assert_array_equal(union.region, label[graph.region])
+    expected = np.unique(np.sort(label[graph.pairs], axis=1), axis=0)
+    expected = expected[expected[:, 0] != expected[:, 1]]
+    np.testing.assert_array_equal(union.pairs, expected)
+
+
+def test_scores_are_the_same_for_any_numbering_of_regions(toy_room):
+    view, model = toy_room[-1], load_models()[0]
+    graph = region_graph(view.mesh)
+    shapes = Shapes.of(view.mesh, graph)
+    nodes, edges = node_features(view, graph, shapes), edge_features(view, graph, shapes)
+    scores = model.scores(nodes, edges, graph.pairs)
+    turned = model.scores(nodes[::-1], edges, graph.count - 1 - graph.pairs)
+    np.testing.assert_allclose(turned.label[::-1], scores.label, atol=1e-3)
+    np.testing.assert_allclose(turned.affinity, scores.affinity, atol=1e-3)
+    np.testing.assert_allclose(np.exp(scores.label).sum(axis=1), 1.0, atol=1e-5)
+    assert scores.label.shape == (graph.count, len(LABELS))
+
+
+def test_a_toy_on_a_table_on_the_floor_is_two_things(toy_room):
+    surface, posed, depth, _, _ = toy_room
+    found = find_instances(posed, depth, surface, InstancesConfig(cut="partition"), progress=NO_PROGRESS)
+    place = [int(np.argmin(np.linalg.norm(surface.vertices - p, axis=1))) for p in
+             ((0.0, 0.0, 0.42), (0.2, 0.2, 0.3), (0.45, 0.45, 0.0))]  # fmt: skip
+    toy, table, floor = found.vertex_instance[place]
+    assert len({toy, table, floor}) == 3
+    assert floor == found.base[0].id
+    assert next(o for o in found.objects if o.id == toy).support_hint == table
+    again = find_instances(posed, depth, surface, InstancesConfig(cut="partition"), progress=NO_PROGRESS)
+    np.testing.assert_array_equal(found.vertex_instance, again.vertex_instance)
+
+
+def test_unreadable_weights_say_what_to_do(tmp_path):
+    (tmp_path / "w.safetensors").write_bytes(b"no weights")
+    with pytest.raises(EnvironmentMissing, match=r"instances\.cut=rules"):
+        load_models(tmp_path / "w.safetensors")
