@@ -66,11 +66,8 @@ class DepthConfig:
     prior_agree_px: float = 4.0
     """Reprojection error up to which they do, at depth resolution."""
 
-    mend_surety: float = 0.6
+    mend_surety: float = 0.5
     """Probability from which depth is believed after mending."""
-
-    mend_rounds: int = 2
-    """How often maps are mended before views are compared once more."""
 
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""

@@ -371,9 +371,8 @@ def estimate_depth(
         from reconstruction.depth.mending import drop_unconfirmed, mend_depth
 
         each = Workers(config.threads).each
-        for _ in range(config.mend_rounds):
-            found = mend_depth(found, posed, config.mend_surety, each, progress)
-        found = drop_unconfirmed(found, posed, config.min_agreeing, each, progress)
+        mended = mend_depth(found, posed, config.mend_surety, each, progress)
+        found = drop_unconfirmed(mended, found.depth, posed, config.min_agreeing, each, progress)
     depth, confidence = found.depth, np.where(found.origin == PREDICTED, 1, found.origin).astype(np.uint8)
     if config.perturb:
         depth = perturbed(depth, config.perturb)

@@ -20,6 +20,9 @@ WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
 FEATURES = 13
 _AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against
 _MANY_VIEWS = 10.0
+_OWN_ODDS = np.float32(
+    8.0
+)  # how much likelier a pixel's own depth is to be right than in the rooms of the training
 _LOOK_THROUGH = 2  # views that see something beyond a point, from which it may be dropped
 
 
@@ -86,6 +89,7 @@ def candidate_shares(features: np.ndarray, there: np.ndarray, weights: Path = WE
         logits, _ = load_network("mending", weights)(torch.from_numpy(padded)[None])
         logits = logits[0, :, :h, :w]
         logits[:-1].masked_fill_(torch.from_numpy(~there), -1e4)
+        logits[0] += float(np.log(_OWN_ODDS))
         return logits.softmax(0)[:-1].numpy()
 
 
@@ -138,12 +142,18 @@ def mend_depth(
 
 
 def drop_unconfirmed(
-    found: Evidence, posed: PosedFrames, least: int, each: Callable, progress: Progress = NO_PROGRESS
+    found: Evidence,
+    before: np.ndarray,
+    posed: PosedFrames,
+    least: int,
+    each: Callable,
+    progress: Progress = NO_PROGRESS,
 ) -> Evidence:
-    """Return the evidence without depth that too few views see, or that more look through.
+    """Return the evidence without changed depth that too few views see, or that more look through.
 
     Args:
         found: Maps and the origin of every pixel.
+        before: float32 (n, h, w) the maps before they were mended; what is the same stays.
         posed: Their frames.
         least: Other views that have to see the same point.
         each: Runs a function for every frame: each(n, work, label, progress).
@@ -151,6 +161,7 @@ def drop_unconfirmed(
     """
     agree, through = count_views(found.depth, posed, found.camera, found.neighbors, each, progress)
     drop = (agree < least) | ((through >= _LOOK_THROUGH) & (through > agree + 1))
+    drop &= found.depth != before
     progress.note(
         f"depth: views did not confirm {100 * float((drop & (found.depth > 0)).mean()):.1f} % of the pixels"
     )

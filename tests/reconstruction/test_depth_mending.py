@@ -98,8 +98,8 @@ def test_the_weights_are_small_and_load_quickly():
 
 
 def test_things_end_where_they_end():
-    capture = make_test_capture(12, 240, 180)
-    plain = DepthConfig(depth_side_px=240, sweep_side_px=240)
+    capture = make_test_capture(14, 400, 300)
+    plain = DepthConfig(depth_side_px=400)
     rings, right = [], []
     things = [i for i in np.unique(capture.id_maps) if i > len(capture.room.base)]
     for prior in ("none", "mending"):
@@ -110,4 +110,4 @@ def test_things_end_where_they_end():
         on = np.isin(capture.id_maps, things)
         right.append(float((np.abs(maps.depth[on] / truth[on] - 1) < 0.02).mean()))
     assert rings[1] < 0.7 * rings[0]
-    assert right[1] > right[0] - 0.02
+    assert right[1] > right[0]
