@@ -9,7 +9,7 @@ from test_depth import CAMERA, CONFIG, make_posed
 
 from reconstruction.depth import estimate_depth
 from reconstruction.depth.config import DepthConfig
-from reconstruction.depth.estimate import _Workers
+from reconstruction.depth.estimate import Workers
 from reconstruction.depth.monocular import fill_from_predictions, fit_affine
 from reconstruction.depth.views import plan_views
 from registry.errors import EnvironmentMissing, UsageError
@@ -55,7 +55,7 @@ def fill(scene, backend, depth=None, confidence=None):
     watcher = Notes()
     found = fill_from_predictions(
         posed, CAMERA, plan_views(posed, CONFIG), known if depth is None else depth,
-        sure if confidence is None else confidence, backend, CONFIG, _Workers(2).each, watcher,
+        sure if confidence is None else confidence, backend, CONFIG, Workers(2).each, watcher,
     )  # fmt: skip
     return *found, watcher.notes
 
