@@ -11,7 +11,7 @@ from priors.samples import Room, draw_sample, load_sample, stack
 from reconstruction.depth.network import Aggregation, place_of
 
 ARRAYS = ("cost", "smoothed", "color", "true_depth", "true_ids", "range")
-"""What a room's folder must hold."""
+"""Names of the arrays that a room's folder must hold."""
 SCORE = "net_off2"
 """The figure that is least for the best weights."""
 

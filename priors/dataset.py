@@ -181,14 +181,16 @@ def _measure_costs(
     return out | ({"winner": np.stack(winners).astype(np.float32)} if winner else {})
 
 
-def _measure_depth(film: Film, posed: PosedFrames, path: np.ndarray, config: DepthConfig):
+def _measure_depth(
+    film: Film, posed: PosedFrames, path: np.ndarray, config: DepthConfig
+) -> tuple[dict, DepthMaps]:
     """Return the arrays at depth resolution, what the mending network sees and the truth; and the finished maps."""
     import cv2
 
     from reconstruction.depth.estimate import Workers, gather_evidence
-    from reconstruction.depth.evidence import PREDICTED, count_views
+    from reconstruction.depth.evidence import count_views
 
-    found = gather_evidence(posed, config)
+    found = gather_evidence(posed, config, keep_agreed=True)
     camera, each = found.camera, Workers(1).each
     agree, through = count_views(found.depth, posed, camera, found.neighbors, each)
     agreed_agree, agreed_through = count_views(found.agreed, posed, camera, found.neighbors, each)
@@ -209,8 +211,7 @@ def _measure_depth(film: Film, posed: PosedFrames, path: np.ndarray, config: Dep
         "exact_ids": np.stack([i for _, i in exact]).astype(np.uint16),
         "focal": np.array([camera.fx, camera.fy]),
     }
-    confidence = np.where(found.origin == PREDICTED, 1, found.origin).astype(np.uint8)
-    return out, DepthMaps(camera, found.depth, confidence)
+    return out, found.maps()
 
 
 def write_manifest(out: Path) -> None:

@@ -8,24 +8,22 @@ import numpy as np
 import torch
 
 from priors.affinities import affinity_loss
-from priors.samples import Room, other_light
+from priors.samples import Room, near_steps, other_light
 from reconstruction.depth.candidates import OFFSETS, candidate_depths, choose_candidates
-from reconstruction.depth.evidence import MEASURED, PREDICTED
+from reconstruction.depth.evidence import MEASURED, PREDICTED, inverse
 from reconstruction.depth.mending import mending_features
 from reconstruction.depth.network import Mending
 
 ARRAYS = ("picture", "depth", "origin", "agreed", "correlation", "surety", "exact_depth", "exact_ids")
-"""What a room's folder must hold."""
+"""Names of the arrays that a room's folder must hold."""
 SCORE = "entropy"
 """The figure that is least for the best weights."""
 _CROP = (192, 224)
 _ZOOM = (0.55, 1.25)
 _EXCHANGED = 0.3  # share of samples whose rows and columns are exchanged
-_LEFT_OUT, _AGREED = (
-    0.3,
-    0.3,
-)  # shares of samples without predictions, and of those with what was measured alone
-_BESIDE_PX, _JUMP = 9, 1.03  # around steps of the true depth a pixel weighs more
+_LEFT_OUT = 0.3  # share of samples without predictions
+_AGREED = 0.3  # share of samples with what was measured alone
+_BESIDE_PX, _BESIDE_WEIGHT = 9, 4  # around steps of the true depth a pixel weighs more
 _OFF = 0.05
 _SPREAD = 0.015  # scale of a right candidate's relative error, the noise of the measurement (Laplace)
 _NONE = -3.0  # log likelihood of "none of them": that of a candidate three spreads off
@@ -81,9 +79,8 @@ def load_sample(
         picture, depth, origin, read("correlation").astype(np.float32) / 100, agree, through,
         read("surety").astype(np.float32) / 100,
     )  # fmt: skip
-    rho = np.where(depth > 0, 1 / np.maximum(depth, 1e-9), 0).astype(np.float32)
     truth = read("exact_depth").astype(np.float32)
-    return Sample(features, candidate_depths(rho), truth, read("exact_ids").astype(np.int32))
+    return Sample(features, candidate_depths(inverse(depth)), truth, read("exact_ids").astype(np.int32))
 
 
 @dataclass(frozen=True)
@@ -144,7 +141,9 @@ def likelihoods(sample: Sample) -> np.ndarray:
 
 def _weights(sample: Sample) -> np.ndarray:
     there = (sample.candidates > 0).any(0)
-    return (there * (sample.truth > 0) * (1 + 3 * beside_steps(sample.truth))).astype(np.float32)
+    return (there * (sample.truth > 0) * np.where(beside_steps(sample.truth), _BESIDE_WEIGHT, 1)).astype(
+        np.float32
+    )
 
 
 @numba.njit(cache=True)
@@ -161,16 +160,7 @@ def _compare(candidates, truth, out):  # pragma: no cover - compiled
 
 def beside_steps(depth: np.ndarray) -> np.ndarray:
     """Return which pixels (h, w) lie within a few pixels of a step of the true depth."""
-    import cv2
-
-    step = np.zeros(depth.shape, np.uint8)
-    for axis in (0, 1):
-        a, b = np.moveaxis(depth, axis, 0)[1:], np.moveaxis(depth, axis, 0)[:-1]
-        jump = (np.maximum(a, b) > _JUMP * np.minimum(a, b)).astype(np.uint8)
-        view = np.moveaxis(step, axis, 0)
-        view[1:] |= jump
-        view[:-1] |= jump
-    return cv2.dilate(step, np.ones((2 * _BESIDE_PX + 1, 2 * _BESIDE_PX + 1), np.uint8)) > 0
+    return near_steps(depth, _BESIDE_PX)
 
 
 def _entropy(logits: torch.Tensor, likelihood, weight) -> torch.Tensor:
@@ -203,8 +193,7 @@ def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
     for room, number in chosen:
         for agreed in (False, True):
             sample = load_sample(room, number % len(room), agreed=agreed)
-            batch = stack([sample])
-            features, likelihood, weight, ids = batch
+            features, likelihood, weight, ids = stack([sample])
             logits, affinity = net(features)
             share = logits.float().masked_fill(likelihood <= 0.5 * _MISSING, _MISSING).softmax(1)[0].numpy()
             mark = "agreed_" if agreed else ""

@@ -29,7 +29,7 @@ from reconstruction.instances.partition.features import EDGE_FEATURES
 from reconstruction.instances.partition.model import LABELS, load_models
 from registry.errors import UsageError
 
-_KEPT_OUT = 5  # every so manieth training room
+_KEPT_OUT = 5  # one training room of so many
 _CROP_REGIONS = 1000
 _COLORS = [k for k, name in enumerate(EDGE_FEATURES) if name.startswith(("color", "edge"))]
 _TOLD_EVERY = 100  # steps
@@ -40,7 +40,7 @@ _ANYWHERE = 0.25  # of the crops have any middle, the others one on a thing
 
 @dataclass(frozen=True)
 class Targets:
-    """What is to be said of a graph."""
+    """True affinities and labels of a graph, with weights."""
 
     same: np.ndarray  # float32 (e,) 1 = both sides are of one thing, or both base, or both artifacts
     same_weight: np.ndarray  # float32 (e,)

@@ -38,7 +38,7 @@ def partitioned(room: Example, scores: Scores) -> np.ndarray:
 
 
 def best_shift(model: Model, rooms: list[Example]) -> float:
-    """Return what to add to all log-odds of affinities so that whole rooms come out best, on rooms trained on.
+    """Return the bias of the affinities' log-odds under which the cut of whole rooms is best, on rooms trained on.
 
     Scores of neighboring borders hang together, which a sum of log-odds does not know: probabilities that are right for
     single borders are not the best weights of a multicut. Best is the mean of F1 at .25 and recall at .5.

@@ -6,15 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from priors.partition_rooms import Example, frames_and_depth, fused, read_example, write_example
+from priors.partition_rooms import Example, read_example, room_view, write_example
 from priors.samples import Room
-from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition.cut import features, sure_unions
-from reconstruction.instances.partition.features import Shapes, View
+from reconstruction.instances.partition.features import Shapes
 from reconstruction.instances.partition.graph import region_graph
 from reconstruction.instances.partition.model import Model
-from reconstruction.instances.sightings import sightings
-from reconstruction.progress import NO_PROGRESS
 
 
 def next_look(room: Room, first: Example, model: Model, cache: Path) -> Example:
@@ -36,12 +33,9 @@ def next_look(room: Room, first: Example, model: Model, cache: Path) -> Example:
 
 
 def _made(room: Room, first: Example, model: Model, cache: Path) -> Example:
-    surface = fused(room, cache)
-    posed, depth = frames_and_depth(room)
-    shell = Shell.of(surface, NO_PROGRESS)
-    view = View.of(shell.graph, surface, sightings(surface, posed, depth))
-    graph = region_graph(shell.graph)
+    view = room_view(room, cache)
+    graph = region_graph(view.mesh)
     graph = graph.merged(sure_unions(graph, model.scores(first.nodes, first.edges, first.pairs)))
     nodes, edges = features(view, graph)
-    centers = Shapes.of(shell.graph, graph).center.astype(np.float32)
+    centers = Shapes.of(view.mesh, graph).center.astype(np.float32)
     return replace(first, nodes=nodes, edges=edges, pairs=graph.pairs, centers=centers, region=graph.region)

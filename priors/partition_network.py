@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
-from reconstruction.instances.partition.model import _CLIP, LABELS
+from reconstruction.instances.partition.model import CLIP, LABELS
 
 
 def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -44,8 +44,8 @@ class Network(nn.Module):
         self, nodes: torch.Tensor, edges: torch.Tensor, pairs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return log-odds (e,) of one thing and log-probabilities (n, 3) of the labels."""
-        h = self.node_in(((nodes - self.node_mean) * self.node_scale).clamp(-_CLIP, _CLIP))
-        g = self.edge_in(((edges - self.edge_mean) * self.edge_scale).clamp(-_CLIP, _CLIP))
+        h = self.node_in(((nodes - self.node_mean) * self.node_scale).clamp(-CLIP, CLIP))
+        g = self.edge_in(((edges - self.edge_mean) * self.edge_scale).clamp(-CLIP, CLIP))
         a, b = pairs[:, 0], pairs[:, 1]
         to = torch.cat([a, b])
         degree = torch.bincount(to, minlength=len(nodes)).clamp_min(1)[:, None]

@@ -9,20 +9,21 @@ import numpy as np
 
 from priors.rooms import draw_film
 from priors.samples import Room
+from priors.surfaces import true_ids
 from reconstruction import artifacts
 from reconstruction.cache import source_digest
+from reconstruction.depth.evidence import PREDICTED
 from reconstruction.instances.cut import Shell
-from reconstruction.instances.partition.features import Shapes, View, edge_features, node_features
+from reconstruction.instances.partition.cut import features
+from reconstruction.instances.partition.features import Shapes, View
 from reconstruction.instances.partition.graph import region_graph
 from reconstruction.instances.sightings import sightings
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
 from synthetic.capture import posed_capture
-from synthetic.film import FilmSet
 
 NEEDED = ("picture", "depth", "origin", "exact_depth", "exact_ids", "world_from_camera", "focal")
-_PREDICTED = 3  # in `origin`: depth that a network made up
 _FEATURE_MODULES = (
     "priors.partition_rooms",
     *(
@@ -36,8 +37,6 @@ _FEATURE_MODULES = (
         )
     ),
 )
-_SAMPLES = 2_000_000  # of the true surface
-_OFF_M, _OFF_SHARE = 0.02, 0.02  # farther from every true surface, also as a share of the depth: an artifact
 _LEAST_PURITY = 0.6  # of a superpoint's known surface must be of one entity
 
 
@@ -67,14 +66,14 @@ def frames_and_depth(room: Room) -> tuple[PosedFrames, DepthMaps]:
     """Return the keyframes with true cameras, and their depth as measured, without what a network predicted."""
     a = room.arrays
     origin = np.asarray(a["origin"])
-    depth = np.where(origin == _PREDICTED, 0, a["depth"]).astype(np.float32)
+    depth = np.where(origin == PREDICTED, 0, a["depth"]).astype(np.float32)
     height, width = depth.shape[1:]
     fx, fy = (float(f) for f in a["focal"])
     camera = Camera(width, height, fx, fy, 0.5 * width, 0.5 * height)
     posed = posed_capture(
         camera, np.asarray(a["world_from_camera"]), np.asarray(a["picture"]), depth, room.folder.name
     )
-    return posed, DepthMaps(camera, depth, np.where(origin == _PREDICTED, 0, origin).astype(np.uint8))
+    return posed, DepthMaps(camera, depth, np.where(origin == PREDICTED, 0, origin).astype(np.uint8))
 
 
 def fused(room: Room, cache: Path) -> Surface:
@@ -88,6 +87,13 @@ def fused(room: Room, cache: Path) -> Surface:
         artifacts.save(fuse_surface(posed, depth, SurfaceConfig()), part)
         part.rename(folder)
     return artifacts.load(Surface, folder)
+
+
+def room_view(room: Room, cache: Path) -> View:
+    """Return a room's fused surface as its keyframes see it."""
+    surface = fused(room, cache)
+    shell = Shell.of(surface, NO_PROGRESS)
+    return View.of(shell.graph, surface, sightings(surface, *frames_and_depth(room)))
 
 
 def example(room: Room, cache: Path, photographs: Path | None) -> Example:
@@ -114,17 +120,12 @@ def read_example(file: Path) -> Example:
 
 
 def _made(room: Room, cache: Path, photographs: Path | None) -> Example:
-    surface = fused(room, cache)
-    posed, depth = frames_and_depth(room)
-    shell = Shell.of(surface, NO_PROGRESS)
-    view = View.of(shell.graph, surface, sightings(surface, posed, depth))
-    graph = region_graph(shell.graph)
-    shapes = Shapes.of(shell.graph, graph)
-    truth = _truth(room, surface, cache, photographs)
-    return Example(
-        node_features(view, graph, shapes), edge_features(view, graph, shapes), graph.pairs,
-        shapes.center.astype(np.float32), graph.region, shell.graph.areas, **truth,
-    )  # fmt: skip
+    view = room_view(room, cache)
+    graph = region_graph(view.mesh)
+    nodes, edges = features(view, graph)
+    centers = Shapes.of(view.mesh, graph).center.astype(np.float32)
+    truth = _truth(room, view.surface, cache, photographs)
+    return Example(nodes, edges, graph.pairs, centers, graph.region, view.mesh.areas, **truth)
 
 
 def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) -> dict[str, np.ndarray]:
@@ -149,21 +150,3 @@ def _write(file: Path, **arrays: np.ndarray) -> None:
     part = file.with_suffix(".part.npz")
     np.savez(part, **arrays)
     part.rename(file)
-
-
-def true_ids(film_set: FilmSet, points: np.ndarray, eyes: np.ndarray) -> np.ndarray:
-    """Return the entity uint16 (v,) whose true surface is nearest to each point (v, 3), metres.
-
-    0 where that is farther than 2 cm and than 2 % of the distance to the nearest of the cameras' centers (n, 3).
-    """
-    from scipy.spatial import cKDTree
-
-    corners = film_set.vertices[film_set.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    rng = np.random.default_rng(0)
-    face = np.r_[rng.choice(len(area), _SAMPLES, p=area / area.sum()), np.arange(len(area))]
-    share = rng.dirichlet((1, 1, 1), len(face))
-    samples = np.einsum("nk,nkj->nj", share, corners[face])
-    distance, nearest = cKDTree(samples).query(points)
-    allowed = np.maximum(_OFF_M, _OFF_SHARE * cKDTree(eyes).query(points)[0])
-    return np.where(distance <= allowed, film_set.face_entity[face[nearest]], 0).astype(np.uint16)

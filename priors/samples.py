@@ -34,9 +34,9 @@ ARRAYS = {
     "mesh_faces": "int32 (f, 3)",
     "mesh_colors": "uint8 (v, 3)",
     "mesh_superpoints": "int32 (v,) superpoint of each vertex",
-    "mesh_true_ids": "uint16 (v,) true entity of each vertex, 0: farther than 2 cm from all",
+    "mesh_true_ids": "uint16 (v,) true entity of each vertex, 0: far from all (`surfaces.true_ids`)",
 }
-"""What a room's folder may hold; `--keep` says which."""
+"""Arrays of a room's folder, by name; `priors.dataset --keep` chooses among them."""
 _CROP = (192, 224)
 _JUMP = 1.03  # ratio of depths from which two neighbors are two surfaces
 
@@ -143,12 +143,16 @@ def other_light(color, rng):
 
 def border_of(place: np.ndarray, rho: tuple[float, float], reach_px: int = 4) -> np.ndarray:
     """Return which pixels (h, w) lie within `reach_px` of a step in the true depth."""
+    return near_steps(np.where(place >= 0, rho[0] + rho[1] * place, 0), reach_px)
+
+
+def near_steps(values: np.ndarray, reach_px: int) -> np.ndarray:
+    """Return which pixels (h, w) lie within `reach_px` of a step of depth, or of inverse depth (h, w), 0 = unknown."""
     import cv2
 
-    inverse = np.where(place >= 0, rho[0] + rho[1] * place, 0)
-    step = np.zeros(place.shape, np.uint8)
+    step = np.zeros(values.shape, np.uint8)
     for axis in (0, 1):
-        a, b = np.moveaxis(inverse, axis, 0)[1:], np.moveaxis(inverse, axis, 0)[:-1]
+        a, b = np.moveaxis(values, axis, 0)[1:], np.moveaxis(values, axis, 0)[:-1]
         jump = (np.maximum(a, b) > _JUMP * np.minimum(a, b)).astype(np.uint8)
         view = np.moveaxis(step, axis, 0)
         view[1:] |= jump

@@ -5,8 +5,11 @@ import numpy as np
 from reconstruction.types import DepthMaps, PosedFrames
 from synthetic.film import FilmSet
 
-_SAMPLES = 400_000
-_ARTIFACT_M = 0.02  # farther from every true surface: what only occlusion borders and wrong matches made
+_SAMPLES = 2_000_000  # of the true surface
+_ARTIFACT_M, _ARTIFACT_SHARE = (
+    0.02,
+    0.02,
+)  # distance to the true surface, and the same over the distance to a camera
 
 
 def measure_surface(
@@ -35,22 +38,25 @@ def measure_surface(
         "mesh_faces": surface.faces,
         "mesh_colors": surface.colors,
         "mesh_superpoints": superpoints(MeshGraph.from_surface(surface)),
-        "mesh_true_ids": true_ids(film_set, surface.vertices),
+        "mesh_true_ids": true_ids(film_set, surface.vertices, posed.world_from_camera[:, :3, 3]),
     }
 
 
-def true_ids(film_set: FilmSet, points: np.ndarray) -> np.ndarray:
-    """Return the entity uint16 (n,) whose true surface is nearest to each point (n, 3), metres; 0 beyond 2 cm."""
+def true_ids(film_set: FilmSet, points: np.ndarray, eyes: np.ndarray) -> np.ndarray:
+    """Return the entity uint16 (v,) whose true surface is nearest to each point (v, 3), metres.
+
+    0 where that is farther than 2 cm and than 2 % of the distance to the nearest of the cameras' centers (n, 3):
+    surface that only occlusion borders and wrong matches made.
+    """
     from scipy.spatial import cKDTree
 
     corners = film_set.vertices[film_set.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     rng = np.random.default_rng(0)
-    face = rng.choice(len(area), _SAMPLES, p=area / area.sum())
     # Small things get samples, too: a face each.
-    face = np.concatenate([face, np.arange(len(area))])
+    face = np.r_[rng.choice(len(area), _SAMPLES, p=area / area.sum()), np.arange(len(area))]
     share = rng.dirichlet((1, 1, 1), len(face))
     samples = np.einsum("nk,nkj->nj", share, corners[face])
-    distance, nearest = cKDTree(samples).query(points, distance_upper_bound=_ARTIFACT_M)
-    known = np.isfinite(distance)
-    return np.where(known, film_set.face_entity[face[np.where(known, nearest, 0)]], 0).astype(np.uint16)
+    distance, nearest = cKDTree(samples).query(points)
+    allowed = np.maximum(_ARTIFACT_M, _ARTIFACT_SHARE * cKDTree(eyes).query(points)[0])
+    return np.where(distance <= allowed, film_set.face_entity[face[nearest]], 0).astype(np.uint16)

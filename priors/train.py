@@ -23,7 +23,7 @@ from priors import aggregation, mending
 from priors.samples import Room, open_rooms
 
 NETWORKS = {"aggregation": aggregation, "mending": mending}
-"""What can be trained: modules of a network's samples, loss and figures."""
+"""Modules with the samples, loss and figures of each network that can be trained."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class TrainConfig:
     seed: int = 0
     threads: int = 0
     widths: tuple[int, ...] = ()  # channels at a half, a quarter, ... of the resolution; () = the usual ones
-    border_weight: float = 3.0
+    border_weight: float = 3.0  # of the aggregation network alone
     affinity_weight: float = 0.2
     check_every: int = 400
     save_every: int = 50

@@ -22,7 +22,7 @@ _KEPT = np.float32(0.9)  # share of the mode's probability from which a pixel ke
 _NO_MODE = np.float32(0.01)  # candidates less probable than this are no mode
 _JUMP = np.float32(
     0.012
-)  # relative change of inverse depth from pixel to pixel up to which a surface goes on
+)  # change of inverse depth from pixel to pixel up to which a surface goes on, relative
 _SLOPE_REACH, _SLOPE_STRIDE = 6, 2  # pixels whose slopes are averaged: far candidates amplify a slope's noise
 _MOST_BENT = np.float32(0.3)  # relative change of inverse depth up to which a plane is extended
 
@@ -121,14 +121,18 @@ def choose_candidates(candidates, share, least, out, trust):  # pragma: no cover
     k, h, w = candidates.shape
     for y in range(h):
         for x in range(w):
-            own, best, value = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            value = candidates[0, y, x]
+            own = _support(candidates, share, value, y, x, SPREAD) if value > 0.0 else np.float32(0.0)
+            best, whole = own, np.float32(0.0)
             for i in range(k):
+                whole += share[i, y, x]
+            # No mode has more than the whole: most pixels are done here.
+            others = k if own < _KEPT * whole else 1
+            for i in range(1, others):
                 at = candidates[i, y, x]
-                if at <= 0.0 or (i > 0 and share[i, y, x] < _NO_MODE):
+                if at <= 0.0 or share[i, y, x] < _NO_MODE:
                     continue
                 total = _support(candidates, share, at, y, x, SPREAD)
-                if i == 0:
-                    own = total
                 if total > best:
                     best, value = total, at
             if own >= _KEPT * best and own > 0.0:

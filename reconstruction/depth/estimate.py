@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
 from reconstruction.depth.config import DepthConfig
-from reconstruction.depth.evidence import PREDICTED, Evidence
+from reconstruction.depth.evidence import PREDICTED, Evidence, count_views, inverse
 from reconstruction.depth.monocular import MonocularBackend, fill_from_predictions, load_monocular
 from reconstruction.depth.perturb import perturbed
 from reconstruction.depth.views import ViewPlan, plan_views
@@ -235,7 +236,7 @@ def _resolve(
     posed, camera: Camera, plan: ViewPlan, depth, confidence, score, config: DepthConfig, workers, progress
 ):
     """Put depth edges where the image has them, and drop what other views look through; return both maps anew."""
-    from reconstruction.depth.consistency import count_witnesses, remove_speckles
+    from reconstruction.depth.consistency import remove_speckles
     from reconstruction.depth.outlines import mark_doubt, resolve_edges
     from reconstruction.depth.refine import fit_slopes
 
@@ -251,7 +252,7 @@ def _resolve(
             return
         warps = [(gray[sources], *_warps(posed, camera, i, sources)) for _, sources in parts]
         color = small_color(posed.images[i], camera)
-        rho = np.where(depth[i] > 0, 1.0 / np.maximum(depth[i], 1e-12), 0).astype(np.float32)
+        rho = inverse(depth[i])
         sure = np.choose(confidence[i], [np.float32(0), np.float32(_COMPLETED_SAY), score[i]]).astype(
             np.float32
         )
@@ -275,15 +276,11 @@ def _resolve(
         trust[i][changed] = np.where(sure[changed] >= _SURE_CORRELATION, 2, 1)
 
     workers.each(len(depth), work, "placing edges", progress)
-    k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    agree, through = count_views(moved, posed, camera, plan.neighbors, workers.each, progress, doubts)
     out = moved.copy()
 
     def check(i: int) -> None:
-        rows = plan.neighbors[i]
-        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
-        agree, through = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-        count_witnesses(i, rows, moved, doubts[i], relative, k, 1.025, 0.015, agree, through)
-        drop = doubts[i] & (through >= 3) & (through > agree + 1)
+        drop = doubts[i] & (through[i] >= 3) & (through[i] > agree[i] + 1)
         # Single pixels that chose otherwise than all around them become flakes in the air.
         drop |= doubts[i] & (moved[i] > 0) & ~remove_speckles(moved[i], config.min_speckle_px // 4, 0.02)
         out[i][drop] = 0
@@ -298,19 +295,26 @@ def gather_evidence(
     config: DepthConfig,
     *,
     backend: MonocularBackend | None = None,
+    keep_agreed: bool = False,
     progress: Progress = NO_PROGRESS,
 ) -> Evidence:
     """Measure every keyframe, complete it by planes and predictions; return the maps and where each pixel is from.
 
-    Args: as of `estimate_depth`.
+    Args:
+        posed: As of `estimate_depth`, like all others.
+        config: Settings.
+        backend: Learned depth, or None.
+        keep_agreed: Whether `Evidence.agreed` is kept, too.
+        progress: Where steps and decisions are reported.
     """
     camera = sized_camera(posed.camera, config.depth_side_px)
     plan = plan_views(posed, config)
     workers = Workers(config.threads)
     rho, score, predicted, surety = _measure(posed, camera, plan, config, workers, progress)
-    raw = np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0).astype(np.float32)
-    agreed, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
-    depth, confidence = agreed, np.where(agreed > 0, 2, 0).astype(np.uint8)
+    raw = inverse(rho)
+    depth, _ = _agree(posed, camera, plan, raw, score, config, workers, progress)
+    agreed = depth.copy() if keep_agreed else np.zeros(0, np.float32)
+    confidence = np.where(depth > 0, 2, 0).astype(np.uint8)
     share = float((confidence == 2).mean())
     if share < 0.02:
         raise InputError(
@@ -337,15 +341,8 @@ def gather_evidence(
     progress.note(
         f"depth: {100 * share:.0f} % of the pixels measured, {100 * float((confidence == 1).mean()):.0f} % completed"
     )
-    return Evidence(
-        camera,
-        plan.neighbors,
-        agreed,
-        depth,
-        np.where(filled, PREDICTED, confidence).astype(np.uint8),
-        score,
-        surety,
-    )
+    origin = np.where(filled, PREDICTED, confidence).astype(np.uint8)
+    return Evidence(camera, plan.neighbors, depth, origin, score, surety, agreed)
 
 
 def estimate_depth(
@@ -373,7 +370,5 @@ def estimate_depth(
         each = Workers(config.threads).each
         mended = mend_depth(found, posed, config.mend_surety, each, progress)
         found = drop_unconfirmed(mended, found.depth, posed, config.min_agreeing, each, progress)
-    depth, confidence = found.depth, np.where(found.origin == PREDICTED, 1, found.origin).astype(np.uint8)
-    if config.perturb:
-        depth = perturbed(depth, config.perturb)
-    return DepthMaps(found.camera, depth, confidence)
+    maps = found.maps()
+    return replace(maps, depth=perturbed(maps.depth, config.perturb)) if config.perturb else maps

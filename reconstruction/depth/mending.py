@@ -1,10 +1,11 @@
 """Mending of finished depth maps: maps with the origin of every pixel's depth -> maps that end where things end.
 
-A network says for every pixel on which of the surfaces around it the pixel lies, or on none of them (displacement of
+A network classifies every pixel: it lies on one of the surfaces around it, or on none of them (displacement of
 depth at occlusion borders: Ramamonjisoa et al., CVPR 2020, as a choice among plane hypotheses of neighbors). What it
 was trained on: docs/priors.md. Weights ship with the project.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.depth.candidates import candidate_depths, choose_candidates
-from reconstruction.depth.evidence import COMPLETED, MEASURED, PREDICTED, Evidence, count_views
+from reconstruction.depth.evidence import COMPLETED, MEASURED, PREDICTED, Evidence, count_views, inverse
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import PosedFrames
 
@@ -20,9 +21,7 @@ WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
 FEATURES = 13
 _AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against
 _MANY_VIEWS = 10.0
-_OWN_ODDS = np.float32(
-    8.0
-)  # how much likelier a pixel's own depth is to be right than in the rooms of the training
+_OWN_ODDS = 8.0  # odds of a pixel's own depth over those in the rooms of the training (docs/priors.md)
 _LOOK_THROUGH = 2  # views that see something beyond a point, from which it may be dropped
 
 
@@ -89,7 +88,7 @@ def candidate_shares(features: np.ndarray, there: np.ndarray, weights: Path = WE
         logits, _ = load_network("mending", weights)(torch.from_numpy(padded)[None])
         logits = logits[0, :, :h, :w]
         logits[:-1].masked_fill_(torch.from_numpy(~there), -1e4)
-        logits[0] += float(np.log(_OWN_ODDS))
+        logits[0] += math.log(_OWN_ODDS)
         return logits.softmax(0)[:-1].numpy()
 
 
@@ -123,13 +122,13 @@ def mend_depth(
         features = mending_features(
             picture, found.depth[i], found.origin[i], found.correlation[i], agree[i], through[i], surety
         )
-        own = np.where(found.depth[i] > 0, 1.0 / np.maximum(found.depth[i], 1e-12), 0).astype(np.float32)
+        own = inverse(found.depth[i])
         candidates = candidate_depths(own)
         share = candidate_shares(features, candidates > 0, weights)
         rho, trust = np.empty_like(own), np.empty_like(own)
         choose_candidates(candidates, share, np.float32(least), rho, trust)
         kept = rho == own
-        depth[i] = np.where(kept, found.depth[i], np.where(rho > 0, 1.0 / np.maximum(rho, 1e-12), 0))
+        depth[i] = np.where(kept, found.depth[i], inverse(rho))
         origin[i] = np.where(depth[i] > 0, np.where(kept, found.origin[i], COMPLETED), 0)
 
     each(len(depth), work, "mending depth", progress)

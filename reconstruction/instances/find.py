@@ -50,13 +50,13 @@ def find_instances(
     progress.advance()
     frames = sightings(surface, posed, depth)
     by_rules = masks is None and config.cut == "rules"
-    if masks is None and config.cut == "partition":
-        cut = cut_by_partition(shell, surface, frames, config, progress)
-    elif masks is None:
+    if masks is not None:
+        cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
+    elif by_rules:
         cut = cut_by_rules(shell, surface, posed, depth, frames, config, progress)
         cut = refine_by_views(shell, cut, surface, posed, depth, config, progress)
     else:
-        cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
+        cut = cut_by_partition(shell, surface, frames, config, progress)
     taken = without_doubts(shell, cut.things, frames, progress)
     if by_rules:
         again = cut_cleaned_stacks(shell.graph, surface, cut.things, posed, depth, config, progress)

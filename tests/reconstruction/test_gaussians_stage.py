@@ -81,13 +81,13 @@ def test_moved_gaussians_look_the_same_from_the_moved_camera(small_capture, made
     camera = small_capture.posed.camera.resized(80, 60)
     here = render_gaussians(made.gaussians, camera, made.gaussians.world_from_camera[1])
     again = render_gaussians(there, camera, there.world_from_camera[1])
-    # Rounding moves a Gaussian's rim across the cutoff of 1/255 in single pixels; which, depends on the processor.
+    # Rounding flips single pixels by up to a few gray levels; which, depends on the processor. All others are the same.
     off = np.abs(here.color - again.color)
-    assert np.quantile(off, 0.999) < 2e-3
+    assert np.quantile(off, 0.999) < 1e-4
     assert off.max() < 4 / 255
     solid = here.opacity > 0.5
     off = np.abs(again.depth[solid] / here.depth[solid] / 2.5 - 1)
-    assert np.quantile(off, 0.999) < 1e-3
+    assert np.quantile(off, 0.999) < 1e-4
     assert off.max() < 0.02
 
 

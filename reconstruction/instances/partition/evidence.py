@@ -1,4 +1,4 @@
-"""What keyframes say of each vertex of the fused mesh: visibility, agreement of depth, edges, spread of color."""
+"""Evidence of keyframes for each vertex of the fused mesh: visibility, agreement of depth, edges, spread of color."""
 
 from dataclasses import dataclass
 

@@ -16,12 +16,12 @@ from registry.errors import EnvironmentMissing
 
 WEIGHTS = Path(__file__).parent / "weights" / "partition.safetensors"
 LABELS = ("thing", "base", "artifact")
-_CLIP = 5.0  # standard deviations
+CLIP = 5.0  # standard deviations beyond which features are cut off
 
 
 @dataclass(frozen=True)
 class Scores:
-    """What the network says of a graph."""
+    """Scores of a graph by the network."""
 
     affinity: np.ndarray  # float32 (e,) log-odds that both sides are one thing
     label: np.ndarray  # float32 (n, 3) log-probabilities of LABELS
@@ -72,7 +72,7 @@ class Model:
 
 def standardized(values: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Return features less their mean over their scale, clipped."""
-    return np.clip((values - mean) * scale, -_CLIP, _CLIP).astype(np.float32)
+    return np.clip((values - mean) * scale, -CLIP, CLIP).astype(np.float32)
 
 
 class _Neighbors:
