@@ -25,6 +25,7 @@ _LEFT_OUT = 0.3  # share of samples without predictions
 _AGREED = 0.3  # share of samples with what was measured alone
 _BESIDE_PX, _BESIDE_WEIGHT = 9, 4  # around steps of the true depth a pixel weighs more
 _OFF = 0.05
+_SOME = 0.005  # share of a keyframe from which it has a say in the figures of where nothing stands
 _SPREAD = 0.015  # scale of a right candidate's relative error, the noise of the measurement (Laplace)
 _NONE = -3.0  # log likelihood of "none of them": that of a candidate three spreads off
 _MISSING = -1e4
@@ -132,7 +133,10 @@ def stack(samples: list[Sample]) -> list[torch.Tensor]:
 
 
 def likelihoods(sample: Sample) -> np.ndarray:
-    """Return the log likelihood float32 (k + 1, h, w) of the true depth under each candidate, "none" last."""
+    """Return the log likelihood float32 (k + 1, h, w) of the true depth under each candidate, "none" last.
+
+    Where nothing stands (truth 0) no candidate is right.
+    """
     out = np.empty((len(sample.candidates) + 1, *sample.truth.shape), np.float32)
     out[-1] = _NONE
     _compare(sample.candidates, sample.truth, out)
@@ -141,9 +145,7 @@ def likelihoods(sample: Sample) -> np.ndarray:
 
 def _weights(sample: Sample) -> np.ndarray:
     there = (sample.candidates > 0).any(0)
-    return (there * (sample.truth > 0) * np.where(beside_steps(sample.truth), _BESIDE_WEIGHT, 1)).astype(
-        np.float32
-    )
+    return (there * np.where(beside_steps(sample.truth), _BESIDE_WEIGHT, 1)).astype(np.float32)
 
 
 @numba.njit(cache=True)
@@ -208,4 +210,7 @@ def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
                     off = np.abs(rho * sample.truth - 1) > _OFF
                     add(f"{mark}known_{name}{part}", known.sum() / max(mask.sum(), 1))
                     add(f"{mark}off_{name}{part}", off[known].mean() if known.any() else 0.0)
+                void = sample.truth == 0
+                if void.mean() > _SOME:
+                    add(f"{mark}void_{name}", (rho[void] > 0).mean())
     return {name: float(np.mean(values)) for name, values in sums.items()}

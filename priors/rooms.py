@@ -20,6 +20,7 @@ from synthetic.lighting import draw_light
 from synthetic.materials import MaterialMix, repaint
 from synthetic.photographs import load_photographs
 from synthetic.procedural import RoomSpec, furnish, plan_room
+from synthetic.room import Room
 from synthetic.sensor import Sensor, draw_sensor
 from synthetic.shape_families import SHAPE_FAMILIES
 from synthetic.walks import draw_walk
@@ -36,6 +37,10 @@ _STEPS = (0.035, 0.07)  # between keyframes, as a share of the longer side; the 
 _STARTS, _FEWEST_KEYFRAMES, _FEWEST_THINGS = 6, 8, 0.04
 _FRAMES_A_STEP = (
     8.0  # frames of a phone's film from keyframe to keyframe: the shutter is open for a share of one
+)
+_OPEN = 0.4  # share of rooms without one or two of their walls: nothing stands there
+_AS_FURNISHED = (
+    0.4  # share of rooms with the generator's own materials, which windows measure nearly everywhere
 )
 _USUAL = MaterialMix(
     print=2.0, text=0.7, noise=1.6, blank=1.0, dark=0.25, gloss=0.5, gradient=0.3, wood=1.0, tiles=0.6
@@ -149,6 +154,16 @@ class Film:
         }  # fmt: skip
 
 
+def _without_walls(room: Room, rng: np.random.Generator) -> Room:
+    """Return the room without one or two of its walls, and without all that hangs there."""
+    walls = [e.id for e in room.base if e.label == "wall"]
+    gone = {int(k) for k in rng.choice(walls, int(rng.integers(1, 3)), replace=False)}
+    for entity in room.entities:  # parents come first
+        if entity.parent in gone:
+            gone.add(entity.id)
+    return replace(room, entities=tuple(e for e in room.entities if e.id not in gone))
+
+
 def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Film:
     """Draw, furnish, paint and light the room of this number in a split, and a walk through it."""
     rng = np.random.default_rng((zlib.crc32(split.encode()), number))
@@ -160,7 +175,14 @@ def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Fi
         **{f.name: usual[f.name] * float(np.exp(rng.normal(0, 0.6))) for f in fields(MaterialMix)}
     )
     pictures = load_photographs(photographs, 40, rng) if photographs else None
-    room, finishes = repaint(furnish(plan), rng, mix, pictures)
+    room, finishes = furnish(plan), {}
+    drawn = np.random.default_rng((number, 9))
+    if drawn.random() >= _AS_FURNISHED or pictures:
+        room, finishes = repaint(room, rng, mix, pictures)
+    base = len(room.base)
+    if drawn.random() < _OPEN:
+        room = _without_walls(room, drawn)
+    background = tuple(float(c) for c in drawn.uniform(20, 235) + drawn.uniform(-20, 20, 3))
     light, sensor = draw_light(rng, room.extent), draw_sensor(rng)
     sensor = replace(
         sensor,
@@ -168,7 +190,7 @@ def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Fi
         rolling_shutter=sensor.rolling_shutter / _FRAMES_A_STEP,
     )
     return Film(
-        split, number, spec, prepare(room, shadow_px=512, light=light, finishes=finishes),
+        split, number, spec, prepare(room, shadow_px=512, light=light, finishes=finishes, background=background),
         draw_walk(rng, plan.shape, _WALK_FRAMES), sensor, fov_deg=float(rng.uniform(50, 76)),
-        portrait=bool(rng.random() < 0.12), materials=mix, base_entities=len(room.base),
+        portrait=bool(rng.random() < 0.12), materials=mix, base_entities=base,
     )  # fmt: skip

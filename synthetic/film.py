@@ -44,6 +44,7 @@ class FilmSet:
     mirrored: np.ndarray  # float64 (k, 7) lamps that glossy things show: position, color, size
     windows: np.ndarray  # float64 (k, 9) axis, plane, low and high along, low and high up, color
     box: np.ndarray  # float64 (6,) west, east, south, north, floor, ceiling: what reflections hit
+    background: tuple[float, float, float] = _BACKGROUND  # color where nothing stands, 0 to 255
 
 
 def _pack_textures(looks: list[Texture]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -67,6 +68,7 @@ def prepare(
     shadow_px: int = 768,
     light: Light | None = None,
     finishes: Mapping[str, Finish] | None = None,
+    background: tuple[float, float, float] = _BACKGROUND,
 ) -> FilmSet:
     """Gather the room's surface, pack its textures, bake its light.
 
@@ -75,6 +77,7 @@ def prepare(
         shadow_px: Size of the shadow maps.
         light: What lights it; None: as every room.
         finishes: Of textures that shine, by name; see `materials.repaint`.
+        background: Color where nothing stands, 0 to 255.
     """
     light, finishes = light or Light(), finishes or {}
     names = sorted(room.textures)
@@ -111,6 +114,7 @@ def prepare(
         mirrored=mirrored_lamps(lamps),
         windows=mirrored_windows(light, vertices),
         box=np.array([*room.extent, 0.0, WALL_HEIGHT_M]),
+        background=background,
     )
 
 
@@ -133,7 +137,7 @@ def render_color(
     """
     pose = np.ascontiguousarray(world_from_camera, np.float64)
     shining = film_set.normals, film_set.finish, film_set.mirrored, film_set.windows, film_set.box
-    background = np.array(_BACKGROUND, np.float32)
+    background = np.array(film_set.background, np.float32)
     if quick:
         points = into_camera(film_set.vertices, invert_rigid(pose))
         large = camera.resized(camera.width * supersample, camera.height * supersample)
