@@ -177,7 +177,7 @@ def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Fi
     pictures = load_photographs(photographs, 40, rng) if photographs else None
     room, finishes = furnish(plan), {}
     drawn = np.random.default_rng((number, 9))
-    if drawn.random() >= _AS_FURNISHED or pictures:
+    if drawn.random() >= _AS_FURNISHED or mix.photograph > 0:
         room, finishes = repaint(room, rng, mix, pictures)
     base = len(room.base)
     if drawn.random() < _OPEN:
