@@ -123,7 +123,7 @@ def _write_room(options: argparse.Namespace, number: int) -> str:
 def film_frames(film: Film, frames: int, cameras: str) -> tuple[PosedFrames, np.ndarray]:
     """Film a stretch of a walk; return the frames with "noisy" or "true" cameras, and the true ones (n, 4, 4)."""
     camera, path = film.camera(WIDTH, HEIGHT), film.keyframes(frames)
-    images = film_room(film.film_set, camera, path, film.sensor, seed=film.number, quick=True)
+    images = film_room(film.film_set, camera, path, film.keyframe_sensor(), seed=film.number, quick=True)
     depth = np.stack([render_truth(film.film_set, camera, pose)[0] for pose in path])
     posed = posed_capture(camera, path, images, depth, f"room-{film.number}.mp4")
     return (replace(posed, world_from_camera=film.shaken(path)) if cameras == "noisy" else posed), path

@@ -95,9 +95,10 @@ class Film:
     split: str
     number: int
     spec: RoomSpec
+    room: Room
     film_set: FilmSet
     walk: np.ndarray  # float64 (k, 4, 4) world_from_camera, of the whole film
-    sensor: Sensor
+    sensor: Sensor  # at the walk's frame rate
     fov_deg: float
     portrait: bool
     materials: MaterialMix
@@ -133,6 +134,14 @@ class Film:
         if len(best) < min(count, _FEWEST_KEYFRAMES):
             raise InputError(f"{self.split}/{self.number}: no stretch of this walk sees enough")
         return best
+
+    def keyframe_sensor(self) -> Sensor:
+        """Return the sensor of a film of keyframes alone: the shutter is open for a smaller share of its steps."""
+        return replace(
+            self.sensor,
+            blur_shutter=self.sensor.blur_shutter / _FRAMES_A_STEP,
+            rolling_shutter=self.sensor.rolling_shutter / _FRAMES_A_STEP,
+        )
 
     def shaken(self, path: np.ndarray) -> np.ndarray:
         """Return poses off by what bundle adjustment leaves: up to .15 mrad and .5 mm, as much as this film drew."""
@@ -184,13 +193,8 @@ def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Fi
         room = _without_walls(room, drawn)
     background = tuple(float(c) for c in drawn.uniform(20, 235) + drawn.uniform(-20, 20, 3))
     light, sensor = draw_light(rng, room.extent), draw_sensor(rng)
-    sensor = replace(
-        sensor,
-        blur_shutter=sensor.blur_shutter / _FRAMES_A_STEP,
-        rolling_shutter=sensor.rolling_shutter / _FRAMES_A_STEP,
-    )
     return Film(
-        split, number, spec, prepare(room, shadow_px=512, light=light, finishes=finishes, background=background),
+        split, number, spec, room, prepare(room, shadow_px=512, light=light, finishes=finishes, background=background),
         draw_walk(rng, plan.shape, _WALK_FRAMES), sensor, fov_deg=float(rng.uniform(50, 76)),
         portrait=bool(rng.random() < 0.12), materials=mix, base_entities=base,
     )  # fmt: skip

@@ -33,6 +33,7 @@ class TrainConfig:
     network: str
     data: str
     out: str
+    start: str = ""  # weights of the same network to begin with; "" = random ones
     steps: int = 4000
     batch: int = 8
     rate: float = 2e-3
@@ -87,7 +88,7 @@ def rate_at(step: int, config: TrainConfig) -> float:
 
 def train(config: TrainConfig, must_resume: bool = False) -> None:
     """Train until `steps`, from the checkpoint if there is one."""
-    from safetensors.torch import save_file
+    from safetensors.torch import load_file, save_file
     from torch.utils.tensorboard import SummaryWriter
 
     out = Path(config.out)
@@ -98,6 +99,9 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     task = NETWORKS[config.network]
     net = task.make_network(config).to(device)
+    if config.start:
+        weights = load_file(config.start)
+        net.load_state_dict({name: value.to(net.state_dict()[name].dtype) for name, value in weights.items()})
     slow = task.make_network(config).to(device)
     slow.load_state_dict(net.state_dict())
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=config.decay)
