@@ -7,8 +7,8 @@ import pytest
 import torch
 import yaml
 
-from priors import dataset, mending, train
-from priors.rooms import HELD_OUT, SPLITS, families_of
+from priors import captures, dataset, mending, train
+from priors.rooms import HELD_OUT, SPLITS, draw_film, families_of
 from priors.samples import border_of, draw_sample, load_sample, open_rooms
 from reconstruction.depth.aggregation import BINS
 
@@ -92,10 +92,10 @@ def test_another_range_keeps_costs_and_truth_together(data):
         assert 0 <= sample.color.min() <= sample.color.max() <= 1
 
 
-def _train(network, data, out, steps):
+def _train(network, data, out, steps, **more):
     values = {
         "network": network, "data": str(data), "out": str(out), "steps": steps, "batch": 1, "check_every": 2,
-        "check_keyframes": 1, "widths": [16, 16, 16], "held_out": ["shapes"], "threads": 1, "warm_up": 1000,
+        "check_keyframes": 1, "widths": [16, 16, 16], "held_out": ["shapes"], "threads": 1, "warm_up": 1000, **more,
     }  # fmt: skip
     config = out.with_suffix(".yaml")
     config.write_text(yaml.safe_dump(values))
@@ -139,6 +139,70 @@ def test_samples_for_mending_say_how_likely_each_candidate_is(data):
     assert crop.features.shape[1:] == crop.truth.shape == crop.candidates.shape[1:]
     batch = mending.stack([crop, crop])
     assert batch[2][:, mending.beside_steps(crop.truth)].max() == 4
+
+
+def test_where_nothing_stands_no_candidate_is_right():
+    """A plane of depth 2 whose upper half has no true surface: `none` is likeliest there, and it has weight."""
+    truth = np.full((24, 32), 2.0, np.float32)
+    truth[:12] = 0
+    candidates = np.full((3, 24, 32), 0.5, np.float32)
+    sample = mending.Sample(
+        np.zeros((13, 24, 32), np.float32), candidates, truth, np.zeros((24, 32), np.int32)
+    )
+    likelihood = mending.likelihoods(sample)
+    assert (likelihood.argmax(0)[:12] == 3).all()
+    assert (likelihood.argmax(0)[12:] == 0).all()
+    assert (mending.stack([sample])[2].numpy() > 0).all()
+
+
+@pytest.fixture(scope="module")
+def open_film():
+    """The first film of the split whose room lacks a wall, and which walls the same room has in all."""
+    for number in range(20):
+        film = draw_film("train", number)
+        if len(film.room.base) < film.base_entities:
+            return film
+    raise AssertionError("none of 20 rooms lacks a wall")
+
+
+def test_some_rooms_lack_walls_and_what_hangs_there(open_film):
+    ids = {e.id for e in open_film.room.entities}
+    assert {e.parent for e in open_film.room.entities} - {None} <= ids
+    assert set(np.unique(open_film.film_set.face_entity)) <= ids
+    # The camera turned to where the wall was sees the background's color, as it is drawn.
+    from synthetic.film import render_color, render_truth
+
+    camera, pose = open_film.camera(64, 48), np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # looks along +y
+    west, east, _, north = open_film.room.extent
+    pose[:3, 3] = (west + east) / 2, north + 50, 1.2  # beyond the room: nothing at all
+    assert (render_truth(open_film.film_set, camera, pose)[0] == 0).all()
+    color = render_color(open_film.film_set, camera, pose, quick=True)
+    assert np.allclose(color, open_film.film_set.background, atol=1)
+
+
+def test_a_film_of_a_held_out_room_becomes_a_capture(open_film, tmp_path):
+    from reconstruction.evaluation.ground_truth import GroundTruth
+
+    captures.write_film(open_film, tmp_path / "room", 3)
+    assert (tmp_path / "room" / "video.mp4").stat().st_size > 1000
+    truth = GroundTruth.load(tmp_path / "room" / "ground_truth")
+    assert truth is not None
+    scene = json.loads((tmp_path / "room" / "ground_truth" / "scene.json").read_text())
+    assert {e["id"] for e in scene["entities"]} == {e.id for e in open_film.room.entities}
+
+
+def test_training_may_start_from_given_weights(data, tmp_path):
+    from safetensors.torch import load_file
+
+    _train("mending", data, tmp_path / "first", 2, seed=1)
+    start = tmp_path / "first" / "best.safetensors"
+    moved = _train("mending", data, tmp_path / "second", 2, start=str(start))
+    fresh = _train("mending", data, tmp_path / "third", 2)
+    given = load_file(start)
+    name = next(name for name, value in given.items() if value.ndim == 4)
+    away = [float((state["net"][name] - given[name].float()).abs().mean()) for state in (moved, fresh)]
+    assert away[0] < 0.1 * away[1]  # two steps at the start of the warm-up hardly move them
 
 
 def test_without_predictions_and_completion_what_was_measured_stays(data):
