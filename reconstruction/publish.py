@@ -20,11 +20,20 @@ from reconstruction.gaussians import write_ply
 from reconstruction.instance_views import write_views
 from reconstruction.instances import backends as instance_backends
 from reconstruction.instances.gaussian_ids import add_instances_to_ply, gaussian_instances
+from reconstruction.phrases import Described, phrases
 from reconstruction.preview import render_preview
 from reconstruction.profiling import OTHER, PUBLISH, Usage, UsageMeter
 from reconstruction.scene_graph import backend_name
 from reconstruction.scene_graph.publishing import graph_of_bundle
-from reconstruction.types import AssetSet, BaseAsset, ObjectAsset, PlacedObject, PosedFrames, WorldFrame
+from reconstruction.types import (
+    AssembledScene,
+    AssetSet,
+    BaseAsset,
+    ObjectAsset,
+    PlacedObject,
+    PosedFrames,
+    WorldFrame,
+)
 from registry import SceneRecord, SceneRegistry, seal_bundle
 from registry.errors import EnvironmentMissing, SimReconError
 from registry.primitives import primitive_of
@@ -106,12 +115,24 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         run.lens(),
         folder,
     )
+    names = _names(assets, assembled)
     for item in scene["objects"]:
+        item["name"] = names[item["id"]]
         if item["id"] in anchors:
             item["anchor"] = anchors[item["id"]]
     picture = render_preview(assets, assembled, posed)
     cv2.imwrite(str(folder / "preview.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     return scene
+
+
+def _names(assets: AssetSet, assembled: AssembledScene) -> dict[int, str]:
+    """Return what a person would call each object, by id."""
+    edges = {edge.child: edge for edge in assembled.graph.edges}
+    poses = {item.id: item.world_from_object for item in assembled.placed}
+    described = [
+        Described.of(o.id, o.label, o.visual, np.asarray(poses[o.id]), edges[o.id]) for o in assets.objects
+    ]
+    return phrases(described, {item.id: item.label for item in assets.base})
 
 
 def _scale(world: WorldFrame) -> dict:

@@ -84,6 +84,7 @@ class BundleObject:
     relation_fixed: bool  # attached to its parent rather than resting on it
     provenance: dict
     views: tuple  # video frame numbers, best first
+    name: str = ""  # noun phrase that no other object of the scene has; "" in bundles of before
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,7 @@ class SceneBundle:
                 ranges={name: tuple(span) for name, span in o.get("ranges", {}).items()},
                 relation_fixed=o.get("relation_fixed", False),
                 views=tuple(o["views"]),
+                name=o.get("name", ""),
             )
             for o in self.scene["objects"]
         )

@@ -190,8 +190,9 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
         )
         size = " x ".join(f"{100 * side:.0f}" for side in item["scale"])
         kind = "movable" if item["dynamic"] else "fixed"
+        name = item.get("name") or item["label"]
         lines.append(
-            f"  {item['id']:3d}  {item['label']:<10} {size + ' cm':<18} {item['mass_kg']:7.2f} kg  {kind:<8}"
+            f"  {item['id']:3d}  {name:<26} {size + ' cm':<18} {item['mass_kg']:7.2f} kg  {kind:<8}"
             f"{relation:<32} seen {item['provenance']['observed_fraction']:.0%}"
         )
     scale = scene["scale"]

@@ -203,7 +203,7 @@ def objects_section(g: Gathered) -> Section:
         cards.append(
             Card(
                 item["id"],
-                f"{item['label']} {item['id']}",
+                f"{item.get('name') or item['label']} {item['id']}",
                 drawing.css_color(g.colors[item["id"]]),
                 object_pictures.turntable(g, mesh, first),
                 object_pictures.ANGLES,

@@ -33,6 +33,7 @@ class SceneFacts:
         self.parent = {edge.child: edge.parent for edge in bundle.edges}
         self.relation = {edge.child: edge.relation for edge in bundle.edges}
         self.labels = {item.id: item.label for item in (*bundle.base, *bundle.objects)}
+        self.phrases = {item.id: item.name for item in bundle.objects}
         self.base_ids = {item.id for item in bundle.base}
         self.floor_ids = {item.id for item in bundle.base if item.label == "floor"}
         self.wall_ids = {item.id for item in bundle.base if item.label == "wall"}
@@ -123,7 +124,9 @@ class SceneFacts:
         return out + [far for child in out for far in self.above(child)]
 
     def thing(self, key: int) -> str:
-        """Return an object's name in a sentence: "mug", "object 7"."""
+        """Return an object's name in a sentence: "small red box", "mug"; "object 7" in bundles without names."""
+        if self.phrases.get(key):
+            return self.phrases[key]
         label = self.labels[key]
         same = [other for other in self.labels.values() if other == label]
         if label == "unknown":

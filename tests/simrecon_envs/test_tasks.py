@@ -52,6 +52,20 @@ def test_every_kind_is_listed_with_names_and_instructions(facts: SceneFacts, sce
     assert "SimRecon/things-navigate_shelf-v0" in {entry.id for entry in driving}
 
 
+def test_instructions_say_an_object_by_its_name_where_the_bundle_has_names(scenes_root: Path) -> None:
+    bundle = SceneRegistry(scenes_root).load("things")
+    plain = SceneFacts(bundle, "panda")
+    first = plain.movable[0]
+    for item in bundle.scene["objects"]:
+        if item["id"] == first:
+            item["name"] = "small red box on the shelf"
+    del bundle.objects  # read again
+    named = SceneFacts(bundle, "panda")
+    assert named.thing(first) == "small red box on the shelf"
+    assert all(named.thing(key) == plain.thing(key) for key in plain.movable[1:])
+    assert named.names == plain.names  # ids of tasks stay
+
+
 def test_the_inside_of_a_crate_is_measured(facts: SceneFacts) -> None:
     assert facts.containers == [CRATE]
     inside = facts.container(CRATE)
