@@ -25,13 +25,18 @@ from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, Example, example
 from priors.rooms import HELD_OUT
 from priors.samples import Room, open_rooms
-from reconstruction.instances.partition.features import EDGE_FEATURES
+from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
 from reconstruction.instances.partition.model import LABELS, load_models
 from registry.errors import UsageError
 
 _KEPT_OUT = 5  # one training room of so many
 _CROP_REGIONS = 1000
 _COLORS = [k for k, name in enumerate(EDGE_FEATURES) if name.startswith(("color", "edge"))]
+_TOGETHER = [
+    [k for k, name in enumerate(names) if name.startswith(("together", "pixel"))]
+    for names in (NODE_FEATURES, EDGE_FEATURES)
+]
+_WITHOUT_IMAGES = 0.1  # share of crops without what the image network says
 _TOLD_EVERY = 100  # steps
 _CRUMB_M2 = 1e-4  # regions below this count less
 _LEAST_WEIGHT = 0.05
@@ -177,7 +182,11 @@ def crop(room: Example, targets: Targets, rng: np.random.Generator, most: int) -
     number[kept] = np.arange(len(kept), dtype=np.int32)
     inside = (number[room.pairs] >= 0).all(axis=1)
     edges = _other_colors(room.edges[inside], rng)
-    part = replace(room, nodes=room.nodes[kept], edges=edges, pairs=number[room.pairs[inside]])
+    nodes = room.nodes[kept]
+    if rng.random() < _WITHOUT_IMAGES:
+        nodes, edges = nodes.copy(), edges.copy()
+        nodes[:, _TOGETHER[0]], edges[:, _TOGETHER[1]] = 0, 0
+    part = replace(room, nodes=nodes, edges=edges, pairs=number[room.pairs[inside]])
     return part, Targets(
         targets.same[inside], targets.same_weight[inside], targets.label[kept], targets.label_weight[kept]
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import rankdata
 
-from priors.partition_rooms import Example, frames_and_depth, fused
+from priors.partition_rooms import Example, cached, frames_and_depth, fused
 from priors.partition_ruler import NOTHING, compare
 from priors.samples import Room
 from reconstruction.instances import InstancesConfig, find_instances
@@ -72,9 +72,9 @@ def rules_figures(rooms: list[Room], examples: list[Example], cache: Path) -> di
     """Return the same figures for the cut by rules, with default settings; its results are cached by room."""
     found = []
     for room in rooms:
-        file = cache / "rules" / room.folder.parent.name / f"{room.folder.name}.npy"
+        file = cached(room, cache, "rules").with_suffix(".npy")
         if not file.is_file():
-            posed, depth = frames_and_depth(room)
+            posed, depth = frames_and_depth(room, cache)
             config = InstancesConfig(cut="rules")
             instances = find_instances(posed, depth, fused(room, cache), config, progress=NO_PROGRESS)
             ids = instances.vertex_instance

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from priors.partition_rooms import Example, read_example, room_view, write_example
+from priors.partition_rooms import Example, cached, read_example, room_view, write_example
 from priors.samples import Room
 from reconstruction.instances.partition.cut import features, sure_unions
 from reconstruction.instances.partition.features import Shapes
@@ -26,7 +26,7 @@ def next_look(room: Room, first: Example, model: Model, cache: Path) -> Example:
     digest = hashlib.sha256(first.nodes.tobytes() + first.edges.tobytes())
     for name in sorted(model.weights):
         digest.update(name.encode() + model.weights[name].tobytes())
-    file = cache / "looks" / room.folder.parent.name / f"{room.folder.name}-{digest.hexdigest()[:12]}.npz"
+    file = cached(room, cache, f"looks-{digest.hexdigest()[:12]}").with_suffix(".npz")
     if not file.is_file():
         write_example(file, _made(room, first, model, cache))
     return read_example(file)

@@ -12,7 +12,11 @@ from priors.samples import Room
 from priors.surfaces import true_ids
 from reconstruction import artifacts
 from reconstruction.cache import source_digest
-from reconstruction.depth.evidence import PREDICTED
+from reconstruction.depth import DepthConfig
+from reconstruction.depth.estimate import Workers
+from reconstruction.depth.evidence import PREDICTED, Evidence
+from reconstruction.depth.mending import WEIGHTS, drop_unconfirmed, mend_depth
+from reconstruction.depth.views import plan_views
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition.cut import features
 from reconstruction.instances.partition.features import Shapes, View
@@ -23,7 +27,9 @@ from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
 from synthetic.capture import posed_capture
 
-NEEDED = ("picture", "depth", "origin", "exact_depth", "exact_ids", "world_from_camera", "focal")
+NEEDED = (
+    "picture", "depth", "origin", "correlation", "exact_depth", "exact_ids", "world_from_camera", "focal",
+)  # fmt: skip
 _FEATURE_MODULES = (
     "priors.partition_rooms",
     *(
@@ -62,8 +68,29 @@ class Example:
         return table.argmax(axis=1), table.max(axis=1) > _LEAST_PURITY * table.sum(axis=1)
 
 
-def frames_and_depth(room: Room) -> tuple[PosedFrames, DepthMaps]:
-    """Return the keyframes with true cameras, and their depth as measured, without what a network predicted."""
+def cached(room: Room, cache: Path, kind: str) -> Path:
+    """Return where something of a room is kept, which follows from its depth as the shipped weights mend it."""
+    weights = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()[:12]
+    return cache / kind / weights / room.folder.parent.name / room.folder.name
+
+
+def frames_and_depth(room: Room, cache: Path) -> tuple[PosedFrames, DepthMaps]:
+    """Return the keyframes with true cameras, and their depth as the depth stage mends it, without predictions.
+
+    Mended maps are taken from the cache if the same weights made them.
+    """
+    posed, found = _evidence(room)
+    folder = cached(room, cache, "mended")
+    if not folder.is_dir():
+        config = DepthConfig()
+        mended = mend_depth(found, posed, config.mend_surety, config.fill_surety, Workers(1).each)
+        mended = drop_unconfirmed(mended, found.depth, posed, config.min_agreeing, Workers(1).each)
+        _save(mended.maps(), folder)
+    return posed, artifacts.load(DepthMaps, folder)
+
+
+def _evidence(room: Room) -> tuple[PosedFrames, Evidence]:
+    """Return the keyframes with true cameras, and their depth as measured and completed by planes."""
     a = room.arrays
     origin = np.asarray(a["origin"])
     depth = np.where(origin == PREDICTED, 0, a["depth"]).astype(np.float32)
@@ -73,36 +100,41 @@ def frames_and_depth(room: Room) -> tuple[PosedFrames, DepthMaps]:
     posed = posed_capture(
         camera, np.asarray(a["world_from_camera"]), np.asarray(a["picture"]), depth, room.folder.name
     )
-    return posed, DepthMaps(camera, depth, np.where(origin == PREDICTED, 0, origin).astype(np.uint8))
+    origin = np.where(origin == PREDICTED, 0, origin).astype(np.uint8)
+    correlation = np.asarray(a["correlation"], np.float32) / 100
+    neighbors = plan_views(posed, DepthConfig()).neighbors
+    nothing = np.zeros(0, np.float32)
+    return posed, Evidence(camera, neighbors, depth, origin, correlation, nothing, nothing)
 
 
 def fused(room: Room, cache: Path) -> Surface:
     """Return the fused surface of a room, from the cache if it is there."""
-    folder = cache / "surfaces" / room.folder.parent.name / room.folder.name
+    folder = cached(room, cache, "surfaces")
     if not folder.is_dir():
-        posed, depth = frames_and_depth(room)
-        part = folder.with_name(folder.name + ".part")
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
-        artifacts.save(fuse_surface(posed, depth, SurfaceConfig()), part)
-        part.rename(folder)
+        _save(fuse_surface(*frames_and_depth(room, cache), SurfaceConfig()), folder)
     return artifacts.load(Surface, folder)
+
+
+def _save(value: DepthMaps | Surface, folder: Path) -> None:
+    """Write a folder of arrays, whole or not at all."""
+    part = folder.with_name(folder.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    artifacts.save(value, part)
+    part.rename(folder)
 
 
 def room_view(room: Room, cache: Path) -> View:
     """Return a room's fused surface as its keyframes see it."""
     surface = fused(room, cache)
     shell = Shell.of(surface, NO_PROGRESS)
-    return View.of(shell.graph, surface, sightings(surface, *frames_and_depth(room)))
+    return View.of(shell.graph, surface, sightings(surface, *frames_and_depth(room, cache)))
 
 
 def example(room: Room, cache: Path, photographs: Path | None) -> Example:
     """Return the graph of a room with its truth, from the cache if the code that made it is the same."""
-    digest = hashlib.sha256("".join(source_digest(name) for name in _FEATURE_MODULES).encode()).hexdigest()[
-        :12
-    ]
-    split, number = room.folder.parent.name, room.folder.name
-    file = cache / "graphs" / digest / split / f"{number}.npz"
+    digest = hashlib.sha256("".join(source_digest(name) for name in _FEATURE_MODULES).encode()).hexdigest()
+    file = cached(room, cache, f"graphs-{digest[:12]}").with_suffix(".npz")
     if not file.is_file():
         write_example(file, _made(room, cache, photographs))
     return read_example(file)
@@ -131,7 +163,7 @@ def _made(room: Room, cache: Path, photographs: Path | None) -> Example:
 def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) -> dict[str, np.ndarray]:
     """Return the last three fields of a room's example, from the cache if they are there."""
     split, number = room.folder.parent.name, room.folder.name
-    file = cache / "truth" / split / f"{number}.npz"
+    file = cached(room, cache, "truth").with_suffix(".npz")
     if not file.is_file():
         film = draw_film(split, int(number), photographs=photographs)
         eyes = np.asarray(room.arrays["world_from_camera"])[:, :3, 3]

@@ -105,6 +105,9 @@ class DepthMaps:
     confidence: (
         np.ndarray
     )  # uint8 (n, h, w): 0 unknown, 1 completed (a plane that its surroundings support), 2 measured
+    affinity: np.ndarray | None = (
+        None  # uint8 (n, 6, ceil(h / 2), ceil(w / 2)), see `depth.mending.pack_affinities`
+    )
 
 
 @dataclass(frozen=True)

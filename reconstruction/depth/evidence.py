@@ -28,11 +28,12 @@ class Evidence:
     agreed: (
         np.ndarray
     )  # float32 (n, h, w) depth before completion, 0 = unknown; empty where nobody asked for it
+    affinity: np.ndarray | None = None  # as `DepthMaps.affinity`, once mended
 
     def maps(self) -> DepthMaps:
         """Return the maps; predicted depth counts as completed."""
         confidence = np.where(self.origin == PREDICTED, COMPLETED, self.origin).astype(np.uint8)
-        return DepthMaps(self.camera, self.depth, confidence)
+        return DepthMaps(self.camera, self.depth, confidence, self.affinity)
 
 
 def inverse(values: np.ndarray) -> np.ndarray:

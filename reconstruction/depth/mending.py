@@ -19,6 +19,9 @@ from reconstruction.types import PosedFrames
 
 WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
 FEATURES = 13
+OFFSETS_PX = (1, 4, 12)
+"""Distances at which the network says whether two pixels are of one thing, to the right and downwards."""
+AFFINITIES = 2 * len(OFFSETS_PX)
 _AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against
 _MANY_VIEWS = 10.0
 _OWN_ODDS = 8.0  # odds of a pixel's own depth over those in the rooms of the training (docs/priors.md)
@@ -67,8 +70,14 @@ def mending_features(
     return out
 
 
-def candidate_shares(features: np.ndarray, there: np.ndarray, weights: Path = WEIGHTS) -> np.ndarray:
-    """Return the probability float32 (k, h, w) that each candidate is right; what is missing to 1 is "none of them".
+def candidate_shares(
+    features: np.ndarray, there: np.ndarray, weights: Path = WEIGHTS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the probability of each candidate, and whether neighbors are of one thing.
+
+    The first array, float32 (k, h, w), sums to 1 with what is missing: "none of them". The second, float32 (6, h, w),
+    is the probability that a pixel and the one 1 px to its right, 1 px below, 4 px to the right, ... are of one thing
+    (`OFFSETS_PX`).
 
     One thread, so that the result does not depend on how many there are; call it from several.
 
@@ -85,17 +94,23 @@ def candidate_shares(features: np.ndarray, there: np.ndarray, weights: Path = WE
     h, w = features.shape[1:]
     padded = np.pad(features, ((0, 0), (0, h % 2), (0, w % 2)), mode="edge")
     with torch.inference_mode():
-        logits, _ = load_network("mending", weights)(torch.from_numpy(padded)[None])
+        logits, affinity = load_network("mending", weights)(torch.from_numpy(padded)[None])
         logits = logits[0, :, :h, :w]
         logits[:-1].masked_fill_(torch.from_numpy(~there), -1e4)
         logits[0] += math.log(_OWN_ODDS)
-        return logits.softmax(0)[:-1].numpy()
+        return logits.softmax(0)[:-1].numpy(), affinity[0, :, :h, :w].sigmoid().numpy()
+
+
+def pack_affinities(affinity: np.ndarray) -> np.ndarray:
+    """Return affinities (6, h, w) of every second pixel and row as uint8 (6, ceil(h / 2), ceil(w / 2)), 255 for 1."""
+    return np.round(255 * affinity[:, ::2, ::2]).astype(np.uint8)
 
 
 def mend_depth(
     found: Evidence,
     posed: PosedFrames,
     least: float,
+    least_filled: float,
     each: Callable,
     progress: Progress = NO_PROGRESS,
     weights: Path = WEIGHTS,
@@ -105,7 +120,8 @@ def mend_depth(
     Args:
         found: Maps and the origin of every pixel.
         posed: Their frames.
-        least: Probability from which depth is believed.
+        least: Probability from which depth is believed where there was depth.
+        least_filled: The same where there was none.
         each: Runs a function for every frame: each(n, work, label, progress).
         progress: Where steps and shares are reported.
         weights: Of the network.
@@ -114,6 +130,8 @@ def mend_depth(
 
     agree, through = count_views(found.depth, posed, found.camera, found.neighbors, each, progress)
     depth, origin = np.zeros_like(found.depth), np.zeros_like(found.origin)
+    count, h, w = depth.shape
+    together = np.zeros((count, AFFINITIES, (h + 1) // 2, (w + 1) // 2), np.uint8)
     nothing = np.zeros(found.depth.shape[1:], np.float32)
 
     def work(i: int) -> None:
@@ -124,9 +142,11 @@ def mend_depth(
         )
         own = inverse(found.depth[i])
         candidates = candidate_depths(own)
-        share = candidate_shares(features, candidates > 0, weights)
+        share, affinity = candidate_shares(features, candidates > 0, weights)
+        together[i] = pack_affinities(affinity)
         rho, trust = np.empty_like(own), np.empty_like(own)
         choose_candidates(candidates, share, np.float32(least), rho, trust)
+        rho[(own == 0) & (trust < least_filled)] = 0
         kept = rho == own
         depth[i] = np.where(kept, found.depth[i], inverse(rho))
         origin[i] = np.where(depth[i] > 0, np.where(kept, found.origin[i], COMPLETED), 0)
@@ -137,7 +157,7 @@ def mend_depth(
     progress.note(
         f"depth: mending dropped {shares[0]:.1f} % of the pixels, moved {shares[1]:.1f} % and filled {shares[2]:.1f} %"
     )
-    return replace(found, depth=depth, origin=origin)
+    return replace(found, depth=depth, origin=origin, affinity=together)
 
 
 def drop_unconfirmed(

@@ -13,11 +13,7 @@ from torch.nn import functional
 
 from reconstruction.depth.aggregation import BINS
 from reconstruction.depth.candidates import OFFSETS
-from reconstruction.depth.mending import FEATURES
-
-OFFSETS_PX = (1, 4, 12)
-"""Distances at which the network says whether two pixels are of one thing, to the right and downwards."""
-
+from reconstruction.depth.mending import FEATURES, OFFSETS_PX
 
 WIDTHS = (48, 64, 96, 128, 128)
 """Channels at a half, a quarter, ... of the resolution."""

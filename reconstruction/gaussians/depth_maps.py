@@ -1,5 +1,7 @@
 """Depth maps as the fitted Gaussians show them: every frame corrected by what all frames agree on."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from reconstruction.depth import DepthConfig
@@ -82,7 +84,7 @@ def rendered_depth_maps(
         f"gaussians: {100 * moved / max(known, 1):.1f} % of the known depth moved by more than "
         f"{100 * config.clear_depth:g} %, {100 * dropped / max(known, 1):.1f} % contradicted and dropped"
     )
-    return DepthMaps(depth.camera, refined, confidence)
+    return replace(depth, depth=refined, confidence=confidence)
 
 
 def _choose(

@@ -28,6 +28,10 @@ class Sighting:
     lab: np.ndarray  # float32 (h, w, 3) weighted CIELAB
     measured: np.ndarray  # float32 (h, w) depth
     drawn: np.ndarray  # float32 (h, w) depth of the fused surface
+    vertex: (
+        np.ndarray
+    )  # int32 (ceil(h / 2), ceil(w / 2)) vertex nearest to what every second pixel shows, -1 = none
+    affinity: np.ndarray | None  # uint8 (6, ceil(h / 2), ceil(w / 2)), of `DepthMaps.affinity`
 
     def seen_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the pixel row and column of points (n, 3), clipped, and their z-depth, 0 where they are outside."""
@@ -52,10 +56,15 @@ def sightings(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[Si
     for row in np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int)):
         pose = np.asarray(posed.world_from_camera[row], np.float64)
         image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        drawn = rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth
+        raster = rasterize_mesh(surface.vertices, surface.faces, camera, pose)
+        face, corner = raster.face[::2, ::2], raster.barycentric[::2, ::2].argmax(axis=2)
+        vertex = np.where(face >= 0, surface.faces[np.maximum(face, 0), corner], -1).astype(np.int32)
+        affinity = None if depth.affinity is None else np.asarray(depth.affinity[row])
         lab = lab_from_rgb(image) * LIGHTNESS_WEIGHT
         measured = np.asarray(depth.depth[row])
-        out.append(Sighting(camera, invert_rigid(pose), pose[:3, 3], lab, measured, drawn))
+        out.append(
+            Sighting(camera, invert_rigid(pose), pose[:3, 3], lab, measured, raster.depth, vertex, affinity)
+        )
     return out
 
 

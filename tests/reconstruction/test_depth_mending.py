@@ -10,6 +10,7 @@ import pytest
 from benchmarks.depth_figures import ring_counts
 from reconstruction.depth import DepthConfig, estimate_depth, mending
 from reconstruction.depth.candidates import OFFSETS, candidate_depths, choose_candidates
+from reconstruction.depth.estimate import Workers, gather_evidence
 from reconstruction.depth.mending import candidate_shares, mending_features
 from reconstruction.depth.weights import load_network
 from synthetic.capture import make_test_capture
@@ -80,12 +81,12 @@ def test_threads_do_not_change_the_result():
     rng = np.random.default_rng(0)
     features = rng.normal(0, 1, (mending.FEATURES, 61, 83)).astype(np.float32)  # odd sizes
     there = rng.random((len(OFFSETS), 61, 83)) < 0.7
-    alone = candidate_shares(features, there)
+    alone, _ = candidate_shares(features, there)
     assert alone.shape == there.shape
     assert (alone[~there] == 0).all()
     assert alone.sum(0).max() <= 1 + 1e-5
     with ThreadPoolExecutor(3) as pool:
-        for share in pool.map(lambda _: candidate_shares(features, there), range(4)):
+        for share, _ in pool.map(lambda _: candidate_shares(features, there), range(4)):
             assert np.array_equal(share, alone)
 
 
@@ -111,3 +112,39 @@ def test_things_end_where_they_end():
         right.append(float((np.abs(maps.depth[on] / truth[on] - 1) < 0.02).mean()))
     assert rings[1] < 0.7 * rings[0]
     assert right[1] > right[0]
+
+
+def test_holes_are_filled_only_where_the_network_is_sure_enough():
+    capture = make_test_capture(8, 320, 240)
+    config = DepthConfig(depth_side_px=320)
+    found = gather_evidence(capture.posed, config)
+    each = Workers(2).each
+    filled, careful, never = (
+        mending.mend_depth(found, capture.posed, 0.5, least, each).depth for least in (0.5, 0.8, 1.1)
+    )
+    known = found.depth > 0
+    assert np.array_equal(filled[known], careful[known])
+    assert np.array_equal(careful[known], never[known])
+    assert not never[~known].any()
+    amounts = [float((depth[~known] > 0).mean()) for depth in (filled, careful)]
+    assert amounts[0] > amounts[1] > 0
+    truth = capture.depth.depth
+    wrong = [
+        float((np.abs(d[hole] / np.maximum(truth[hole], 1e-6) - 1) > 0.05).mean())
+        for d in (filled, careful)
+        for hole in [~known & (d > 0)]
+    ]
+    assert wrong[1] < wrong[0]
+    assert filled.shape == truth.shape
+
+
+def test_affinities_of_the_keyframes_go_with_the_maps():
+    capture = make_test_capture(6, 320, 240)
+    maps = estimate_depth(capture.posed, DepthConfig(depth_side_px=320, prior="mending"))
+    assert maps.affinity.shape == (6, mending.AFFINITIES, 120, 160)
+    ids = capture.id_maps[:, ::2, ::2]
+    step = mending.OFFSETS_PX[-1] // 2
+    said = maps.affinity[:, 2 * (len(mending.OFFSETS_PX) - 1), :, :-step]
+    same = ids[:, :, :-step] == ids[:, :, step:]
+    known = (ids[:, :, :-step] > 0) & (ids[:, :, step:] > 0)
+    assert said[known & same].mean() > said[known & ~same].mean() + 64

@@ -1,18 +1,21 @@
 """The learned cut: multicut against brute force, the graph and its features on known solids, and the cut itself."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from fused_surfaces import box, fused
 from surfaces import frames_of, with_planes
 
+from reconstruction.depth.mending import AFFINITIES, OFFSETS_PX
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition import multicut as solver
 from reconstruction.instances.partition.features import (
     EDGE_FEATURES,
     Shapes,
+    Together,
     View,
     edge_features,
     node_features,
@@ -111,7 +114,7 @@ def test_borders_are_concave_where_things_touch_and_convex_around_them(toy_room)
     view = toy_room[-1]
     graph = region_graph(view.mesh)
     shapes = Shapes.of(view.mesh, graph)
-    features = edge_features(view, graph, shapes)
+    features = edge_features(view, graph, shapes, Together.of(view, graph))
     concavity = features[:, EDGE_FEATURES.index("concavity")]
     angle = features[:, EDGE_FEATURES.index("angle")]
     middle = 0.5 * (shapes.center[graph.pairs[:, 0]] + shapes.center[graph.pairs[:, 1]])
@@ -129,12 +132,43 @@ def test_features_of_borders_do_not_depend_on_which_side_comes_first(toy_room):
     view = toy_room[-1]
     graph = region_graph(view.mesh)
     turned = graph.merged(graph.count - 1 - np.arange(graph.count))
-    first = edge_features(view, graph, Shapes.of(view.mesh, graph))
-    second = edge_features(view, turned, Shapes.of(view.mesh, turned))
+    first, second = (
+        edge_features(view, g, Shapes.of(view.mesh, g), Together.of(view, g)) for g in (graph, turned)
+    )
     numbers = graph.count - 1 - graph.pairs
     order = np.lexsort((numbers.max(axis=1), numbers.min(axis=1)))
     np.testing.assert_array_equal(np.sort(numbers[order], axis=1), turned.pairs)
     np.testing.assert_allclose(first[order], second, atol=1e-4)
+
+
+def test_pixel_pairs_of_two_things_part_the_regions_that_show_there(toy_room):
+    surface, _, _, shell, _ = toy_room
+    posed, depth = frames_of(surface, 1280, 960)
+    on_toy = surface.vertices[:, 2] > 0.31
+    affinity = []
+    for frame in sightings(surface, posed, depth):
+        toy = (frame.vertex >= 0) & on_toy[np.maximum(frame.vertex, 0)]
+        said = np.full((AFFINITIES, *toy.shape), 255, np.uint8)
+        for scale, px in enumerate(OFFSETS_PX):
+            step = max(px // 2, 1)
+            said[2 * scale, :, :-step][toy[:, step:] != toy[:, :-step]] = 0
+            said[2 * scale + 1, :-step][toy[step:] != toy[:-step]] = 0
+        affinity.append(said)
+    told = replace(depth, affinity=np.stack(affinity))
+    view = View.of(shell.graph, surface, sightings(surface, posed, told))
+    graph = region_graph(view.mesh)
+    together = Together.of(view, graph)
+    share = np.bincount(graph.region, weights=on_toy) / np.bincount(graph.region)
+    a, b = graph.pairs.T
+    apart = np.abs(share[a] - share[b])
+    seen = together.pixel_pairs > 8
+    assert (seen & (apart > 0.9)).sum() > 3
+    assert (together.across[seen & (apart > 0.9), 2] < -1).mean() > 0.9
+    assert (together.across[seen & (apart == 0), 2] > 1).mean() > 0.9
+    assert (together.inside[:, 2] >= 0).mean() > 0.9
+    silent = Together.of(toy_room[-1], graph)  # maps without affinities say nothing
+    assert not silent.across.any()
+    assert not silent.inside.any()
 
 
 @pytest.mark.parametrize(("gap_m", "joined"), [(0.02, True), (0.06, False)])
@@ -166,7 +200,9 @@ def test_scores_are_the_same_for_any_numbering_of_regions(toy_room):
     view, model = toy_room[-1], load_models()[0]
     graph = region_graph(view.mesh)
     shapes = Shapes.of(view.mesh, graph)
-    nodes, edges = node_features(view, graph, shapes), edge_features(view, graph, shapes)
+    together = Together.of(view, graph)
+    nodes = node_features(view, graph, shapes, together)
+    edges = edge_features(view, graph, shapes, together)
     scores = model.scores(nodes, edges, graph.pairs)
     turned = model.scores(nodes[::-1], edges, graph.count - 1 - graph.pairs)
     np.testing.assert_allclose(turned.label[::-1], scores.label, atol=1e-3)

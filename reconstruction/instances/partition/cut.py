@@ -6,7 +6,7 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.mask_cut import mark_attached
-from reconstruction.instances.partition.features import Shapes, View, edge_features, node_features
+from reconstruction.instances.partition.features import Shapes, Together, View, edge_features, node_features
 from reconstruction.instances.partition.graph import RegionGraph, region_graph
 from reconstruction.instances.partition.model import LABELS, Model, Scores, load_models
 from reconstruction.instances.partition.multicut import multicut, partition_with_labels
@@ -68,7 +68,8 @@ def partition_surface(
 def features(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray]:
     """Return the features of a graph's regions and borders."""
     shapes = Shapes.of(view.mesh, graph)
-    return node_features(view, graph, shapes), edge_features(view, graph, shapes)
+    together = Together.of(view, graph)
+    return node_features(view, graph, shapes, together), edge_features(view, graph, shapes, together)
 
 
 def sure_unions(graph: RegionGraph, scores: Scores) -> np.ndarray:

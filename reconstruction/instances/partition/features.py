@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.depth.mending import OFFSETS_PX
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.partition.evidence import FrameLook, VertexEvidence, gather, look
 from reconstruction.instances.partition.graph import RegionGraph
@@ -19,17 +20,20 @@ NODE_FEATURES = (
     "log_area", "length", "width", "thickness", "flatness", "coherence", "normal_z", "height", "height_of_foot",
     "gap_below", "to_side", "of_height", "on_floor", "on_wall", "on_ceiling", "on_support", "wall_distance",
     "shown", "unseen", "agreed", "through", "before", "facing", "edge", "jump", "spread", "weight",
-    "free_front", "free_back", "color_spread",
+    "free_front", "free_back", "color_spread", "together_4", "together_12",
 )  # fmt: skip
 EDGE_FEATURES = (
     "touching", "gap", "log_border", "border_share", "concavity", "concavity_low", "angle", "convexity",
     "step_out", "color_step", "color_far", "color_relative", "edge", "edge_relative", "jump", "chord_free",
     "chord_depth", "slope", "agreed", "through", "facing", "in_common",
+    "together_1", "together_4", "together_12", "pixel_pairs",
 )  # fmt: skip
 _BELOW_REACH_M, _BELOW_STEP_M, _UP = 0.08, 0.01, 0.7
 _FREE_REACH_M = 0.04
 _CHORD_CAP_M = 0.05
 _TINY = 1e-9
+_LOG_ODDS = np.log((np.arange(256) + 1.0) / (256.0 - np.arange(256)))
+_FEW_PAIRS = 4.0  # pixel pairs that weigh as much as knowing nothing
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,50 @@ class Shapes:
         )  # fmt: skip
 
 
-def node_features(view: View, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
+@dataclass(frozen=True)
+class Together:
+    """Means over keyframes of what the mending network says of pixel pairs: log-odds of one thing, at 1, 4, 12 px."""
+
+    inside: np.ndarray  # float64 (n, 3) of pairs inside a region, 0 where nothing is known
+    across: np.ndarray  # float64 (e, 3) of pairs across a border
+    pixel_pairs: np.ndarray  # float64 (e,) number of those 12 px apart
+
+    @classmethod
+    def of(cls, view: View, graph: RegionGraph) -> "Together":
+        """Gather the affinities of all keyframes that have them."""
+        count, pairs = graph.count, len(graph.pairs)
+        keys = graph.pairs[:, 0].astype(np.int64) * count + graph.pairs[:, 1]
+        sums, shown = np.zeros((len(OFFSETS_PX), count + pairs)), np.zeros((len(OFFSETS_PX), count + pairs))
+        for frame in view.frames:
+            if frame.affinity is None:
+                continue
+            region = np.where(frame.vertex >= 0, graph.region[np.maximum(frame.vertex, 0)], -1)
+            for scale, px in enumerate(OFFSETS_PX):
+                for axis in (1, 0):
+                    step = max(px // 2, 1)  # at every second pixel: the nearest pair is 2 px apart
+                    first = np.moveaxis(region, axis, 0)[:-step].ravel()
+                    other = np.moveaxis(region, axis, 0)[step:].ravel()
+                    channel = frame.affinity[2 * scale + (1 - axis)]
+                    said = np.moveaxis(channel, axis, 0)[:-step].ravel()
+                    known = (first >= 0) & (other >= 0)
+                    low, high = np.minimum(first, other)[known], np.maximum(first, other)[known]
+                    place = np.where(low == high, low, count + _places(keys, low * np.int64(count) + high))
+                    found = place < count + pairs
+                    odds = _LOG_ODDS[said[known][found]]
+                    sums[scale] += np.bincount(place[found], weights=odds, minlength=count + pairs)
+                    shown[scale] += np.bincount(place[found], minlength=count + pairs)
+        mean = (sums / (shown + _FEW_PAIRS)).T
+        return cls(mean[:count], mean[count:], shown[-1, count:])
+
+
+def _places(keys: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Return the row of each number in sorted keys; their count where it is not there."""
+    row = np.searchsorted(keys, asked)
+    there = keys[np.minimum(row, len(keys) - 1)] == asked if len(keys) else np.zeros(len(asked), bool)
+    return np.where(there, row, len(keys))
+
+
+def node_features(view: View, graph: RegionGraph, shapes: Shapes, together: Together) -> np.ndarray:
     """Return float32 (n, len(NODE_FEATURES)) for the regions of a graph."""
     mesh, evidence = view.mesh, view.evidence
     weight = np.maximum(mesh.areas, _TINY)
@@ -105,11 +152,11 @@ def node_features(view: View, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
     planes = _means(graph, weight, _on_planes(view))
     views = _means(graph, weight, seen)
     around = _means(graph, weight, np.stack(free, axis=1).astype(np.float64))
-    parts = [own, planes, views, around, np.log1p(shapes.color_spread)[:, None]]
+    parts = [own, planes, views, around, np.log1p(shapes.color_spread)[:, None], together.inside[:, 1:]]
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
-def edge_features(view: View, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
+def edge_features(view: View, graph: RegionGraph, shapes: Shapes, together: Together) -> np.ndarray:
     """Return float32 (e, len(EDGE_FEATURES)) for the pairs of a graph."""
     mesh, evidence = view.mesh, view.evidence
     p, q = graph.links[:, 0], graph.links[:, 1]
@@ -137,7 +184,8 @@ def edge_features(view: View, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
     return np.column_stack(
         [graph.touching, mean[:, 0], np.log(border), np.log(share), mean[:, 1], lowest,
          *_bends(shapes, a, b), np.log1p(mean[:, 2]), np.log1p(far), relative, np.log1p(edge),
-         np.log1p(edge) - np.minimum(inside[a], inside[b]), jump, chord_free, chord_depth, mean[:, 3:], common]
+         np.log1p(edge) - np.minimum(inside[a], inside[b]), jump, chord_free, chord_depth, mean[:, 3:], common,
+         together.across, np.log1p(together.pixel_pairs)]
     ).astype(np.float32)  # fmt: skip
 
 
