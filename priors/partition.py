@@ -36,7 +36,7 @@ _TOGETHER = [
     [k for k, name in enumerate(names) if name.startswith(("together", "pixel"))]
     for names in (NODE_FEATURES, EDGE_FEATURES)
 ]
-_WITHOUT_IMAGES = 0.1  # share of crops without what the image network says
+_WITHOUT_IMAGES = 0.3  # share of crops without what the image network says
 _TOLD_EVERY = 100  # steps
 _CRUMB_M2 = 1e-4  # regions below this count less
 _LEAST_WEIGHT = 0.05

@@ -58,7 +58,8 @@ def sightings(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[Si
         image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         raster = rasterize_mesh(surface.vertices, surface.faces, camera, pose)
         face, corner = raster.face[::2, ::2], raster.barycentric[::2, ::2].argmax(axis=2)
-        vertex = np.where(face >= 0, surface.faces[np.maximum(face, 0), corner], -1).astype(np.int32)
+        vertex = np.full(face.shape, -1, np.int32)
+        vertex[face >= 0] = surface.faces[face[face >= 0], corner[face >= 0]]
         affinity = None if depth.affinity is None else np.asarray(depth.affinity[row])
         lab = lab_from_rgb(image) * LIGHTNESS_WEIGHT
         measured = np.asarray(depth.depth[row])
