@@ -141,20 +141,25 @@ def test_features_of_borders_do_not_depend_on_which_side_comes_first(toy_room):
     np.testing.assert_allclose(first[order], second, atol=1e-4)
 
 
+def with_affinities(surface, posed, depth, thing):
+    """Depth maps with the affinities of a perfect network: `thing` (v,) says what each vertex is of."""
+    affinity = []
+    for frame in sightings(surface, posed, depth):
+        ids = np.where(frame.vertex >= 0, np.asarray(thing, int)[np.maximum(frame.vertex, 0)], -1)
+        said = np.full((AFFINITIES, *ids.shape), 250, np.uint8)
+        for scale, px in enumerate(OFFSETS_PX):
+            step = max(px // 2, 1)
+            said[2 * scale, :, :-step][ids[:, step:] != ids[:, :-step]] = 5
+            said[2 * scale + 1, :-step][ids[step:] != ids[:-step]] = 5
+        affinity.append(said)
+    return replace(depth, affinity=np.stack(affinity))
+
+
 def test_pixel_pairs_of_two_things_part_the_regions_that_show_there(toy_room):
     surface, _, _, shell, _ = toy_room
     posed, depth = frames_of(surface, 1280, 960)
     on_toy = surface.vertices[:, 2] > 0.31
-    affinity = []
-    for frame in sightings(surface, posed, depth):
-        toy = (frame.vertex >= 0) & on_toy[np.maximum(frame.vertex, 0)]
-        said = np.full((AFFINITIES, *toy.shape), 255, np.uint8)
-        for scale, px in enumerate(OFFSETS_PX):
-            step = max(px // 2, 1)
-            said[2 * scale, :, :-step][toy[:, step:] != toy[:, :-step]] = 0
-            said[2 * scale + 1, :-step][toy[step:] != toy[:-step]] = 0
-        affinity.append(said)
-    told = replace(depth, affinity=np.stack(affinity))
+    told = with_affinities(surface, posed, depth, on_toy)
     view = View.of(shell.graph, surface, sightings(surface, posed, told))
     graph = region_graph(view.mesh)
     together = Together.of(view, graph)
@@ -212,7 +217,10 @@ def test_scores_are_the_same_for_any_numbering_of_regions(toy_room):
 
 
 def test_a_toy_on_a_table_on_the_floor_is_two_things(toy_room):
-    surface, posed, depth, _, _ = toy_room
+    surface = toy_room[0]
+    posed, depth = frames_of(surface, 640, 480)
+    height = surface.vertices[:, 2]
+    depth = with_affinities(surface, posed, depth, (height > 0.005).astype(int) + (height > 0.305))
     found = find_instances(posed, depth, surface, InstancesConfig(cut="partition"), progress=NO_PROGRESS)
     place = [int(np.argmin(np.linalg.norm(surface.vertices - p, axis=1))) for p in
              ((0.0, 0.0, 0.42), (0.2, 0.2, 0.3), (0.45, 0.45, 0.0))]  # fmt: skip
