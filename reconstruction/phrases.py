@@ -87,7 +87,8 @@ def phrases(objects: Sequence[Described], base_labels: Mapping[int, str]) -> dic
 
 def _short(item: Described, objects: Sequence[Described]) -> str:
     """Return color and noun, with the size where others share both and all of them are visibly smaller or larger."""
-    words = [item.color, item.noun] if item.color else [item.noun]
+    shape, _, noun = item.noun.rpartition(" ") if item.noun.endswith(" thing") else ("", "", item.noun)
+    words = [word for word in (shape, item.color, noun) if word]
     alike = [o for o in objects if o.id != item.id and (o.color, o.noun) == (item.color, item.noun)]
     if alike and all(item.volume > _LARGER * o.volume for o in alike):
         words.insert(0, "large")

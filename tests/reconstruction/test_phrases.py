@@ -81,6 +81,11 @@ def test_size_color_and_place_tell_things_apart():
     }  # fmt: skip
 
 
+def test_the_shape_comes_before_the_color():
+    plate = trimesh.creation.box((0.3, 0.2, 0.02))
+    assert phrases([thing(2, shape=plate)], {FLOOR: "floor"}) == {2: "flat red thing"}
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_no_two_objects_share_a_name_and_order_does_not_matter(seed):
     rng = np.random.default_rng(seed)
