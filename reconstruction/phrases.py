@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reconstruction.instances.labels import UNKNOWN
 from reconstruction.surface.mesh_graph import lab_from_rgb
-from reconstruction.types import Edge, TexturedMesh
+from reconstruction.types import TexturedMesh
 
 _HUES = (  # upper end of the CIELAB hue angle in degrees, light name, dark name
-    (18.0, "pink", "red"),
     (48.0, "pink", "red"),
     (75.0, "orange", "brown"),
     (110.0, "yellow", "brown"),
@@ -35,7 +35,6 @@ _BOX_FILL, _ROUND_FILL = (
 _FLAT, _TALL, _LONG = 0.22, 1.8, 3.0  # height over the smaller side, height over the larger, side over side
 _LARGER = 1.4  # ratio of volumes from which sizes differ visibly
 _BESIDE_M = 0.4
-UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True)
@@ -48,18 +47,16 @@ class Described:
     volume: float  # of its box, m3
     center: np.ndarray  # float64 (3,) world, metres
     parent: int
-    attached: bool
 
     @classmethod
     def of(
-        cls, key: int, label: str, mesh: TexturedMesh, world_from_object: np.ndarray, edge: Edge
+        cls, key: int, label: str, mesh: TexturedMesh, world_from_object: np.ndarray, parent: int
     ) -> "Described":
         """Measure an object."""
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         center = world_from_object[:3, :3] @ (0.5 * (low + high)) + world_from_object[:3, 3]
-        noun = label.replace("_", " ") if label != UNKNOWN else shape_noun(mesh.vertices)
-        attached = edge.relation == "attached_to"
-        return cls(key, noun, color_name(mesh), float(np.prod(high - low)), center, edge.parent, attached)
+        noun = label.replace("_", " ") if label != UNKNOWN[0] else shape_noun(mesh.vertices)
+        return cls(key, noun, color_name(mesh), float(np.prod(high - low)), center, parent)
 
 
 def phrases(objects: Sequence[Described], base_labels: Mapping[int, str]) -> dict[int, str]:
@@ -79,8 +76,8 @@ def phrases(objects: Sequence[Described], base_labels: Mapping[int, str]) -> dic
             text = _placed(item, alike, every, short, base_labels) or f"{text} {item.id}"
         out[item.id] = text
     taken: dict[str, int] = {}
-    for key, text in sorted(out.items()):  # two places may still read the same
-        out[key] = text if text not in taken else f"{text}, number {key}"
+    for key, text in sorted(out.items()):  # labels are free words: one may read like another thing's place
+        out[key] = text if text not in taken else f"{text} {key}"
         taken.setdefault(text, key)
     return out
 
@@ -105,10 +102,10 @@ def _placed(
     counts: dict[str, int] = {}
     for text in short.values():
         counts[text] = counts.get(text, 0) + 1
-    if all(other.parent != item.parent for other in alike):
-        carrier = base_labels.get(item.parent) or short.get(item.parent, "")
-        if carrier and counts.get(carrier, 1) == 1:
-            return f"{short[item.id]} on the {carrier}"
+    carriers = {o.id: base_labels.get(o.parent) or short.get(o.parent, "") for o in (item, *alike)}
+    carrier = carriers.pop(item.id)
+    if carrier and carrier not in carriers.values() and counts.get(carrier, 1) == 1:
+        return f"{short[item.id]} on the {carrier}"
     landmarks = [o for o in every.values() if counts[short[o.id]] == 1 and o.id not in (item.id, item.parent)]
     for mark in sorted(landmarks, key=lambda o: (_apart(item, o), o.id)):
         if _apart(item, mark) > _BESIDE_M:

@@ -126,11 +126,11 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
 
 
 def _names(assets: AssetSet, assembled: AssembledScene) -> dict[int, str]:
-    """Return what a person would call each object, by id."""
-    edges = {edge.child: edge for edge in assembled.graph.edges}
+    """Return a unique noun phrase for each object, by id."""
+    parents = {edge.child: edge.parent for edge in assembled.graph.edges}
     poses = {item.id: item.world_from_object for item in assembled.placed}
     described = [
-        Described.of(o.id, o.label, o.visual, np.asarray(poses[o.id]), edges[o.id]) for o in assets.objects
+        Described.of(o.id, o.label, o.visual, np.asarray(poses[o.id]), parents[o.id]) for o in assets.objects
     ]
     return phrases(described, {item.id: item.label for item in assets.base})
 

@@ -179,6 +179,8 @@ def _objects(items: list, base_ids: set[int]) -> set[int]:
         _mapping(item, where)
         _unique(_integer(item, "id", where, low=1), seen, f"{where}.id")
         _text(item, "label", where)
+        if "name" in item:  # bundles of before had none
+            _text(item, "name", where)
         _number(item, "label_confidence", where, low=0, high=1)
         _transform(item, "world_from_object", where)
         if min(_vector(item, "scale", where, (3,), high=_MAX_METRES)) <= 0:

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from reconstruction.phrases import Described, color_name, phrases, shape_noun
-from reconstruction.types import Edge, TexturedMesh
+from reconstruction.types import TexturedMesh
 
 FLOOR, SHELF, TABLE = 1, 2, 3
 
@@ -22,7 +22,7 @@ def thing(key, label="unknown", rgb=(200, 30, 30), size=(0.1, 0.1, 0.1), at=(0, 
     pose = np.eye(4)
     pose[:3, 3] = at
     mesh = mesh_of(trimesh.creation.box(size) if shape is None else shape, rgb)
-    return Described.of(key, label, mesh, pose, Edge(key, "supported_by", on, 1.0, ""))
+    return Described.of(key, label, mesh, pose, on)
 
 
 @pytest.mark.parametrize(
@@ -79,6 +79,13 @@ def test_size_color_and_place_tell_things_apart():
         6: "large blue box", 7: "small blue box", 8: "gray mug", 9: "green can beside the gray mug",
         10: "green can beside the large blue box",
     }  # fmt: skip
+
+
+def test_two_pictures_on_two_walls_are_not_both_the_picture_on_the_wall():
+    names = phrases(
+        [thing(5, "picture", on=1), thing(6, "picture", at=(3, 0, 1), on=2)], {1: "wall", 2: "wall"}
+    )
+    assert names == {5: "red picture 5", 6: "red picture 6"}
 
 
 def test_the_shape_comes_before_the_color():
