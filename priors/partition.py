@@ -1,46 +1,70 @@
-"""Train the affinities and unaries of the learned cut on rooms on disk, and measure the cut on rooms kept out.
+"""Train the two networks of the learned cut on rooms on disk, and measure the cut on rooms kept out.
 
     python -m priors.partition DATA --out RUN [--photographs DIR] [--cache DIR] [--steps 3000] [--rules]
 
 Graphs with truth are made from `DATA/<split>/<number>` (see `priors.dataset`, `--keep depth`) and cached. Every fifth
-room of "train" is kept out, and so are all other splits. `RUN` gets `partition.safetensors` and `figures.json`.
-`--photographs` has to be the folder that the rooms were made with.
+room of "train" is kept out, and so are all other splits. The network of superpoints is trained on all rooms, and on
+either half of them; the clusters that each half's makes of the other half are what the network of clusters learns
+from. `RUN` gets `partition.safetensors` and `figures.json`. `--photographs` has to be the folder that the rooms were
+made with.
 """
 
 import argparse
+import hashlib
 import json
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch.nn import functional
 
+from priors.partition_clusters import cluster_examples
 from priors.partition_figures import best_shift, figures_of, rules_figures
-from priors.partition_looks import next_look
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, Example, example
 from priors.rooms import HELD_OUT
 from priors.samples import Room, open_rooms
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
-from reconstruction.instances.partition.model import LABELS, load_models
+from reconstruction.instances.partition.graph import LABELS
+from reconstruction.instances.partition.model import Ensemble, Model, load_models
 from registry.errors import UsageError
 
 _KEPT_OUT = 5  # one training room of so many
-_CROP_REGIONS = 1000
-_COLORS = [k for k, name in enumerate(EDGE_FEATURES) if name.startswith(("color", "edge"))]
+_FINER = -1.5  # log-odds added to borders of superpoints: clusters can still be joined, but not cut
 _TOGETHER = [
     [k for k, name in enumerate(names) if name.startswith(("together", "pixel"))]
     for names in (NODE_FEATURES, EDGE_FEATURES)
 ]
+_COLORS = [k for k, name in enumerate(EDGE_FEATURES) if name.startswith(("color", "edge"))]
 _WITHOUT_IMAGES = 0.3  # share of crops without what the image network says
 _TOLD_EVERY = 100  # steps
 _CRUMB_M2 = 1e-4  # regions below this count less
 _LEAST_WEIGHT = 0.05
 _ANYWHERE = 0.25  # of the crops have any middle, the others one on a thing
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How one graph's networks are trained."""
+
+    steps: int
+    members: int  # networks whose scores are averaged
+    width: int
+    rounds: int  # of messages
+    weight_decay: float
+    hidden: float  # share of features that are replaced by their means
+    noise: float  # added to features, in standard deviations
+    crop: int  # regions
+    rate: float = 3e-3
+
+
+_SUPERPOINTS = Fit(3000, 2, 32, 3, 1e-2, 0.0, 0.0, 1000)
+_CLUSTERS = Fit(2000, 4, 32, 1, 0.3, 0.3, 0.5, 300)
 
 
 @dataclass(frozen=True)
@@ -72,7 +96,6 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     options = _parser().parse_args(arguments)
     torch.set_num_threads(options.threads)
-    torch.manual_seed(options.seed)
     options.out.mkdir(parents=True, exist_ok=True)
     cache = options.cache or options.out / "cache"
     splits = _split_rooms(options.data)
@@ -80,29 +103,32 @@ def main(arguments: list[str] | None = None) -> int:
         name: [example(room, cache, options.photographs) for room in rooms] for name, rooms in splits.items()
     }
     print({name: len(rooms) for name, rooms in splits.items()}, flush=True)
-    weights, networks, figures = options.out / "partition.safetensors", [], {}
-    for look in range(options.looks):
-        networks.append(train(examples["train"], options))
-        export(networks, weights)
-        if look + 1 == options.looks:
-            shift = best_shift(load_models(weights)[look], examples["train"])
-            print(f"affinities are shifted by {shift}", flush=True)
-            with torch.no_grad():
-                networks[look].edge_out[-1].bias += shift
-            export(networks, weights)
-        model = load_models(weights)[look]
-        for name, rooms in examples.items():
-            figures[f"{name}, look {look + 1}"] = figures_of(model, rooms)
-            print(name, json.dumps(figures[f"{name}, look {look + 1}"]), flush=True)
-        if look + 1 < options.looks:
-            examples = {
-                name: [next_look(room, e, model, cache) for room, e in zip(splits[name], examples[name])]
-                for name in splits
-            }
+    fits = [replace(f, steps=options.steps or f.steps) for f in (_SUPERPOINTS, _CLUSTERS)]
+    members = partial(_members, kept=options.out / "networks", seed=options.seed)
+    networks = {"superpoints": members(examples["train"], fits[0], shift=_FINER)}
+    finished = _ensemble(networks["superpoints"])
+    figures = {f"{name}, superpoints": figures_of(finished, rooms) for name, rooms in examples.items()}
+    halves = [examples["train"][0::2], examples["train"][1::2] or examples["train"]]
+    by_half = [_ensemble(members(half, replace(fits[0], members=1), shift=_FINER)) for half in halves]
+    clusters = {}
+    for name, rooms in splits.items():
+        models = [by_half[1 - k % 2] if name == "train" else finished for k in range(len(rooms))]
+        clusters[name] = cluster_examples(rooms, examples[name], models, cache, options.processes)
+    networks["clusters"] = members(clusters["train"], fits[1], shift=0.0)
+    shift = options.shift
+    if shift is None:
+        shift = best_shift(_ensemble(networks["clusters"]), clusters["train"])
+    print(f"affinities of clusters are shifted by {shift}", flush=True)
+    for network in networks["clusters"]:
+        _shift(network, shift)
+    export(networks, options.out / "partition.safetensors")
+    finished = load_models(options.out / "partition.safetensors").clusters
+    figures |= {f"{name}, clusters": figures_of(finished, rooms) for name, rooms in clusters.items()}
     if options.rules:
         for name in [name for name in splits if name != "train"]:
             figures[f"{name}, rules"] = rules_figures(splits[name], examples[name], cache)
-            print(name, json.dumps(figures[f"{name}, rules"]), flush=True)
+    for name, row in figures.items():
+        print(name, json.dumps(row), flush=True)
     (options.out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
     return 0
 
@@ -114,20 +140,60 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cache", type=Path, help="folder for graphs (default: OUT/cache)")
     parser.add_argument("--photographs", type=Path, help="folder of pictures that the rooms were made with")
     parser.add_argument(
-        "--steps", type=int, default=3000, help="of training, a part of a room each (default: %(default)s)"
+        "--steps",
+        type=int,
+        help=f"of each network, a part of a room a step (default: {_SUPERPOINTS.steps} for superpoints, "
+        f"{_CLUSTERS.steps} for clusters)",
     )
-    parser.add_argument("--width", type=int, default=32, help="of the layers (default: %(default)s)")
     parser.add_argument(
-        "--looks", type=int, default=2, help="networks, one after the other (default: %(default)s)"
+        "--shift",
+        type=float,
+        help="log-odds added to pairs of clusters (default: best for the rooms trained on; whole films have fewer "
+        "pieces and want less)",
     )
-    parser.add_argument("--rounds", type=int, default=3, help="of messages (default: %(default)s)")
-    parser.add_argument("--rate", type=float, default=3e-3, help="learning rate (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of weights and order (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="(default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="of training (default: %(default)s)")
+    parser.add_argument(
+        "--processes", type=int, default=1, help="that make graphs of clusters (default: %(default)s)"
+    )
     parser.add_argument(
         "--rules", action="store_true", help="measure the cut by rules on the same surfaces, too"
     )
     return parser
+
+
+def _members(examples: list[Example], fit: Fit, shift: float, kept: Path, seed: int) -> list[Network]:
+    """Return networks with other seeds, from the folder `kept` where the same ones were trained before."""
+    data = hashlib.sha256()
+    for values in (array for e in examples for array in (e.nodes, e.edges, e.pairs)):
+        data.update(np.ascontiguousarray(values).tobytes())
+    kept.mkdir(parents=True, exist_ok=True)
+    out = []
+    for k in range(fit.members):
+        key = hashlib.sha256(f"{data.hexdigest()} {replace(fit, members=1)} {seed + k}".encode()).hexdigest()
+        file = kept / f"{key[:16]}.safetensors"
+        if file.is_file():
+            network = _empty(examples, fit)
+            network.load_state_dict(load_file(file))
+        else:
+            network = train(examples, fit, seed + k)
+            save_file(network.state_dict(), file)
+        _shift(network, shift)
+        out.append(network)
+    return out
+
+
+def _empty(examples: list[Example], fit: Fit) -> Network:
+    return Network((examples[0].nodes.shape[1], examples[0].edges.shape[1]), fit.width, fit.rounds).eval()
+
+
+def _shift(network: Network, shift: float) -> None:
+    with torch.no_grad():
+        network.edge_out[-1].bias += shift
+
+
+def _ensemble(networks: list[Network]) -> Ensemble:
+    return Ensemble(tuple(Model({k: v.numpy() for k, v in n.state_dict().items()}) for n in networks))
 
 
 def _split_rooms(data: Path) -> dict[str, list[Room]]:
@@ -143,20 +209,22 @@ def _split_rooms(data: Path) -> dict[str, list[Room]]:
     return {name: rooms for name, rooms in out.items() if rooms}
 
 
-def train(examples: list[Example], options: argparse.Namespace) -> Network:
+def train(examples: list[Example], fit: Fit, seed: int) -> Network:
     """Fit a network to graphs with truth, a part of a room a step."""
-    network = Network(options.width, options.rounds)
+    torch.manual_seed(seed)
+    network = _empty(examples, fit).train()
     for name in ("nodes", "edges"):
         values = np.concatenate([getattr(e, name) for e in examples])
         getattr(network, f"{name[:-1]}_mean").copy_(torch.from_numpy(values.mean(axis=0)))
         getattr(network, f"{name[:-1]}_scale").copy_(torch.from_numpy(1.0 / (values.std(axis=0) + 1e-6)))
-    optimizer = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.rate, total_steps=options.steps + 1)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=fit.rate, weight_decay=fit.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, fit.rate, total_steps=fit.steps + 1)
     targets = [Targets.of(e) for e in examples]
-    rng, started, total = np.random.default_rng(options.seed), time.perf_counter(), np.zeros(2)
-    for step in range(1, options.steps + 1):
+    rng, started, total = np.random.default_rng(seed), time.perf_counter(), np.zeros(2)
+    for step in range(1, fit.steps + 1):
         row = int(rng.integers(len(examples)))
-        parts = losses(network, *crop(examples[row], targets[row], rng, _CROP_REGIONS))
+        room, truth = crop(examples[row], targets[row], rng, fit.crop)
+        parts = losses(network, _blurred(room, network, fit, rng), truth)
         optimizer.zero_grad()
         sum(parts).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -165,10 +233,23 @@ def train(examples: list[Example], options: argparse.Namespace) -> Network:
         total += [float(p.detach()) for p in parts]
         if step % _TOLD_EVERY == 0:
             edges, labels = total / _TOLD_EVERY
-            left = (time.perf_counter() - started) / step * (options.steps - step)
+            left = (time.perf_counter() - started) / step * (fit.steps - step)
             print(f"step {step}: edges {edges:.4f} labels {labels:.4f} ({left:.0f} s left)", flush=True)
             total[:] = 0
     return network.eval()
+
+
+def _blurred(room: Example, network: Network, fit: Fit, rng: np.random.Generator) -> Example:
+    """Return a part of a room with noise on its features, and some of them replaced by their means."""
+    if not fit.hidden and not fit.noise:
+        return room
+    out = {}
+    for name in ("nodes", "edges"):
+        values = getattr(room, name)
+        mean, scale = (getattr(network, f"{name[:-1]}_{part}").numpy() for part in ("mean", "scale"))
+        noisy = values + fit.noise / scale * rng.standard_normal(values.shape)
+        out[name] = np.where(rng.random(values.shape) < fit.hidden, mean, noisy).astype(np.float32)
+    return replace(room, **out)
 
 
 def crop(room: Example, targets: Targets, rng: np.random.Generator, most: int) -> tuple[Example, Targets]:
@@ -216,12 +297,16 @@ def losses(network: Network, room: Example, targets: Targets) -> tuple[torch.Ten
     return edges, (each * weight).sum() / weight.sum().clamp_min(1e-6)
 
 
-def export(networks: list[Network], file: Path) -> None:
-    """Write the weights of all looks as `reconstruction.instances.partition.model.load_models` reads them."""
+def export(networks: dict[str, list[Network]], file: Path) -> None:
+    """Write the weights as `reconstruction.instances.partition.model.load_models` reads them."""
     load_models.cache_clear()
-    looks = enumerate(network.state_dict() for network in networks)
     save_file(
-        {f"{k}.{name}": value.detach().contiguous() for k, look in looks for name, value in look.items()},
+        {
+            f"{graph}.{k}.{name}": value.detach().contiguous()
+            for graph, members in networks.items()
+            for k, network in enumerate(members)
+            for name, value in network.state_dict().items()
+        },
         file,
     )
 

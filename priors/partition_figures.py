@@ -10,21 +10,22 @@ from priors.partition_ruler import NOTHING, compare
 from priors.samples import Room
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.partition.cut import clusters_of_things
-from reconstruction.instances.partition.model import LABELS, Model, Scores
+from reconstruction.instances.partition.graph import LABELS, Scores
+from reconstruction.instances.partition.model import Ensemble
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.progress import NO_PROGRESS
 
-_SHIFTS = tuple(0.25 * k for k in range(-10, 5))  # log-odds
+_SHIFTS = tuple(0.25 * k for k in range(-10, 9))  # log-odds
 
 
-def figures_of(model: Model, rooms: list[Example]) -> dict[str, float]:
+def figures_of(model: Ensemble, rooms: list[Example]) -> dict[str, float]:
     """Return figures by name: of superpoints, affinities, labels, and of things after the partition."""
     scores = [model.scores(room.nodes, room.edges, room.pairs) for room in rooms]
     out = affinity_figures(rooms, scores) | superpoint_figures(rooms)
     found = [partitioned(room, score) for room, score in zip(rooms, scores)]
     out |= things_figures(rooms, found)
     best = things_figures(rooms, [by_truth(room) for room in rooms])
-    return out | {f"superpoints_{name}": value for name, value in best.items()}
+    return out | {f"by_truth_{name}": value for name, value in best.items()}
 
 
 def partitioned(room: Example, scores: Scores) -> np.ndarray:
@@ -37,7 +38,7 @@ def partitioned(room: Example, scores: Scores) -> np.ndarray:
     return number[cluster]
 
 
-def best_shift(model: Model, rooms: list[Example]) -> float:
+def best_shift(model: Ensemble, rooms: list[Example]) -> float:
     """Return the bias of the affinities' log-odds under which the cut of whole rooms is best, on rooms trained on.
 
     Scores of neighboring borders hang together, which a sum of log-odds does not know: probabilities that are right for

@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
-from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
-from reconstruction.instances.partition.model import CLIP, LABELS
+from reconstruction.instances.partition.graph import LABELS
+from reconstruction.instances.partition.model import CLIP
 
 
 def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -26,14 +26,14 @@ class Message(nn.Module):
 class Network(nn.Module):
     """See `reconstruction.instances.partition.model.Model`, whose weights have these names."""
 
-    def __init__(self, width: int, rounds: int) -> None:
-        """Make the layers."""
+    def __init__(self, features: tuple[int, int], width: int, rounds: int) -> None:
+        """Make the layers; `features` are the numbers of features of a region and of a border."""
         super().__init__()
-        for name, count in (("node", len(NODE_FEATURES)), ("edge", len(EDGE_FEATURES))):
+        for name, count in zip(("node", "edge"), features):
             self.register_buffer(f"{name}_mean", torch.zeros(count))
             self.register_buffer(f"{name}_scale", torch.ones(count))
-        self.node_in = _mlp(len(NODE_FEATURES), width, width)
-        self.edge_in = _mlp(len(EDGE_FEATURES), width, width)
+        self.node_in = _mlp(features[0], width, width)
+        self.edge_in = _mlp(features[1], width, width)
         self.message = nn.ModuleList(Message(width) for _ in range(rounds))
         self.node_step = nn.ModuleList(_mlp(3 * width, width, width) for _ in range(rounds))
         self.edge_step = nn.ModuleList(_mlp(3 * width, width, width) for _ in range(rounds))

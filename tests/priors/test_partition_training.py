@@ -12,8 +12,7 @@ from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, example
 from priors.partition_ruler import Figures, compare
 from priors.samples import open_rooms
-from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
-from reconstruction.instances.partition.model import load_models
+from reconstruction.instances.partition.model import FEATURES, load_models
 
 FRAMES = 6
 
@@ -92,42 +91,56 @@ def test_area_under_curve_of_known_orders():
     assert area_under_curve(np.array([1.0, 1, 1, 1]), positive) == 0.5
 
 
+def graph_of(rng, features):
+    """Features of 30 regions and of their borders; the last region has no neighbor."""
+    pairs = np.unique(np.sort(rng.integers(0, 29, (60, 2)), axis=1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    nodes, edges = (
+        rng.normal(size=(count, len(names))).astype(np.float32)
+        for count, names in zip((30, len(pairs)), features)
+    )
+    return nodes, edges, pairs
+
+
 def test_numpy_says_what_pytorch_says(tmp_path):
     torch.manual_seed(0)
-    network = Network(16, 2)
-    rng = np.random.default_rng(0)
-    nodes = rng.normal(size=(30, len(NODE_FEATURES))).astype(np.float32)
-    pairs = np.unique(
-        np.sort(rng.integers(0, 29, (60, 2)), axis=1), axis=0
-    )  # the last region has no neighbor
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    edges = rng.normal(size=(len(pairs), len(EDGE_FEATURES))).astype(np.float32)
-    with torch.no_grad():
-        affinity, label = network(*(torch.from_numpy(x) for x in (nodes, edges, pairs)))
-    partition.export([network], tmp_path / "w.safetensors")
-    scores = load_models(tmp_path / "w.safetensors")[0].scores(nodes, edges, pairs)
-    np.testing.assert_allclose(scores.affinity, affinity.numpy(), atol=1e-4)
-    np.testing.assert_allclose(scores.label, label.numpy(), atol=1e-4)
+    networks = {
+        name: [Network(tuple(map(len, features)), 16, 2) for _ in range(2)]
+        for name, features in zip(("superpoints", "clusters"), FEATURES)
+    }
+    partition.export(networks, tmp_path / "w.safetensors")
+    rng, models = np.random.default_rng(0), load_models(tmp_path / "w.safetensors")
+    for (name, members), features in zip(networks.items(), FEATURES):
+        nodes, edges, pairs = graph_of(rng, features)
+        with torch.no_grad():
+            said = [network(*(torch.from_numpy(x) for x in (nodes, edges, pairs))) for network in members]
+        scores = getattr(models, name).scores(nodes, edges, pairs)
+        affinity, label = (torch.stack(values).mean(dim=0) for values in zip(*said))
+        np.testing.assert_allclose(scores.affinity, affinity.numpy(), atol=1e-4)
+        np.testing.assert_allclose(scores.label, label.log_softmax(dim=1).numpy(), atol=1e-4)
 
 
 def test_training_learns_writes_weights_and_says_figures(data, tmp_path):
-    arguments = [
-        str(data),
-        "--out",
-        str(tmp_path),
-        "--cache",
-        str(data / "cache"),
-        "--width",
-        "16",
-        "--rounds",
-        "1",
-    ]
+    arguments = [str(data), "--out", str(tmp_path), "--cache", str(data / "cache")]
     assert partition.main([*arguments, "--steps", "1"]) == 0
-    early = json.loads((tmp_path / "figures.json").read_text())["train, look 1"]
+    early = json.loads((tmp_path / "figures.json").read_text())["train, superpoints"]
     assert partition.main([*arguments, "--steps", "150"]) == 0
     late = json.loads((tmp_path / "figures.json").read_text())
-    assert late["train, look 1"]["log_loss"] < 0.8 * early["log_loss"]
-    assert late["train, look 1"]["auc"] > 0.7
-    wanted = {"asa", "auc", "recall_25", "precision_25", "recall_50", "superpoints_recall_25"}
-    assert wanted <= set(late["shapes, look 2"])
-    assert [model.rounds for model in load_models(tmp_path / "partition.safetensors")] == [1, 1]
+    assert late["train, superpoints"]["log_loss"] < 0.8 * early["log_loss"]
+    assert late["train, superpoints"]["auc"] > 0.7
+    wanted = {"asa", "auc", "recall_25", "precision_25", "recall_50", "by_truth_recall_25"}
+    assert wanted <= set(late["shapes, clusters"])
+    models = load_models(tmp_path / "partition.safetensors")
+    assert len(models.superpoints.members) > 1
+    assert len(models.clusters.members) > 1
+
+
+def test_noise_on_features_keeps_their_means(graph):
+    fit = partition.Fit(1, 1, 16, 1, 0.0, 0.3, 0.5, 300)
+    network = partition.train([graph], fit, 0)
+    rng = np.random.default_rng(0)
+    blurred = partition._blurred(graph, network, fit, rng)
+    scale = network.edge_scale.numpy()
+    away = (blurred.edges - graph.edges) * scale
+    assert np.abs(away.mean(axis=0)).max() < 0.2
+    assert 0.2 < np.isclose(blurred.edges, network.edge_mean.numpy()).mean() < 0.5

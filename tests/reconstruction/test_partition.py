@@ -20,8 +20,8 @@ from reconstruction.instances.partition.features import (
     edge_features,
     node_features,
 )
-from reconstruction.instances.partition.graph import region_graph
-from reconstruction.instances.partition.model import LABELS, load_models
+from reconstruction.instances.partition.graph import LABELS, region_graph
+from reconstruction.instances.partition.model import load_models
 from reconstruction.instances.sightings import sightings
 from reconstruction.progress import NO_PROGRESS
 from registry.errors import EnvironmentMissing
@@ -202,7 +202,7 @@ def test_merging_regions_keeps_their_outer_borders(toy_room):
 
 
 def test_scores_are_the_same_for_any_numbering_of_regions(toy_room):
-    view, model = toy_room[-1], load_models()[0]
+    view, model = toy_room[-1], load_models().superpoints
     graph = region_graph(view.mesh)
     shapes = Shapes.of(view.mesh, graph)
     together = Together.of(view, graph)

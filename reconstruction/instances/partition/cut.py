@@ -6,17 +6,17 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.mask_cut import mark_attached
+from reconstruction.instances.partition.clusters import cluster_graph
 from reconstruction.instances.partition.features import Shapes, Together, View, edge_features, node_features
-from reconstruction.instances.partition.graph import RegionGraph, region_graph
-from reconstruction.instances.partition.model import LABELS, Model, Scores, load_models
-from reconstruction.instances.partition.multicut import multicut, partition_with_labels
+from reconstruction.instances.partition.graph import LABELS, RegionGraph, region_graph
+from reconstruction.instances.partition.model import Models, load_models
+from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import Sighting
 from reconstruction.progress import Progress
 from reconstruction.types import Surface
 
 _THING, _BASE = LABELS.index("thing"), LABELS.index("base")
-_SURE = 0.9  # probability of one thing from which a first look merges
 
 
 def cut_by_partition(
@@ -51,30 +51,28 @@ def cut_by_partition(
     return Cut(things, _base_owner(shell, label))
 
 
-def partition_surface(
-    view: View, graph: RegionGraph, models: tuple[Model, ...]
-) -> tuple[np.ndarray, np.ndarray]:
+def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[np.ndarray, np.ndarray]:
     """Return the row in LABELS, and the cluster, of each vertex, int32 (v,) each.
 
-    All models but the last merge regions that are surely one thing; the next one sees the features of the unions.
+    Superpoints are partitioned into clusters, and clusters of things into things: pieces of one thing need not touch.
     """
-    for model in models[:-1]:
-        graph = graph.merged(sure_unions(graph, model.scores(*features(view, graph), graph.pairs)))
-    scores = models[-1].scores(*features(view, graph), graph.pairs)
+    scores = models.superpoints.scores(*features(view, graph), graph.pairs)
     label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
-    return label[graph.region], cluster[graph.region]
+    pieces = cluster_graph(view, graph, scores, label, cluster)
+    scores = models.clusters.scores(pieces.nodes, pieces.edges, pieces.graph.pairs)
+    kind, thing = partition_with_labels(pieces.graph.pairs, scores.affinity, scores.label)
+    node = pieces.graph.region
+    left = node >= pieces.things
+    own = np.where(left, label[graph.region], kind[node])
+    number = np.where(left, thing.max() + 1 + cluster[graph.region], thing[node])
+    return own.astype(np.int32), number.astype(np.int32)
 
 
 def features(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray]:
-    """Return the features of a graph's regions and borders."""
+    """Return the features of a graph's superpoints and borders."""
     shapes = Shapes.of(view.mesh, graph)
     together = Together.of(view, graph)
     return node_features(view, graph, shapes, together), edge_features(view, graph, shapes, together)
-
-
-def sure_unions(graph: RegionGraph, scores: Scores) -> np.ndarray:
-    """Return the union int32 (n,) of each region: a multicut in which a border counts only beyond `_SURE`."""
-    return multicut(graph.count, graph.pairs, scores.affinity - np.log(_SURE / (1.0 - _SURE)))
 
 
 def clusters_of_things(

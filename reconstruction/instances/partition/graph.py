@@ -10,6 +10,15 @@ from reconstruction.instances.superpoints import superpoints
 from reconstruction.surface.mesh_graph import MeshGraph
 
 GAP_M = 0.03  # superpoints this near to each other are joined across a gap
+LABELS = ("thing", "base", "artifact")
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a graph by the network."""
+
+    affinity: np.ndarray  # float32 (e,) log-odds that both sides are one thing
+    label: np.ndarray  # float32 (n, 3) log-probabilities of LABELS
 
 
 @dataclass(frozen=True)
@@ -32,7 +41,7 @@ class RegionGraph:
         a, b = self.region[self.links[:, 0]], self.region[self.links[:, 1]]
         crossing = label[a] != label[b]
         touching = self.touching[self.link_pair][crossing]
-        return _of_links(label[self.region].astype(np.int32), self.links[crossing], touching)
+        return graph_of_links(label[self.region].astype(np.int32), self.links[crossing], touching)
 
 
 def region_graph(mesh: MeshGraph, gap_m: float = GAP_M) -> RegionGraph:
@@ -46,7 +55,7 @@ def region_graph(mesh: MeshGraph, gap_m: float = GAP_M) -> RegionGraph:
     links = mesh.edges[a != b]
     across = _gap_links(mesh, region, links, gap_m)
     touching = np.r_[np.ones(len(links), bool), np.zeros(len(across), bool)]
-    return _of_links(region, np.concatenate([links, across]), touching)
+    return graph_of_links(region, np.concatenate([links, across]), touching)
 
 
 def _gap_links(mesh: MeshGraph, region: np.ndarray, links: np.ndarray, gap_m: float) -> np.ndarray:
@@ -69,8 +78,12 @@ def _gap_links(mesh: MeshGraph, region: np.ndarray, links: np.ndarray, gap_m: fl
     return near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int32)
 
 
-def _of_links(region: np.ndarray, links: np.ndarray, touching: np.ndarray) -> RegionGraph:
-    count = int(region.max()) + 1 if len(region) else 0
+def graph_of_links(
+    region: np.ndarray, links: np.ndarray, touching: np.ndarray, count: int | None = None
+) -> RegionGraph:
+    """Return the graph of regions int32 (v,) that links int32 (l, 2) of vertices join, by mesh edges or across gaps."""
+    if count is None:
+        count = int(region.max()) + 1 if len(region) else 0
     ends = region[links].astype(np.int64)
     swap = ends[:, 0] > ends[:, 1]
     links = np.where(swap[:, None], links[:, ::-1], links)

@@ -11,20 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.instances.partition.clusters import CLUSTER_FEATURES, PAIR_FEATURES
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
+from reconstruction.instances.partition.graph import Scores
 from registry.errors import EnvironmentMissing
 
 WEIGHTS = Path(__file__).parent / "weights" / "partition.safetensors"
-LABELS = ("thing", "base", "artifact")
+FEATURES = ((NODE_FEATURES, EDGE_FEATURES), (CLUSTER_FEATURES, PAIR_FEATURES))  # of superpoints, of clusters
 CLIP = 5.0  # standard deviations beyond which features are cut off
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Scores of a graph by the network."""
-
-    affinity: np.ndarray  # float32 (e,) log-odds that both sides are one thing
-    label: np.ndarray  # float32 (n, 3) log-probabilities of LABELS
 
 
 @dataclass(frozen=True)
@@ -42,8 +36,8 @@ class Model:
         """Score a graph.
 
         Args:
-            nodes: float32 (n, len(NODE_FEATURES)) features of regions.
-            edges: float32 (e, len(EDGE_FEATURES)) features of their borders.
+            nodes: float32 (n, F) features of regions, those of `FEATURES` that the weights are for.
+            edges: float32 (e, G) features of their borders.
             pairs: int (e, 2) regions on both sides, rows sorted.
         """
         w = self.weights
@@ -60,9 +54,7 @@ class Model:
             g = g + self._mlp(f"edge_step.{k}", np.concatenate([g, h[a] + h[b], np.abs(h[a] - h[b])], axis=1))
         affinity = self._mlp("edge_out", np.concatenate([g, h[a] + h[b], np.abs(h[a] - h[b])], axis=1))[:, 0]
         label = self._mlp("node_out", h)
-        label = label - label.max(axis=1, keepdims=True)
-        label -= np.log(np.exp(label).sum(axis=1, keepdims=True))
-        return Scores(affinity.astype(np.float32), label.astype(np.float32))
+        return Scores(affinity.astype(np.float32), _log_softmax(label))
 
     def _mlp(self, name: str, x: np.ndarray) -> np.ndarray:
         w = self.weights
@@ -94,9 +86,35 @@ class _Neighbors:
         return mean, most
 
 
+@dataclass(frozen=True)
+class Ensemble:
+    """Models whose scores are averaged."""
+
+    members: tuple[Model, ...]
+
+    def scores(self, nodes: np.ndarray, edges: np.ndarray, pairs: np.ndarray) -> Scores:
+        """Return the mean log-odds, and the normalized mean of the log-probabilities; see `Model.scores`."""
+        every = [model.scores(nodes, edges, pairs) for model in self.members]
+        label = np.mean([s.label for s in every], axis=0)
+        return Scores(np.mean([s.affinity for s in every], axis=0), _log_softmax(label))
+
+
+def _log_softmax(values: np.ndarray) -> np.ndarray:
+    values = values - values.max(axis=1, keepdims=True)
+    return (values - np.log(np.exp(values).sum(axis=1, keepdims=True))).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Models:
+    """What the learned cut is made of."""
+
+    superpoints: Ensemble  # scores the graph of superpoints
+    clusters: Ensemble  # scores the graph of their clusters
+
+
 @lru_cache(maxsize=2)
-def load_models(weights: Path = WEIGHTS) -> tuple[Model, ...]:
-    """Read the weights of all looks, named `<look>.<name>`.
+def load_models(weights: Path = WEIGHTS) -> Models:
+    """Read the weights, named `<superpoints or clusters>.<member>.<name>`.
 
     Raises:
         EnvironmentMissing: the file is not there or is not what this version reads.
@@ -104,19 +122,18 @@ def load_models(weights: Path = WEIGHTS) -> tuple[Model, ...]:
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
+    members: dict[str, dict[str, dict[str, np.ndarray]]] = {"superpoints": {}, "clusters": {}}
     try:
-        found = load_file(weights)
-        looks: dict[int, dict[str, np.ndarray]] = {}
-        for name, value in found.items():
-            look, _, own = name.partition(".")
-            looks.setdefault(int(look), {})[own] = value.astype(np.float32)
-        for look in looks.values():
-            shapes = look["node_mean"].shape, look["edge_mean"].shape
-            if shapes != ((len(NODE_FEATURES),), (len(EDGE_FEATURES),)):
-                raise KeyError(f"made for {shapes} features")
+        for name, value in load_file(weights).items():
+            graph, member, own = name.split(".", 2)
+            members[graph].setdefault(member, {})[own] = value.astype(np.float32)
+        for (graph, found), (nodes, edges) in zip(members.items(), FEATURES):
+            shapes = {(len(w["node_mean"]), len(w["edge_mean"])) for w in found.values()}
+            if shapes != {(len(nodes), len(edges))}:
+                raise KeyError(f"{graph}: made for {shapes or 'no'} features")
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise EnvironmentMissing(
             f"instances: the weights {weights} cannot be read ({error}). Install the package again, or use "
             "--set instances.cut=rules."
         ) from error
-    return tuple(Model(looks[k]) for k in sorted(looks))
+    return Models(*(Ensemble(tuple(Model(found[k]) for k in sorted(found))) for found in members.values()))
