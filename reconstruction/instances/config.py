@@ -9,8 +9,8 @@ class InstancesConfig:
     """How the surface is cut into things."""
 
     cut: Literal["rules", "partition"] = "rules"
-    """Without masks, what cuts: `rules` of shape, contact and color, or `partition`, one multicut by learned
-    affinities."""
+    """Without masks, what cuts: `rules` of shape, contact and color, or `partition`, multicuts of superpoints
+    and of their clusters by learned affinities (best with `depth.prior=mending`)."""
 
     masks: Literal["embedded", "folder", "sam2", "sam3", "mask2former"] = "embedded"
     """Where the cut comes from: `embedded` (geometry and color, nothing to install), `folder` (id images that any other
