@@ -20,7 +20,7 @@ from reconstruction.instances.partition.features import (
     edge_features,
     node_features,
 )
-from reconstruction.instances.partition.graph import LABELS, region_graph
+from reconstruction.instances.partition.graph import LABELS, graph_of_links, region_graph
 from reconstruction.instances.partition.model import load_models
 from reconstruction.instances.sightings import sightings
 from reconstruction.progress import NO_PROGRESS
@@ -131,7 +131,8 @@ def test_borders_are_concave_where_things_touch_and_convex_around_them(toy_room)
 def test_features_of_borders_do_not_depend_on_which_side_comes_first(toy_room):
     view = toy_room[-1]
     graph = region_graph(view.mesh)
-    turned = graph.merged(graph.count - 1 - np.arange(graph.count))
+    region = (graph.count - 1 - graph.region).astype(np.int32)
+    turned = graph_of_links(region, graph.links, graph.touching[graph.link_pair])
     first, second = (
         edge_features(view, g, Shapes.of(view.mesh, g), Together.of(view, g)) for g in (graph, turned)
     )
@@ -188,17 +189,6 @@ def test_regions_are_joined_across_small_gaps_only(gap_m, joined):
     between = (x[a] * x[b] < 0) & (np.minimum(z[a], z[b]) > 0.4)
     assert between.any() == joined
     assert not graph.touching[between].any()
-
-
-def test_merging_regions_keeps_their_outer_borders(toy_room):
-    graph = region_graph(toy_room[-1].mesh)
-    label = np.arange(graph.count) // 7
-    union = graph.merged(label)
-    assert union.count == label.max() + 1
-    np.testing.assert_array_equal(union.region, label[graph.region])
-    expected = np.unique(np.sort(label[graph.pairs], axis=1), axis=0)
-    expected = expected[expected[:, 0] != expected[:, 1]]
-    np.testing.assert_array_equal(union.pairs, expected)
 
 
 def test_scores_are_the_same_for_any_numbering_of_regions(toy_room):

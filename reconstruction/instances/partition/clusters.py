@@ -69,7 +69,7 @@ def cluster_graph(
     rest = int(node.max(initial=-1)) + 1
     node = np.where(node >= 0, node, rest)
     pieces = _Pieces.of(view, node[graph.region], rest)
-    pairs, ends, gaps = _near_pairs(view, graph, node, rest, pieces)
+    pairs, ends, gaps = _near_pairs(view, pieces)
     merged = _joined(graph, node, rest, pairs, ends)
     shapes, together = Shapes.of(view.mesh, merged), Together.of(view, merged)
     nodes = np.column_stack(
@@ -129,9 +129,7 @@ def _hull(points: np.ndarray) -> tuple[float, np.ndarray | None]:
     return hull.volume, hull.equations
 
 
-def _near_pairs(
-    view: View, graph: RegionGraph, node: np.ndarray, count: int, pieces: _Pieces
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _near_pairs(view: View, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pairs of nodes within reach (e, 2), their nearest vertices (e, 2), and the gaps, metres."""
     pairs, ends, gaps = [], [], []
     apart = np.maximum(

@@ -23,7 +23,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class RegionGraph:
-    """Regions of a mesh (superpoints, or unions of them) as nodes, and pairs of neighbors as edges.
+    """Regions of a mesh (superpoints, or clusters of them) as nodes, and pairs of neighbors as edges.
 
     A link is a pair of vertices of two regions: a mesh edge across their border, or vertices near each other across a
     gap.
@@ -35,13 +35,6 @@ class RegionGraph:
     touching: np.ndarray  # bool (e,) joined by mesh edges, else across a gap
     links: np.ndarray  # int32 (l, 2) vertices; the first is of the pair's first region
     link_pair: np.ndarray  # int32 (l,) row in `pairs` of each link
-
-    def merged(self, label: np.ndarray) -> "RegionGraph":
-        """Return the graph of unions of regions, `label` int (count,) numbered from 0."""
-        a, b = self.region[self.links[:, 0]], self.region[self.links[:, 1]]
-        crossing = label[a] != label[b]
-        touching = self.touching[self.link_pair][crossing]
-        return graph_of_links(label[self.region].astype(np.int32), self.links[crossing], touching)
 
 
 def region_graph(mesh: MeshGraph, gap_m: float = GAP_M) -> RegionGraph:
