@@ -41,6 +41,7 @@ _TOGETHER = [
     for names in (NODE_FEATURES, EDGE_FEATURES)
 ]
 _COLORS = [k for k, name in enumerate(EDGE_FEATURES) if name.startswith(("color", "edge"))]
+_SCALING = {"node_mean", "node_scale", "edge_mean", "edge_scale"}  # kept as float32 in the file
 _WITHOUT_IMAGES = 0.3  # share of crops without what the image network says
 _TOLD_EVERY = 100  # steps
 _CRUMB_M2 = 1e-4  # regions below this count less
@@ -298,11 +299,11 @@ def losses(network: Network, room: Example, targets: Targets) -> tuple[torch.Ten
 
 
 def export(networks: dict[str, list[Network]], file: Path) -> None:
-    """Write the weights as `reconstruction.instances.partition.model.load_models` reads them."""
+    """Write the weights as `reconstruction.instances.partition.model.load_models` reads them, layers as float16."""
     load_models.cache_clear()
     save_file(
         {
-            f"{graph}.{k}.{name}": value.detach().contiguous()
+            f"{graph}.{k}.{name}": (value if name in _SCALING else value.half()).detach().contiguous()
             for graph, members in networks.items()
             for k, network in enumerate(members)
             for name, value in network.state_dict().items()

@@ -113,7 +113,8 @@ def test_numpy_says_what_pytorch_says(tmp_path):
     for (name, members), features in zip(networks.items(), FEATURES):
         nodes, edges, pairs = graph_of(rng, features)
         with torch.no_grad():
-            said = [network(*(torch.from_numpy(x) for x in (nodes, edges, pairs))) for network in members]
+            # layers are float16 in the file
+            said = [n.half().float()(*(torch.from_numpy(x) for x in (nodes, edges, pairs))) for n in members]
         scores = getattr(models, name).scores(nodes, edges, pairs)
         affinity, label = (torch.stack(values).mean(dim=0) for values in zip(*said))
         np.testing.assert_allclose(scores.affinity, affinity.numpy(), atol=1e-4)
