@@ -1,11 +1,12 @@
-"""Train the two networks of the learned cut on rooms on disk, and measure the cut on rooms kept out.
+"""Train the network and the boosted trees of the learned cut on rooms on disk, and measure it on rooms kept out.
 
-    python -m priors.partition DATA --out RUN [--photographs DIR] [--cache DIR] [--steps 3000] [--rules]
+    python -m priors.partition DATA --out RUN [--photographs DIR] [--cache DIR] [--processes 2] [--rules]
 
 Graphs with truth are made from `DATA/<split>/<number>` (see `priors.dataset`, `--keep depth`) and cached. Every fifth
 room of "train" is kept out, and so are all other splits. The network of superpoints is trained on all rooms, and on
-either half of them; the clusters that each half's makes of the other half are what the network of clusters learns
-from. `RUN` gets `partition.safetensors` and `figures.json`. `--photographs` has to be the folder that the rooms were
+either half of them; the clusters that each half's makes of the other half are what the trees for pairs of clusters
+are fitted to, and the proposals that either half's trees make of the other half are what the trees for proposals are.
+`RUN` gets `partition.safetensors` and `figures.json`. `--photographs` has to be the folder that the rooms were
 made with.
 """
 
@@ -21,21 +22,26 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
+from scipy.special import expit
 from torch.nn import functional
 
-from priors.partition_clusters import cluster_examples
-from priors.partition_figures import best_shift, figures_of, rules_figures
+from priors.partition_clusters import Clusters, RoomProposals, clusters_of, proposals_of
+from priors.partition_figures import best_least, figures_of, proposal_figures, rules_figures
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, Example, example
+from priors.partition_trees import PAIRS, PROPOSALS, fit_trees
 from priors.rooms import HELD_OUT
 from priors.samples import Room, open_rooms
+from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
 from reconstruction.instances.partition.graph import LABELS
 from reconstruction.instances.partition.model import Ensemble, Model, load_models
 from registry.errors import UsageError
 
 _KEPT_OUT = 5  # one training room of so many
-_FINER = -1.5  # log-odds added to borders of superpoints: clusters can still be joined, but not cut
+_FINER = -3.0  # log-odds added to borders of superpoints: clusters can still be joined, but not cut
+_THINGS = 0.5  # log-odds added to "thing": proposals can still be left out, but not made of base
+_ROUNDS = {"pairs": 300, "proposals": 400}
 _TOGETHER = [
     [k for k, name in enumerate(names) if name.startswith(("together", "pixel"))]
     for names in (NODE_FEATURES, EDGE_FEATURES)
@@ -65,7 +71,6 @@ class Fit:
 
 
 _SUPERPOINTS = Fit(3000, 2, 32, 3, 1e-2, 0.0, 0.0, 1000)
-_CLUSTERS = Fit(2000, 4, 32, 1, 0.3, 0.3, 0.5, 300)
 
 
 @dataclass(frozen=True)
@@ -104,27 +109,36 @@ def main(arguments: list[str] | None = None) -> int:
         name: [example(room, cache, options.photographs) for room in rooms] for name, rooms in splits.items()
     }
     print({name: len(rooms) for name, rooms in splits.items()}, flush=True)
-    fits = [replace(f, steps=options.steps or f.steps) for f in (_SUPERPOINTS, _CLUSTERS)]
+    fit = replace(_SUPERPOINTS, steps=options.steps or _SUPERPOINTS.steps)
     members = partial(_members, kept=options.out / "networks", seed=options.seed)
-    networks = {"superpoints": members(examples["train"], fits[0], shift=_FINER)}
-    finished = _ensemble(networks["superpoints"])
-    figures = {f"{name}, superpoints": figures_of(finished, rooms) for name, rooms in examples.items()}
+    networks = members(examples["train"], fit)
+    finished = _ensemble(networks)
     halves = [examples["train"][0::2], examples["train"][1::2] or examples["train"]]
-    by_half = [_ensemble(members(half, replace(fits[0], members=1), shift=_FINER)) for half in halves]
-    clusters = {}
-    for name, rooms in splits.items():
-        models = [by_half[1 - k % 2] if name == "train" else finished for k in range(len(rooms))]
-        clusters[name] = cluster_examples(rooms, examples[name], models, cache, options.processes)
-    networks["clusters"] = members(clusters["train"], fits[1], shift=0.0)
-    shift = options.shift
-    if shift is None:
-        shift = best_shift(_ensemble(networks["clusters"]), clusters["train"])
-    print(f"affinities of clusters are shifted by {shift}", flush=True)
-    for network in networks["clusters"]:
-        _shift(network, shift)
-    export(networks, options.out / "partition.safetensors")
-    finished = load_models(options.out / "partition.safetensors").clusters
-    figures |= {f"{name}, clusters": figures_of(finished, rooms) for name, rooms in clusters.items()}
+    by_half = [_ensemble(members(half, replace(fit, members=1))) for half in halves]
+    rounds = {name: options.rounds or count for name, count in _ROUNDS.items()}
+    pairs, found = None, {}
+    for name, rooms in splits.items():  # those trained on first
+        trained = name == "train"
+        models = [by_half[1 - k % 2] if trained else finished for k in range(len(rooms))]
+        clusters = clusters_of(rooms, examples[name], models, cache, options.processes)
+        print(f"{name}: {sum(room.pieces.things for room in clusters)} clusters", flush=True)
+        if trained:
+            pairs = _fit_pairs(clusters, rounds["pairs"], options.seed)
+            half = [_fit_pairs(clusters[k::2] or clusters, rounds["pairs"], options.seed) for k in (0, 1)]
+        trees = [half[1 - k % 2] if trained else pairs for k in range(len(rooms))]
+        found[name] = proposals_of(clusters, trees, cache, options.processes)
+        print(f"{name}: {sum(len(room.rows) for room in found[name])} proposals", flush=True)
+    proposals = _fit_proposals(found["train"], rounds["proposals"], options.seed)
+    said = {name: [expit(proposals(room.rows)) for room in rooms] for name, rooms in found.items()}
+    chosen_on = [name for name in found if name != "train"] or ["train"]
+    least = options.least
+    if least is None:
+        least = best_least([r for n in chosen_on for r in found[n]], [v for n in chosen_on for v in said[n]])
+    print(f"proposals of an IoU above {least} are chosen", flush=True)
+    export(networks, {"pairs": pairs, "proposals": proposals}, least, options.out / "partition.safetensors")
+    figures = {f"{name}, superpoints": figures_of(finished, rooms) for name, rooms in examples.items()}
+    for name, rooms in found.items():
+        figures[f"{name}, things"] = proposal_figures(rooms, said[name], least)
     if options.rules:
         for name in [name for name in splits if name != "train"]:
             figures[f"{name}, rules"] = rules_figures(splits[name], examples[name], cache)
@@ -132,6 +146,24 @@ def main(arguments: list[str] | None = None) -> int:
         print(name, json.dumps(row), flush=True)
     (options.out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
     return 0
+
+
+def _fit_pairs(rooms: list[Clusters], rounds: int, seed: int) -> Boosted:
+    rows, same, weight = [], [], []
+    for room in rooms:
+        true, certain = room.pair_truth()
+        known = certain > 0
+        rows.append(room.pieces.pair_rows()[known])
+        same.append(true[known])
+        weight.append(certain[known])
+    rows, same, weight = (np.concatenate(values) for values in (rows, same, weight))
+    print(f"{len(rows)} pairs of clusters, {same.mean():.0%} of one thing", flush=True)
+    return fit_trees(rows, same, weight, PAIRS, rounds, seed)
+
+
+def _fit_proposals(rooms: list[RoomProposals], rounds: int, seed: int) -> Boosted:
+    rows, iou = np.concatenate([r.rows for r in rooms]), np.concatenate([r.best_iou for r in rooms])
+    return fit_trees(rows, iou, np.ones(len(iou)), PROPOSALS, rounds, seed)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -143,19 +175,22 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--steps",
         type=int,
-        help=f"of each network, a part of a room a step (default: {_SUPERPOINTS.steps} for superpoints, "
-        f"{_CLUSTERS.steps} for clusters)",
+        help=f"of each network, a part of a room a step (default: {_SUPERPOINTS.steps})",
     )
     parser.add_argument(
-        "--shift",
+        "--rounds",
+        type=int,
+        help=f"trees (default: {_ROUNDS['pairs']} for pairs, {_ROUNDS['proposals']} for proposals)",
+    )
+    parser.add_argument(
+        "--least",
         type=float,
-        help="log-odds added to pairs of clusters (default: best for the rooms trained on; whole films have fewer "
-        "pieces and want less)",
+        help="IoU that proposals are chosen above (default: best for the rooms not trained on)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of weights and order (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="of training (default: %(default)s)")
     parser.add_argument(
-        "--processes", type=int, default=1, help="that make graphs of clusters (default: %(default)s)"
+        "--processes", type=int, default=1, help="that make clusters and proposals (default: %(default)s)"
     )
     parser.add_argument(
         "--rules", action="store_true", help="measure the cut by rules on the same surfaces, too"
@@ -163,7 +198,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _members(examples: list[Example], fit: Fit, shift: float, kept: Path, seed: int) -> list[Network]:
+def _members(examples: list[Example], fit: Fit, kept: Path, seed: int) -> list[Network]:
     """Return networks with other seeds, from the folder `kept` where the same ones were trained before."""
     data = hashlib.sha256()
     for values in (array for e in examples for array in (e.nodes, e.edges, e.pairs)):
@@ -179,7 +214,7 @@ def _members(examples: list[Example], fit: Fit, shift: float, kept: Path, seed: 
         else:
             network = train(examples, fit, seed + k)
             save_file(network.state_dict(), file)
-        _shift(network, shift)
+        _shift(network)
         out.append(network)
     return out
 
@@ -188,9 +223,10 @@ def _empty(examples: list[Example], fit: Fit) -> Network:
     return Network((examples[0].nodes.shape[1], examples[0].edges.shape[1]), fit.width, fit.rounds).eval()
 
 
-def _shift(network: Network, shift: float) -> None:
+def _shift(network: Network) -> None:
     with torch.no_grad():
-        network.edge_out[-1].bias += shift
+        network.edge_out[-1].bias += _FINER
+        network.node_out[-1].bias[LABELS.index("thing")] += _THINGS
 
 
 def _ensemble(networks: list[Network]) -> Ensemble:
@@ -298,18 +334,17 @@ def losses(network: Network, room: Example, targets: Targets) -> tuple[torch.Ten
     return edges, (each * weight).sum() / weight.sum().clamp_min(1e-6)
 
 
-def export(networks: dict[str, list[Network]], file: Path) -> None:
+def export(networks: list[Network], trees: dict[str, Boosted], least_iou: float, file: Path) -> None:
     """Write the weights as `reconstruction.instances.partition.model.load_models` reads them, layers as float16."""
     load_models.cache_clear()
-    save_file(
-        {
-            f"{graph}.{k}.{name}": (value if name in _SCALING else value.half()).detach().contiguous()
-            for graph, members in networks.items()
-            for k, network in enumerate(members)
-            for name, value in network.state_dict().items()
-        },
-        file,
-    )
+    arrays = {
+        f"superpoints.{k}.{name}": (value if name in _SCALING else value.half()).detach().contiguous()
+        for k, network in enumerate(networks)
+        for name, value in network.state_dict().items()
+    }
+    for kind, boosted in trees.items():
+        arrays |= {f"{kind}.{name}": torch.from_numpy(value) for name, value in boosted.arrays().items()}
+    save_file(arrays | {"least_iou": torch.tensor([least_iou])}, file)
 
 
 if __name__ == "__main__":

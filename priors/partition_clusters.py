@@ -1,44 +1,106 @@
-"""Rooms' graphs of clusters with truth: what the second network of the learned cut is trained and measured on."""
+"""Rooms' clusters and proposals with truth: what the boosted trees of the learned cut are fitted to and measured on."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from scipy.sparse import csr_matrix
 
 from priors.partition_rooms import Example, room_view
 from priors.samples import Room
-from reconstruction.instances.partition.clusters import cluster_graph
-from reconstruction.instances.partition.features import Shapes
-from reconstruction.instances.partition.graph import region_graph
+from reconstruction.instances.partition.boosting import Boosted
+from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
+from reconstruction.instances.partition.graph import Scores, region_graph
 from reconstruction.instances.partition.model import Ensemble
 from reconstruction.instances.partition.multicut import partition_with_labels
+from reconstruction.instances.partition.proposal_features import proposal_features
+from reconstruction.instances.partition.proposals import propose
 
-Job = tuple[Room, Example, Ensemble, Path]
+_PURE = 0.6  # of a cluster's known surface must be of one entity
+_CRUMB_M2 = 1e-4  # clusters below this count less
+_TINY = 1e-12
+T = TypeVar("T")
+J = TypeVar("J")
 
 
-def cluster_examples(
+@dataclass(frozen=True)
+class Clusters:
+    """One room's clusters."""
+
+    room: Room
+    example: Example
+    scores: Scores  # of superpoints
+    label: np.ndarray  # int (s,) of superpoints
+    pieces: ClusterGraph
+
+    def table(self) -> np.ndarray:
+        """Return the surface of each entity in each cluster of things, float (n, ids), m2."""
+        region, count = self.pieces.graph.region, self.pieces.things
+        out = np.zeros((count + 1, len(self.example.pixels)))
+        np.add.at(out, (region, self.example.true_ids), np.maximum(self.example.areas, _TINY))
+        return out[:count]
+
+    def pair_truth(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return 1 for pairs of one thing, and the weights of pairs, float (e,) each."""
+        table = self.table()
+        area = table.sum(axis=1)
+        ids = table.argmax(axis=1)
+        ids = np.where(ids <= self.example.base_entities, np.minimum(ids, 1), ids)
+        pure = table.max(axis=1, initial=0.0) > _PURE * area
+        weight = np.clip(area / _CRUMB_M2, 0.0, 1.0) * pure
+        a, b = self.pieces.graph.pairs.T
+        return (ids[a] == ids[b]).astype(float), np.minimum(weight[a], weight[b])
+
+
+@dataclass(frozen=True)
+class RoomProposals:
+    """One room's proposals and how well they are true things."""
+
+    members: csr_matrix  # (m, n)
+    rows: np.ndarray  # float32 (m, F)
+    best_iou: np.ndarray  # float (m,) with the true thing that each is most like
+    region: np.ndarray  # int (v,) cluster of each vertex
+    example: Example
+
+
+def clusters_of(
     rooms: Sequence[Room],
-    superpoints: Sequence[Example],
+    examples: Sequence[Example],
     models: Sequence[Ensemble],
     cache: Path,
     processes: int,
-) -> list[Example]:
-    """Return the graph of clusters of each room.
+) -> list[Clusters]:
+    """Return the clusters of each room.
 
     Args:
         rooms: arrays on disk.
-        superpoints: their graphs of superpoints.
+        examples: their graphs of superpoints.
         models: for each room what partitions it; networks that were trained on a room make other clusters there than
             elsewhere, so that it is one that was not.
         cache: folder with the fused surfaces.
         processes: at work at once.
     """
-    jobs = [(*job, cache) for job in zip(rooms, superpoints, models, strict=True)]
+    found = _each(_clusters, [(*job, cache) for job in zip(rooms, examples, models, strict=True)], processes)
+    return [Clusters(room, example, *values) for room, example, values in zip(rooms, examples, found)]
+
+
+def proposals_of(
+    found: Sequence[Clusters], trees: Sequence[Boosted], cache: Path, processes: int
+) -> list[RoomProposals]:
+    """Return the proposals of each room by trees for pairs that were not fitted to it."""
+    rows = _each(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
+    return [RoomProposals(*values, c.pieces.graph.region, c.example) for values, c in zip(rows, found)]
+
+
+def _each(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
     if processes == 1:
-        return [_made(job) for job in jobs]
+        return [work(job) for job in jobs]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_alone) as pool:
-        return list(pool.map(_made, jobs))
+        return list(pool.map(work, jobs))
 
 
 def _alone() -> None:
@@ -51,14 +113,24 @@ def _alone() -> None:
     torch.set_num_threads(1)
 
 
-def _made(job: Job) -> Example:
+def _clusters(job: tuple[Room, Example, Ensemble, Path]) -> tuple[Scores, np.ndarray, ClusterGraph]:
     room, example, model, cache = job
     view = room_view(room, cache)
     scores = model.scores(example.nodes, example.edges, example.pairs)
     label, cluster = partition_with_labels(example.pairs, scores.affinity, scores.label)
-    pieces = cluster_graph(view, region_graph(view.mesh), scores, label, cluster)
-    centers = Shapes.of(view.mesh, pieces.graph).center
-    return replace(
-        example, nodes=pieces.nodes, edges=pieces.edges, pairs=pieces.graph.pairs, region=pieces.graph.region,
-        centers=centers.astype(example.centers.dtype),
-    )  # fmt: skip
+    return scores, label, cluster_graph(view, region_graph(view.mesh), scores, label, cluster)
+
+
+def _proposals(job: tuple[Clusters, Boosted, Path]) -> tuple[csr_matrix, np.ndarray, np.ndarray]:
+    found, trees, cache = job
+    view = room_view(found.room, cache)
+    odds = trees(found.pieces.pair_rows())
+    proposals = propose(view, found.pieces, odds)
+    rows = proposal_features(
+        view, region_graph(view.mesh), found.scores, found.label, found.pieces, odds, proposals
+    )
+    e, inside = found.example, proposals.members @ found.table()
+    whole = np.bincount(e.true_ids, weights=np.maximum(e.areas, _TINY), minlength=len(e.pixels))
+    iou = inside / np.maximum(inside.sum(axis=1)[:, None] + whole - inside, _TINY)
+    best = iou[:, int(e.base_entities) + 1 :].max(axis=1, initial=0.0)
+    return proposals.members, rows, best

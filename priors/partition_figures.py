@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import rankdata
 
+from priors.partition_clusters import RoomProposals
 from priors.partition_rooms import Example, cached, frames_and_depth, fused
 from priors.partition_ruler import NOTHING, compare
 from priors.samples import Room
@@ -13,9 +14,11 @@ from reconstruction.instances.partition.cut import clusters_of_things
 from reconstruction.instances.partition.graph import LABELS, Scores
 from reconstruction.instances.partition.model import Ensemble
 from reconstruction.instances.partition.multicut import partition_with_labels
+from reconstruction.instances.partition.proposals import best_disjoint
 from reconstruction.progress import NO_PROGRESS
 
-_SHIFTS = tuple(0.25 * k for k in range(-10, 9))  # log-odds
+_LEAST = tuple(0.025 * k for k in range(6, 17))  # IoU
+_HITS = (0.25, 0.5)
 
 
 def figures_of(model: Ensemble, rooms: list[Example]) -> dict[str, float]:
@@ -38,21 +41,40 @@ def partitioned(room: Example, scores: Scores) -> np.ndarray:
     return number[cluster]
 
 
-def best_shift(model: Ensemble, rooms: list[Example]) -> float:
-    """Return the bias of the affinities' log-odds under which the cut of whole rooms is best, on rooms trained on.
+def proposal_figures(rooms: list[RoomProposals], said: list[np.ndarray], least: float) -> dict[str, float]:
+    """Return figures of the things chosen from proposals by their estimated IoU, and of the best choice there is."""
+    out = things_figures([r.example for r in rooms], [chosen(r, iou - least) for r, iou in zip(rooms, said)])
+    best = things_figures([r.example for r in rooms], [chosen(r, _worth(r.best_iou)) for r in rooms])
+    error = np.concatenate([iou - room.best_iou for room, iou in zip(rooms, said)])
+    out |= {f"by_truth_{name}": value for name, value in best.items()}
+    return out | {"iou_error": round(float(np.sqrt(np.mean(error**2))), 4)}
 
-    Scores of neighboring borders hang together, which a sum of log-odds does not know: probabilities that are right for
-    single borders are not the best weights of a multicut. Best is the mean of F1 at .25 and recall at .5.
-    """
-    scores = [model.scores(room.nodes, room.edges, room.pairs) for room in rooms]
 
-    def merit(shift: float) -> float:
-        found = [partitioned(room, Scores(s.affinity + shift, s.label)) for room, s in zip(rooms, scores)]
-        figures = things_figures(rooms, found)
+def _worth(iou: np.ndarray) -> np.ndarray:
+    return np.where(iou >= _HITS[0], 1.0 + (iou >= _HITS[1]) + 0.01 * iou, 0.0)
+
+
+def chosen(room: RoomProposals, gain: np.ndarray) -> np.ndarray:
+    """Return the thing int (v,) of each vertex by the best disjoint proposals, 0 = none or too small."""
+    members = room.members[best_disjoint(room.members, gain)]
+    number = np.zeros(room.members.shape[1] + 1, np.int64)
+    number[members.indices] = 1 + np.repeat(np.arange(members.shape[0]), np.diff(members.indptr))
+    thing = number[np.minimum(room.region, room.members.shape[1])]
+    area = np.bincount(thing, weights=room.example.areas)
+    config = InstancesConfig()
+    kept = (area >= config.min_object_area_m2) & (np.bincount(thing) >= config.min_object_vertices)
+    return np.where(kept[thing], thing, 0)
+
+
+def best_least(rooms: list[RoomProposals], said: list[np.ndarray]) -> float:
+    """Return the least IoU under which the choice is best: the mean of F1 at .25 and recall at .5."""
+
+    def merit(least: float) -> float:
+        figures = proposal_figures(rooms, said, least)
         recall, precision = figures["recall_25"], figures["precision_25"]
         return 2 * recall * precision / max(recall + precision, 1e-9) + figures["recall_50"]
 
-    return max(_SHIFTS, key=merit)
+    return max(_LEAST, key=merit)
 
 
 def by_truth(room: Example) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json
 
+import lightgbm
 import numpy as np
 import pytest
 import torch
@@ -11,8 +12,9 @@ from priors.partition_figures import area_under_curve, by_truth
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, example
 from priors.partition_ruler import Figures, compare
+from priors.partition_trees import PAIRS, arrays_of
 from priors.samples import open_rooms
-from reconstruction.instances.partition.model import FEATURES, load_models
+from reconstruction.instances.partition.model import FEATURES, TREES, load_models
 
 FRAMES = 6
 
@@ -96,33 +98,53 @@ def graph_of(rng, features):
     pairs = np.unique(np.sort(rng.integers(0, 29, (60, 2)), axis=1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     nodes, edges = (
-        rng.normal(size=(count, len(names))).astype(np.float32)
-        for count, names in zip((30, len(pairs)), features)
+        rng.normal(size=(count, width)).astype(np.float32) for count, width in zip((30, len(pairs)), features)
     )
     return nodes, edges, pairs
 
 
+def stumps(features, rng):
+    """Trees for random rows, and LightGBM's own prediction of other ones."""
+    rows = rng.normal(size=(400, features)).astype(np.float32)
+    target = (rows[:, 0] + rows[:, 1] * rows[:, 2] > 0).astype(float)
+    booster = lightgbm.train(PAIRS | {"min_data_in_leaf": 5, "seed": 0}, lightgbm.Dataset(rows, target), 20)
+    return arrays_of(booster.dump_model()), booster
+
+
 def test_numpy_says_what_pytorch_says(tmp_path):
     torch.manual_seed(0)
-    networks = {
-        name: [Network(tuple(map(len, features)), 16, 2) for _ in range(2)]
-        for name, features in zip(("superpoints", "clusters"), FEATURES)
-    }
-    partition.export(networks, tmp_path / "w.safetensors")
-    rng, models = np.random.default_rng(0), load_models(tmp_path / "w.safetensors")
-    for (name, members), features in zip(networks.items(), FEATURES):
-        nodes, edges, pairs = graph_of(rng, features)
-        with torch.no_grad():
-            # layers are float16 in the file
-            said = [n.half().float()(*(torch.from_numpy(x) for x in (nodes, edges, pairs))) for n in members]
-        scores = getattr(models, name).scores(nodes, edges, pairs)
-        affinity, label = (torch.stack(values).mean(dim=0) for values in zip(*said))
-        np.testing.assert_allclose(scores.affinity, affinity.numpy(), atol=1e-4)
-        np.testing.assert_allclose(scores.label, label.log_softmax(dim=1).numpy(), atol=1e-4)
+    networks = [Network(FEATURES, 16, 2) for _ in range(2)]
+    rng = np.random.default_rng(0)
+    trees = {name: stumps(count, rng)[0] for name, count in TREES.items()}
+    partition.export(networks, trees, 0.25, tmp_path / "w.safetensors")
+    models = load_models(tmp_path / "w.safetensors")
+    assert models.least_iou == 0.25
+    nodes, edges, pairs = graph_of(rng, FEATURES)
+    with torch.no_grad():
+        # layers are float16 in the file
+        said = [n.half().float()(*(torch.from_numpy(x) for x in (nodes, edges, pairs))) for n in networks]
+    scores = models.superpoints.scores(nodes, edges, pairs)
+    affinity, label = (torch.stack(values).mean(dim=0) for values in zip(*said))
+    np.testing.assert_allclose(scores.affinity, affinity.numpy(), atol=1e-4)
+    np.testing.assert_allclose(scores.label, label.log_softmax(dim=1).numpy(), atol=1e-4)
+
+
+def test_trees_say_what_lightgbm_says():
+    rng = np.random.default_rng(1)
+    trees, booster = stumps(12, rng)
+    rows = rng.normal(size=(500, 12)).astype(np.float32)
+    rows[:50, 0] = trees.threshold[0]  # at a threshold
+    np.testing.assert_allclose(trees(rows), booster.predict(rows, raw_score=True), atol=1e-5)
+    assert np.ptp(trees(rows)) > 1
+    with pytest.raises(ValueError, match="12 features got 11"):
+        trees(rows[:, 1:])
+    alone = lightgbm.train(PAIRS, lightgbm.Dataset(rows[:50], np.r_[np.zeros(25), np.ones(25)]), 3)
+    constant = arrays_of(alone.dump_model())  # too few rows for any node
+    np.testing.assert_allclose(constant(rows), alone.predict(rows, raw_score=True), atol=1e-6)
 
 
 def test_training_learns_writes_weights_and_says_figures(data, tmp_path):
-    arguments = [str(data), "--out", str(tmp_path), "--cache", str(data / "cache")]
+    arguments = [str(data), "--out", str(tmp_path), "--cache", str(data / "cache"), "--rounds", "20"]
     assert partition.main([*arguments, "--steps", "1"]) == 0
     early = json.loads((tmp_path / "figures.json").read_text())["train, superpoints"]
     assert partition.main([*arguments, "--steps", "150"]) == 0
@@ -130,10 +152,13 @@ def test_training_learns_writes_weights_and_says_figures(data, tmp_path):
     assert late["train, superpoints"]["log_loss"] < 0.8 * early["log_loss"]
     assert late["train, superpoints"]["auc"] > 0.7
     wanted = {"asa", "auc", "recall_25", "precision_25", "recall_50", "by_truth_recall_25"}
-    assert wanted <= set(late["shapes, clusters"])
+    assert wanted <= set(late["shapes, superpoints"])
+    assert wanted - {"asa", "auc"} <= set(late["shapes, things"])
+    assert late["shapes, things"]["recall_25"] <= late["shapes, things"]["by_truth_recall_25"]
     models = load_models(tmp_path / "partition.safetensors")
     assert len(models.superpoints.members) > 1
-    assert len(models.clusters.members) > 1
+    assert len(models.pairs.first_leaf) == len(models.proposals.first_leaf) == 20
+    assert 0 < models.least_iou < 1
 
 
 def test_noise_on_features_keeps_their_means(graph):

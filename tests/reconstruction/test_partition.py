@@ -14,6 +14,7 @@ from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition import multicut as solver
 from reconstruction.instances.partition.features import (
     EDGE_FEATURES,
+    NODE_FEATURES,
     Shapes,
     Together,
     View,
@@ -108,6 +109,35 @@ def room(*solids):
 @pytest.fixture(scope="module")
 def toy_room():
     return room(TABLE, TOY)
+
+
+def measured(view):
+    graph = region_graph(view.mesh)
+    return node_features(view, graph, Shapes.of(view.mesh, graph), Together.of(view, graph))
+
+
+def test_features_of_regions_do_not_grow_with_the_number_of_keyframes(toy_room):
+    view = toy_room[-1]
+    surface = replace(view.surface, weights=2 * np.asarray(view.surface.weights))
+    longer = View.of(view.mesh, surface, [frame for frame in view.frames for _ in range(2)])
+    np.testing.assert_allclose(measured(longer), measured(view), atol=1e-5)
+
+
+def test_the_sheet_of_a_region_is_the_whole_flat_side_that_it_is_a_part_of(toy_room):
+    view = toy_room[-1]
+    nodes = measured(view)
+    column = {name: nodes[:, k] for k, name in enumerate(NODE_FEATURES)}
+    top = (column["normal_z"] > 0.95) & (np.abs(column["height"] - 0.3) < 0.02) & (column["log_area"] > -8)
+    assert top.sum() > 20
+    assert np.median(column["sheet_length"][top]) > 0.6  # the table's top, its regions are 6 cm
+    assert np.median(column["sheet_top"][top]) == pytest.approx(0.3, abs=0.02)
+    side = (np.abs(column["normal_z"]) < 0.1) & (column["height"] > 0.33) & (column["log_area"] > -8)
+    assert side.sum() > 0
+    assert np.median(column["sheet_foot"][side]) == pytest.approx(
+        0.3, abs=0.03
+    )  # of the toy, not of the table
+    assert np.median(column["sheet_length"][side]) < 0.2
+    assert (column["sheet_log_area"] >= column["log_area"] - 1e-4).all()
 
 
 def test_borders_are_concave_where_things_touch_and_convex_around_them(toy_room):

@@ -1,11 +1,14 @@
 """Graphs of clusters: pieces of one thing that do not touch, and features that only whole pieces have."""
 
+import itertools
+
 import numpy as np
 import pytest
 from fused_surfaces import box, fused
 from surfaces import frames_of, with_planes
 
 from reconstruction.instances.cut import Shell
+from reconstruction.instances.partition import clusters
 from reconstruction.instances.partition.clusters import (
     CLUSTER_FEATURES,
     PAIR_FEATURES,
@@ -17,6 +20,8 @@ from reconstruction.instances.partition.cut import partition_surface
 from reconstruction.instances.partition.features import View
 from reconstruction.instances.partition.graph import LABELS, Scores, region_graph
 from reconstruction.instances.partition.model import load_models
+from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES, proposal_features
+from reconstruction.instances.partition.proposals import propose
 from reconstruction.instances.sightings import sightings
 from reconstruction.progress import NO_PROGRESS
 
@@ -96,6 +101,22 @@ def test_summed_odds_are_those_of_the_borders_between_two_clusters(boards):
     assert checked >= 3
 
 
+def test_small_clusters_are_compared_with_near_ones_only():
+    """Pairs grow with the number of clusters, not with its square."""
+    box = np.random.default_rng(0).uniform(0, 2, (300, 1, 3)) + np.array([[0.0], [0.01]])
+    box[0] = [[0, 0, 0], [2, 2, 0.1]]
+    size = np.linalg.norm(box[:, 1] - box[:, 0], axis=1)
+    found = {(a, b): reach for a, b, reach in clusters._boxes_in_reach(box, size)}
+    for a, b in itertools.combinations(range(300), 2):
+        gap = np.linalg.norm(np.maximum(np.maximum(box[a, 0] - box[b, 1], box[b, 0] - box[a, 1]), 0))
+        assert ((a, b) in found) == (gap < max(0.02, min(size[a], size[b])))
+    pairs = np.array(list(itertools.combinations(range(30), 2)))
+    kept = clusters._among_nearest(pairs, np.abs(pairs[:, 0] - pairs[:, 1]).astype(float))
+    away = np.abs(pairs[:, 0] - pairs[:, 1])
+    assert kept[away <= clusters.NEAREST // 2].all()
+    assert not kept[away > clusters.NEAREST].any()
+
+
 def test_features_of_pairs_do_not_depend_on_the_order_of_clusters(boards):
     view, graph, label, cluster = boards
     turned = np.where(label == THING, 4 - cluster, 0)
@@ -110,8 +131,13 @@ def test_nothing_but_base_has_no_clusters(boards):
     pieces = pieces_of((view, graph, np.full_like(label, BASE), np.zeros_like(label)))
     assert pieces.graph.count == 1
     assert pieces.edges.shape == (0, len(PAIR_FEATURES))
-    scores = load_models().clusters.scores(pieces.nodes, pieces.edges, pieces.graph.pairs)
-    assert scores.label.shape == (1, len(LABELS))
+    odds = load_models().pairs(pieces.pair_rows())
+    assert odds.shape == (0,)
+    proposals = propose(view, pieces, odds)
+    assert proposals.members.shape == (0, 0)
+    scores = Scores(np.zeros(len(graph.pairs), np.float32), np.zeros((graph.count, len(LABELS)), np.float32))
+    rows = proposal_features(view, graph, scores, np.full_like(label, BASE), pieces, odds, proposals)
+    assert rows.shape == (0, len(PROPOSAL_FEATURES))
 
 
 def test_each_cluster_of_the_cut_has_one_label(boards):

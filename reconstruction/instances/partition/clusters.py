@@ -5,6 +5,7 @@ of things as nodes, joined within a reach, and features that only whole pieces h
 features: Nunez-Iglesias et al., Machine learning of hierarchical clustering, PLoS ONE 2013).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,10 @@ from reconstruction.instances.partition.features import (
 )
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, Scores, graph_of_links
 
-REACH_M = 0.25  # clusters this near to each other are compared
+REACH_M = 0.25  # clusters this near to each other are compared,
+REACH_OF_SIZE = 1.0  # if the smaller one is no smaller than the gap,
+NEAREST = 8  # and one of both is among so many that are nearest to the other
+_TOUCHING_M = 0.02  # clusters this near to each other are always compared
 LEAST_AREA_M2 = 2e-4  # smaller clusters are dropped
 CLUSTER_FEATURES = (
     *NODE_FEATURES, "log_thing", "log_base", "log_artifact", "log_regions", "border_base", "border_artifact",
@@ -51,6 +55,11 @@ class ClusterGraph:
     things: int  # regions that are clusters of things
     nodes: np.ndarray  # float32 (n, len(CLUSTER_FEATURES))
     edges: np.ndarray  # float32 (e, len(PAIR_FEATURES))
+
+    def pair_rows(self) -> np.ndarray:
+        """Return float32 (e, F) of pairs: their own features, sums and differences of both ends' features."""
+        first, second = (self.nodes[ends] for ends in self.graph.pairs.T)
+        return np.concatenate([self.edges, first + second, np.abs(first - second)], axis=1)
 
 
 def cluster_graph(
@@ -130,24 +139,44 @@ def _hull(points: np.ndarray) -> tuple[float, np.ndarray | None]:
 
 
 def _near_pairs(view: View, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pairs of nodes within reach (e, 2), their nearest vertices (e, 2), and the gaps, metres."""
+    """Return pairs of nodes that are compared (e, 2), their nearest vertices (e, 2), and the gaps, metres."""
+    size = np.linalg.norm(pieces.box[:, 1] - pieces.box[:, 0], axis=1)
     pairs, ends, gaps = [], [], []
-    apart = np.maximum(
-        pieces.box[:, None, 0] - pieces.box[None, :, 1], pieces.box[None, :, 0] - pieces.box[:, None, 1]
-    )
-    near = np.linalg.norm(np.maximum(apart, 0.0), axis=2) < REACH_M
-    for a, b in np.argwhere(np.triu(near, 1)).tolist():
+    for a, b, reach in _boxes_in_reach(pieces.box, size):
         small, large = (a, b) if len(pieces.all_vertices[a]) <= len(pieces.all_vertices[b]) else (b, a)
-        distance, found = pieces.trees[large].query(view.mesh.points[pieces.all_vertices[small]])
+        points = view.mesh.points[pieces.all_vertices[small]]
+        distance, found = pieces.trees[large].query(points, distance_upper_bound=reach)
         row = int(np.argmin(distance))
-        if distance[row] < REACH_M:
+        if distance[row] < reach:
             pairs.append((a, b))
             p, q = pieces.all_vertices[small][row], pieces.all_vertices[large][found[row]]
             ends.append((p, q) if small == a else (q, p))
             gaps.append(distance[row])
-    return (
+    pairs, ends, gaps = (
         np.array(pairs, np.int64).reshape(-1, 2), np.array(ends, np.int64).reshape(-1, 2), np.array(gaps, float)
     )  # fmt: skip
+    kept = (gaps < _TOUCHING_M) | _among_nearest(pairs, gaps)
+    return pairs[kept], ends[kept], gaps[kept]
+
+
+def _boxes_in_reach(box: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, int, float]]:
+    """Yield pairs of boxes float (n, 2, 3) that are within reach of each other, and the reach, metres."""
+    reach = np.clip(REACH_OF_SIZE * size, _TOUCHING_M, REACH_M)
+    for a in range(len(box)):
+        apart = np.maximum(box[a, 0] - box[a + 1 :, 1], box[a + 1 :, 0] - box[a, 1])
+        allowed = np.minimum(reach[a], reach[a + 1 :])
+        for k in np.flatnonzero(np.linalg.norm(np.maximum(apart, 0.0), axis=1) < allowed):
+            yield a, a + 1 + int(k), float(allowed[k])
+
+
+def _among_nearest(pairs: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+    """Return which pairs (e, 2) have an end that is among the `NEAREST` of the other end."""
+    ends, row = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
+    order = np.lexsort((row, gaps[row], ends))
+    first = np.searchsorted(ends[order], ends[order])
+    out = np.zeros(len(pairs), bool)
+    out[row[order[np.arange(len(order)) - first < NEAREST]]] = True
+    return out
 
 
 def _joined(

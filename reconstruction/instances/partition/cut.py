@@ -1,16 +1,20 @@
 """The learned cut: superpoints are scored, partitioned once, and read off as base, things and artifacts."""
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.special import expit
 
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.mask_cut import mark_attached
-from reconstruction.instances.partition.clusters import cluster_graph
+from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
 from reconstruction.instances.partition.features import Shapes, Together, View, edge_features, node_features
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, region_graph
 from reconstruction.instances.partition.model import Models, load_models
 from reconstruction.instances.partition.multicut import partition_with_labels
+from reconstruction.instances.partition.proposal_features import proposal_features
+from reconstruction.instances.partition.proposals import best_disjoint, propose
 from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import Sighting
 from reconstruction.progress import Progress
@@ -54,18 +58,37 @@ def cut_by_partition(
 def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[np.ndarray, np.ndarray]:
     """Return the row in LABELS, and the cluster, of each vertex, int32 (v,) each.
 
-    Superpoints are partitioned into clusters, and clusters of things into things: pieces of one thing need not touch.
+    Superpoints are partitioned into clusters; of the regions that clusters can be merged into the disjoint ones with
+    the best scores are things, and what is left of the things' clusters is artifact.
     """
     scores = models.superpoints.scores(*features(view, graph), graph.pairs)
     label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
     pieces = cluster_graph(view, graph, scores, label, cluster)
-    scores = models.clusters.scores(pieces.nodes, pieces.edges, pieces.graph.pairs)
-    kind, thing = partition_with_labels(pieces.graph.pairs, scores.affinity, scores.label)
-    node = pieces.graph.region
-    left = node >= pieces.things
-    own = np.where(left, label[graph.region], kind[node])
-    number = np.where(left, thing.max() + 1 + cluster[graph.region], thing[node])
-    return own.astype(np.int32), number.astype(np.int32)
+    odds = models.pairs(pieces.pair_rows())
+    proposals = propose(view, pieces, odds)
+    rows = proposal_features(view, graph, scores, label, pieces, odds, proposals)
+    chosen = best_disjoint(proposals.members, expit(models.proposals(rows)) - models.least_iou)
+    thing = things_of(proposals.members[chosen], pieces)
+    return labels_of(thing, label[graph.region], cluster[graph.region])
+
+
+def things_of(members: csr_matrix, pieces: ClusterGraph) -> np.ndarray:
+    """Return the thing int (v,) from 1 of each vertex, 0 = none, for disjoint sets of clusters (m, n)."""
+    number = np.zeros(pieces.things + 1, np.int64)
+    number[members.indices] = 1 + np.repeat(np.arange(members.shape[0]), np.diff(members.indptr))
+    return number[pieces.graph.region]
+
+
+def labels_of(thing: np.ndarray, label: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return label and cluster of each vertex after the choice of things; cluster numbers of things come last."""
+    own = np.where(thing > 0, _THING, np.where(label == _BASE, _BASE, LABELS.index("artifact")))
+    number = np.where(thing > 0, int(cluster.max(initial=-1)) + thing, cluster)
+    return own.astype(np.int32), _one_label_each(own, number)
+
+
+def _one_label_each(label: np.ndarray, cluster: np.ndarray) -> np.ndarray:
+    """Return cluster numbers int32 (v,), counted from 0, of which each has one label."""
+    return np.unique(cluster * len(LABELS) + label, return_inverse=True)[1].astype(np.int32)
 
 
 def features(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,8 @@ Lengths are metres, gravity is -z. Every feature of a border is the same whichev
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from reconstruction.depth.mending import OFFSETS_PX
@@ -21,6 +23,7 @@ NODE_FEATURES = (
     "gap_below", "to_side", "of_height", "on_floor", "on_wall", "on_ceiling", "on_support", "wall_distance",
     "shown", "unseen", "agreed", "through", "before", "facing", "edge", "jump", "spread", "weight",
     "free_front", "free_back", "color_spread", "together_4", "together_12",
+    "sheet_log_area", "sheet_length", "sheet_top", "sheet_foot",
 )  # fmt: skip
 EDGE_FEATURES = (
     "touching", "gap", "log_border", "border_share", "concavity", "concavity_low", "angle", "convexity",
@@ -30,6 +33,8 @@ EDGE_FEATURES = (
 )  # fmt: skip
 _BELOW_REACH_M, _BELOW_STEP_M, _UP = 0.08, 0.01, 0.7
 _FREE_REACH_M = 0.04
+_USUAL_FRAMES = 36.0  # counts of keyframes are features as if there were so many
+_SHEET_COSINE, _SHEET_STEP_M = 0.97, 0.012  # neighbors of nearly one direction and plane are of one sheet
 _CHORD_CAP_M = 0.05
 _TINY = 1e-9
 _LOG_ODDS = np.log((np.arange(256) + 1.0) / (256.0 - np.arange(256)))
@@ -133,10 +138,13 @@ def node_features(view: View, graph: RegionGraph, shapes: Shapes, together: Toge
     """Return float32 (n, len(NODE_FEATURES)) for the regions of a graph."""
     mesh, evidence = view.mesh, view.evidence
     weight = np.maximum(mesh.areas, _TINY)
+    shown = _USUAL_FRAMES / max(len(view.frames), 1) * evidence.shown
+    support = np.asarray(view.surface.weights, np.float64)
+    usual = max(float(np.median(support)), 1.0) if len(support) else 1.0
     seen = np.stack(
-        [np.log1p(evidence.shown), evidence.shown == 0, evidence.agreed, evidence.through, evidence.before,
+        [np.log1p(shown), evidence.shown == 0, evidence.agreed, evidence.through, evidence.before,
          evidence.facing, np.log1p(evidence.edge), evidence.jump_m, np.log1p(evidence.spread),
-         np.log1p(view.surface.weights)], axis=1,
+         np.log(0.1 + support / usual)], axis=1,
     )  # fmt: skip
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     center = shapes.center
@@ -152,8 +160,26 @@ def node_features(view: View, graph: RegionGraph, shapes: Shapes, together: Toge
     planes = _means(graph, weight, _on_planes(view))
     views = _means(graph, weight, seen)
     around = _means(graph, weight, np.stack(free, axis=1).astype(np.float64))
-    parts = [own, planes, views, around, np.log1p(shapes.color_spread)[:, None], together.inside[:, 1:]]
+    parts = [own, planes, views, around, np.log1p(shapes.color_spread)[:, None], together.inside[:, 1:],
+             _sheets(mesh, graph, shapes)]  # fmt: skip
     return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def _sheets(mesh: MeshGraph, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
+    """Return (n, 4) of the connected, nearly flat sheet that each region is in: log area, length, top, foot; metres."""
+    a, b = graph.pairs[graph.touching].T
+    off = [np.abs((shapes.normal[k] * (shapes.center[b] - shapes.center[a])).sum(axis=1)) for k in (a, b)]
+    flat = ((shapes.normal[a] * shapes.normal[b]).sum(axis=1) > _SHEET_COSINE) & (
+        np.maximum(*off) < _SHEET_STEP_M
+    )
+    links = csr_matrix((np.ones(flat.sum()), (a[flat], b[flat])), shape=(graph.count, graph.count))
+    count, sheet = connected_components(links, directed=False)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, sheet[graph.region], mesh.points)
+    np.maximum.at(high, sheet[graph.region], mesh.points)
+    area = np.bincount(sheet, weights=shapes.area, minlength=count)
+    length = np.linalg.norm((high - low)[:, :2], axis=1)
+    return np.column_stack([np.log(area), length, high[:, 2], low[:, 2]])[sheet]
 
 
 def edge_features(view: View, graph: RegionGraph, shapes: Shapes, together: Together) -> np.ndarray:

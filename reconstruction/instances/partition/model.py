@@ -1,4 +1,4 @@
-"""The network that scores borders and regions, run with NumPy: features in, log-odds and log-probabilities out.
+"""The learned models of the cut. A network scores borders and regions: features in, log-odds and probabilities out.
 
 Features of regions and borders are embedded; in each round every region receives the mean and the maximum of messages
 from its neighbors (Battaglia et al., Relational inductive biases, deep learning, and graph networks, 2018). All layers
@@ -11,13 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import CLUSTER_FEATURES, PAIR_FEATURES
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
 from reconstruction.instances.partition.graph import Scores
+from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES
 from registry.errors import EnvironmentMissing
 
 WEIGHTS = Path(__file__).parent / "weights" / "partition.safetensors"
-FEATURES = ((NODE_FEATURES, EDGE_FEATURES), (CLUSTER_FEATURES, PAIR_FEATURES))  # of superpoints, of clusters
+FEATURES = (len(NODE_FEATURES), len(EDGE_FEATURES))  # of superpoints and of their borders
+TREES = {"pairs": len(PAIR_FEATURES) + 2 * len(CLUSTER_FEATURES), "proposals": len(PROPOSAL_FEATURES)}
 CLIP = 5.0  # standard deviations beyond which features are cut off
 
 
@@ -36,7 +39,7 @@ class Model:
         """Score a graph.
 
         Args:
-            nodes: float32 (n, F) features of regions, those of `FEATURES` that the weights are for.
+            nodes: float32 (n, F) features of regions.
             edges: float32 (e, G) features of their borders.
             pairs: int (e, 2) regions on both sides, rows sorted.
         """
@@ -109,12 +112,14 @@ class Models:
     """What the learned cut is made of."""
 
     superpoints: Ensemble  # scores the graph of superpoints
-    clusters: Ensemble  # scores the graph of their clusters
+    pairs: Boosted  # log-odds that two clusters are pieces of one thing
+    proposals: Boosted  # log-odds whose logistic is the IoU of a proposal and a thing
+    least_iou: float  # what a proposal has to be better than to be a thing
 
 
 @lru_cache(maxsize=2)
 def load_models(weights: Path = WEIGHTS) -> Models:
-    """Read the weights, named `<superpoints or clusters>.<member>.<name>`.
+    """Read the weights, named `superpoints.<member>.<name>`, `<pairs or proposals>.<array>`, and `least_iou`.
 
     Raises:
         EnvironmentMissing: the file is not there or is not what this version reads.
@@ -122,18 +127,28 @@ def load_models(weights: Path = WEIGHTS) -> Models:
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
-    members: dict[str, dict[str, dict[str, np.ndarray]]] = {"superpoints": {}, "clusters": {}}
     try:
-        for name, value in load_file(weights).items():
-            graph, member, own = name.split(".", 2)
-            members[graph].setdefault(member, {})[own] = value.astype(np.float32)
-        for (graph, found), (nodes, edges) in zip(members.items(), FEATURES):
-            shapes = {(len(w["node_mean"]), len(w["edge_mean"])) for w in found.values()}
-            if shapes != {(len(nodes), len(edges))}:
-                raise KeyError(f"{graph}: made for {shapes or 'no'} features")
+        stored = load_file(weights)
+        members: dict[str, dict[str, np.ndarray]] = {}
+        for name, value in _under(stored, "superpoints").items():
+            member, own = name.split(".", 1)
+            members.setdefault(member, {})[own] = value.astype(np.float32)
+        shapes = {(len(w["node_mean"]), len(w["edge_mean"])) for w in members.values()}
+        if shapes != {FEATURES}:
+            raise KeyError(f"superpoints: made for {shapes or 'no'} features")
+        trees = {name: Boosted.named(_under(stored, name)) for name in TREES}
+        for name, wanted in TREES.items():
+            if int(trees[name].features) != wanted:
+                raise KeyError(f"{name}: made for {int(trees[name].features)} features")
+        least = float(stored["least_iou"][0])
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise EnvironmentMissing(
             f"instances: the weights {weights} cannot be read ({error}). Install the package again, or use "
             "--set instances.cut=rules."
         ) from error
-    return Models(*(Ensemble(tuple(Model(found[k]) for k in sorted(found))) for found in members.values()))
+    superpoints = Ensemble(tuple(Model(members[k]) for k in sorted(members)))
+    return Models(superpoints, trees["pairs"], trees["proposals"], least)
+
+
+def _under(stored: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    return {name[len(prefix) + 1 :]: value for name, value in stored.items() if name.startswith(f"{prefix}.")}

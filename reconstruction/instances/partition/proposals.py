@@ -1,0 +1,150 @@
+"""Proposals of whole things: regions of merge trees of clusters, and the best choice of disjoint ones.
+
+A sum of pairwise scores cannot tell a whole thing from a part of it. So regions of many sizes are proposed by
+hierarchical merging, each is scored as a whole, and the disjoint ones with the greatest total score are chosen
+(Arbelaez et al., Multiscale combinatorial grouping, CVPR 2014; Endres and Hoiem, Category independent object
+proposals, ECCV 2010).
+"""
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import csr_matrix
+
+from reconstruction.instances.partition.clusters import ClusterGraph
+from reconstruction.instances.partition.features import View
+
+LARGEST_M = 4.0  # diagonal of a thing
+LEAST_AREA_M2 = 0.002  # smaller regions are not proposed
+ALIKE = 1.03  # regions that grow by less until the next one are left out
+_CLIP_ODDS = 20.0
+_TIME_S = 20.0  # for the choice; the best that was found until then is taken
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """Regions of clusters."""
+
+    members: csr_matrix  # float64 (m, n) 1 = the cluster is in the proposal
+    low: np.ndarray  # float64 (m, 3) least coordinates, metres
+    high: np.ndarray  # float64 (m, 3) greatest coordinates
+
+
+def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
+    """Return the regions of two merge trees: by the summed, and by the mean log-odds of pairs.
+
+    Args:
+        view: the surface.
+        pieces: clusters on it, and pairs of them.
+        odds: float (e,) log-odds that both clusters of a pair are one thing.
+    """
+    count, region = pieces.things, pieces.graph.region
+    area = np.bincount(region, weights=view.mesh.areas, minlength=count + 1)[:count]
+    pairs = pieces.graph.pairs.astype(np.int64)
+    odds = np.clip(odds.astype(np.float64), -_CLIP_ODDS, _CLIP_ODDS)
+    found = {frozenset([k]) for k in range(count)}
+    for linkage in (_total, _mean):
+        found |= set(_merged(area, pairs, odds, linkage))
+    regions = sorted(sorted(members) for members in found)
+    members = members_of(regions, count)
+    inside = region < count
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, region[inside], view.mesh.points[inside])
+    np.maximum.at(high, region[inside], view.mesh.points[inside])
+    if not regions:
+        return Proposals(members, low, high)
+    starts = members.indptr[:-1]
+    low = np.minimum.reduceat(low[members.indices], starts, axis=0)
+    high = np.maximum.reduceat(high[members.indices], starts, axis=0)
+    kept = (np.linalg.norm(high - low, axis=1) < LARGEST_M) & (members @ area >= LEAST_AREA_M2)
+    return Proposals(members[kept], low[kept], high[kept])
+
+
+def members_of(regions: list[list[int]], count: int) -> csr_matrix:
+    """Return regions, lists of clusters, as the rows of a matrix (m, count)."""
+    starts = np.cumsum([0, *(len(r) for r in regions)])
+    every = np.array([k for r in regions for k in r], np.int64)
+    return csr_matrix((np.ones(len(every)), every, starts), shape=(len(regions), count))
+
+
+Link = tuple[float, int]  # sum and number of the log-odds between two regions
+
+
+def _total(link: Link) -> float:
+    return link[0]
+
+
+def _mean(link: Link) -> float:
+    return link[0] / link[1]
+
+
+def _merged(
+    area: np.ndarray, pairs: np.ndarray, odds: np.ndarray, linkage: Callable[[Link], float]
+) -> list[frozenset[int]]:
+    """Return the regions of one merge tree, without those that the next region is hardly larger than."""
+    around: list[dict[int, Link]] = [{} for _ in area]
+    for (a, b), value in zip(pairs.tolist(), odds.tolist()):
+        around[a][b] = around[b][a] = (value, 1)
+    heap = [(-linkage(link), a, b) for a, links in enumerate(around) for b, link in links.items() if a < b]
+    heapq.heapify(heap)
+    members = [frozenset([k]) for k in range(len(area))]
+    size, since = area.tolist(), area.tolist()  # area now, and of the last region that was kept
+    alive, dropped = [True] * len(area), set()
+    while heap:
+        value, a, b = heapq.heappop(heap)
+        if not (alive[a] and alive[b]) or -linkage(around[a][b]) != value:
+            continue
+        new = len(members)
+        members.append(members[a] | members[b])
+        links: dict[int, Link] = {}
+        for old in (a, b):
+            alive[old] = False
+            for other, (total, number) in around[old].items():
+                if alive[other]:
+                    before = links.get(other, (0.0, 0))
+                    links[other] = (before[0] + total, before[1] + number)
+        large = a if size[a] >= size[b] else b
+        size.append(size[a] + size[b])
+        alike = size[new] < ALIKE * since[large]
+        since.append(since[large] if alike else size[new])
+        if alike:
+            dropped.add(large)
+        alive.append(True)
+        around.append(links)
+        for other, link in links.items():
+            around[other][new] = link
+            heapq.heappush(heap, (-linkage(link), other, new))
+    return [m for k, m in enumerate(members) if k >= len(area) and k not in dropped]
+
+
+def best_disjoint(members: csr_matrix, gain: np.ndarray) -> np.ndarray:
+    """Return the rows of the disjoint proposals with the greatest total gain (weighted set packing, exactly).
+
+    Args:
+        members: (m, n) 1 = the cluster is in the proposal.
+        gain: float (m,) of each; those without any are never chosen.
+    """
+    rows = np.flatnonzero(gain > 0)
+    if not len(rows):
+        return rows
+    once = LinearConstraint(members[rows].T.tocsr(), -np.inf, 1)
+    found = milp(
+        -gain[rows], constraints=once, bounds=Bounds(0, 1), integrality=np.ones(len(rows)),
+        options={"time_limit": _TIME_S},
+    )  # fmt: skip
+    if found.x is None:  # out of time without any choice: the best one by one
+        return _greedy(members, gain, rows)
+    return rows[found.x > 0.5]
+
+
+def _greedy(members: csr_matrix, gain: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    taken, out = np.zeros(members.shape[1], bool), []
+    for row in rows[np.argsort(-gain[rows], kind="stable")].tolist():
+        own = members.indices[members.indptr[row] : members.indptr[row + 1]]
+        if not taken[own].any():
+            taken[own] = True
+            out.append(row)
+    return np.sort(np.array(out, np.int64))

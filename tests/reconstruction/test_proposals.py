@@ -1,0 +1,122 @@
+"""Proposals of whole things: merge trees, their features, and the best choice of disjoint regions."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_partition_clusters import BASE, LEFT, RIGHT, THING, boards, pieces_of  # noqa: F401
+
+from reconstruction.instances.partition import proposals as trees
+from reconstruction.instances.partition.cut import labels_of, things_of
+from reconstruction.instances.partition.graph import LABELS, Scores
+from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES, proposal_features
+from reconstruction.instances.partition.proposals import best_disjoint, members_of, propose
+
+
+def test_the_choice_is_as_good_as_trying_all():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        regions = [sorted(rng.choice(6, rng.integers(1, 4), replace=False).tolist()) for _ in range(9)]
+        gain = rng.normal(0.1, 0.5, 9)
+        chosen = best_disjoint(members_of(regions, 6), gain)
+        taken = [k for row in chosen for k in regions[row]]
+        assert len(taken) == len(set(taken))
+        best = 0.0
+        for size in range(7):
+            for rows in itertools.combinations(range(9), size):
+                used = [k for row in rows for k in regions[row]]
+                if len(used) == len(set(used)):
+                    best = max(best, gain[list(rows)].sum())
+        assert gain[chosen].sum() == pytest.approx(best)
+
+
+def test_without_time_the_best_are_taken_one_by_one():
+    regions = [[0], [1], [0, 1], [2]]
+    gain = np.array([0.5, 0.1, 0.4, 0.2])
+    chosen = trees._greedy(members_of(regions, 3), gain, np.arange(4))
+    np.testing.assert_array_equal(chosen, [0, 1, 3])
+    assert len(best_disjoint(members_of(regions, 3), -gain)) == 0
+
+
+def test_a_merge_tree_joins_what_belongs_together_first():
+    pairs, odds = np.array([[0, 1], [1, 2], [2, 3]]), np.array([3.0, -1.0, 2.0])
+    for linkage in (trees._total, trees._mean):
+        merged = trees._merged(np.ones(4), pairs, odds, linkage)
+        assert merged == [frozenset({0, 1}), frozenset({2, 3}), frozenset({0, 1, 2, 3})]
+
+
+def test_regions_that_hardly_grow_are_left_out():
+    count = 30
+    area = np.r_[1.0, np.full(count - 1, 0.01)]
+    pairs = np.stack([np.zeros(count - 1, int), np.arange(1, count)], axis=1)
+    merged = trees._merged(area, pairs, -np.arange(1.0, count), trees._total)
+    sizes = np.array([area[list(m)].sum() for m in merged])
+    assert len(merged) < count / 2
+    assert sizes[-1] == pytest.approx(area.sum())
+    assert (np.diff(np.log(sizes)) < 2 * np.log(trees.ALIKE)).all()
+
+
+def rows_of(boards, odds):  # noqa: F811
+    view, graph, label, _ = boards
+    pieces = pieces_of(boards)
+    said = np.zeros((graph.count, len(LABELS)), np.float32)
+    scores = Scores(np.zeros(len(graph.pairs), np.float32), said)
+    found = propose(view, pieces, odds)
+    return found, pieces, proposal_features(view, graph, scores, label, pieces, odds, found)
+
+
+def test_both_boards_and_their_union_are_proposed_and_described(boards):  # noqa: F811
+    view = boards[0]
+    found, pieces, rows = rows_of(boards, np.array([2.0]))
+    sets = {tuple(found.members[k].indices) for k in range(found.members.shape[0])}
+    union = next(s for s in sets if len(s) == 2)
+    assert sets == {(0,), (1,), (2,), union}
+    assert rows.shape == (4, len(PROPOSAL_FEATURES))
+    assert np.isfinite(rows).all()
+    area = np.bincount(pieces.graph.region, weights=view.mesh.areas)
+    for k in range(4):
+        said = dict(zip(PROPOSAL_FEATURES, rows[k].tolist()))
+        members = found.members[k].indices
+        assert said["log_area"] == pytest.approx(np.log(area[members].sum()), abs=1e-4)
+        points = view.mesh.points[np.isin(pieces.graph.region, members)]
+        assert said["tall"] == pytest.approx(np.ptp(points[:, 2]), abs=1e-5)
+        assert said["diagonal"] == pytest.approx(np.linalg.norm(np.ptp(points, axis=0)), abs=1e-5)
+        assert said["pixels_most"] > 0
+        shares = [said[f"contour_share_{kind}"] for kind in ("thing", "base", "artifact", "nothing")]
+        assert sum(shares) == pytest.approx(1.0, abs=1e-5)
+        assert said["contour_behind"] + said["contour_before"] + said["contour_level"] == pytest.approx(
+            1.0, abs=1e-5
+        )
+        assert said["contour_behind"] > 0.3  # the wall and the floor behind a board in the air
+        if members.tolist() == list(union):
+            assert said["in_mean"] == 2.0
+            assert said["out_mean"] == 0.0
+            assert said["hull_box"] > 0.5
+        elif members[0] in union:
+            assert said["out_mean"] == said["best_other"] == 2.0
+
+
+def test_features_follow_the_proposals_order(boards):  # noqa: F811
+    view, graph, label, _ = boards
+    found, pieces, rows = rows_of(boards, np.array([2.0]))
+    turn = np.array([2, 0, 3, 1])
+    turned = replace(found, members=found.members[turn], low=found.low[turn], high=found.high[turn])
+    scores = Scores(np.zeros(len(graph.pairs), np.float32), np.zeros((graph.count, len(LABELS)), np.float32))
+    again = proposal_features(view, graph, scores, label, pieces, np.array([2.0]), turned)
+    np.testing.assert_allclose(again, rows[turn], atol=1e-5)
+
+
+def test_things_are_the_chosen_and_what_is_left_of_clusters_is_artifact(boards):  # noqa: F811
+    _, graph, label, cluster = boards
+    found, pieces, _ = rows_of(boards, np.array([2.0]))
+    union = [k for k in range(4) if len(found.members[k].indices) == 2]
+    thing = things_of(found.members[union], pieces)
+    assert set(np.unique(thing)) == {0, 1}
+    own, number = labels_of(thing, label[graph.region], cluster[graph.region])
+    assert len(np.unique(number[thing == 1])) == 1
+    assert (own[thing == 1] == THING).all()
+    assert (own[label[graph.region] == BASE] == BASE).all()
+    far = (thing == 0) & (label[graph.region] == THING)
+    assert far.any()
+    assert (own[far] == LABELS.index("artifact")).all()
