@@ -135,7 +135,7 @@ def test_trees_say_what_lightgbm_says():
     rows = rng.normal(size=(500, 12)).astype(np.float32)
     rows[:50, 0] = trees.threshold[0]  # at a threshold
     np.testing.assert_allclose(trees(rows), booster.predict(rows, raw_score=True), atol=1e-5)
-    assert np.ptp(trees(rows)) > 1
+    assert np.ptp(trees(rows)) > 0.5
     with pytest.raises(ValueError, match="12 features got 11"):
         trees(rows[:, 1:])
     alone = lightgbm.train(PAIRS, lightgbm.Dataset(rows[:50], np.r_[np.zeros(25), np.ones(25)]), 3)
