@@ -21,6 +21,7 @@ PROPOSALS = _COMMON | {
     "objective": "cross_entropy", "learning_rate": 0.04, "min_data_in_leaf": 60, "feature_fraction": 0.4,
     "bagging_fraction": 0.6, "lambda_l2": 5.0,
 }  # fmt: skip
+_LEAVES_OF_FEW_ROWS = 20  # at the most, where there are too few rows for leaves of the usual size
 
 
 def fit_trees(
@@ -38,7 +39,9 @@ def fit_trees(
             'Boosted trees are fitted with LightGBM: pip install "simrecon[training]"'
         ) from error
     data = lightgbm.Dataset(rows, target, weight=weight, free_raw_data=True)
-    return arrays_of(lightgbm.train(settings | {"seed": seed}, data, rounds).dump_model())
+    least = min(settings["min_data_in_leaf"], len(rows) // _LEAVES_OF_FEW_ROWS)
+    settings = settings | {"seed": seed, "min_data_in_leaf": max(least, 1)}
+    return arrays_of(lightgbm.train(settings, data, rounds).dump_model())
 
 
 def arrays_of(dumped: dict[str, Any]) -> Boosted:
