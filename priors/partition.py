@@ -1,6 +1,6 @@
 """Train the network and the boosted trees of the learned cut on rooms on disk, and measure it on rooms kept out.
 
-    python -m priors.partition DATA --out RUN [--photographs DIR] [--cache DIR] [--processes 2] [--rules]
+    python -m priors.partition DATA --out RUN [--photographs DIR] [--cache DIR] [--processes 2] [--proposals-only]
 
 Graphs with truth are made from `DATA/<split>/<number>` (see `priors.dataset`, `--keep depth`) and cached. Every fifth
 room of "train" is kept out, and so are all other splits. The network of superpoints is trained on all rooms, and on
@@ -25,10 +25,10 @@ from safetensors.torch import load_file, save_file
 from scipy.special import expit
 from torch.nn import functional
 
-from priors.partition_clusters import Clusters, RoomProposals, clusters_of, proposals_of
-from priors.partition_figures import best_least, figures_of, proposal_figures, rules_figures
+from priors.partition_clusters import Clusters, RoomProposals, clusters_of, examples_of, proposals_of
+from priors.partition_figures import best_least, figures_of, proposal_figures
 from priors.partition_network import Network
-from priors.partition_rooms import NEEDED, Example, example
+from priors.partition_rooms import NEEDED, Example
 from priors.partition_trees import PAIRS, PROPOSALS, fit_trees
 from priors.rooms import HELD_OUT
 from priors.samples import Room, open_rooms
@@ -98,6 +98,16 @@ class Targets:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Scorers:
+    """Models of superpoints and of pairs of clusters, and for each room of each split those that never saw it."""
+
+    superpoints: Ensemble
+    pairs: Boosted
+    clusters: dict[str, list[Clusters]]  # by split
+    trees: dict[str, list[Boosted]]  # by split, of pairs, one a room
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     options = _parser().parse_args(arguments)
@@ -106,46 +116,73 @@ def main(arguments: list[str] | None = None) -> int:
     cache = options.cache or options.out / "cache"
     splits = _split_rooms(options.data)
     examples = {
-        name: [example(room, cache, options.photographs) for room in rooms] for name, rooms in splits.items()
+        name: examples_of(rooms, cache, options.photographs, options.processes)
+        for name, rooms in splits.items()
     }
     print({name: len(rooms) for name, rooms in splits.items()}, flush=True)
-    fit = replace(_SUPERPOINTS, steps=options.steps or _SUPERPOINTS.steps)
-    members = partial(_members, kept=options.out / "networks", seed=options.seed)
-    networks = members(examples["train"], fit)
-    finished = _ensemble(networks)
-    halves = [examples["train"][0::2], examples["train"][1::2] or examples["train"]]
-    by_half = [_ensemble(members(half, replace(fit, members=1))) for half in halves]
-    rounds = {name: options.rounds or count for name, count in _ROUNDS.items()}
-    pairs, found = None, {}
-    for name, rooms in splits.items():  # those trained on first
-        trained = name == "train"
-        models = [by_half[1 - k % 2] if trained else finished for k in range(len(rooms))]
-        clusters = clusters_of(rooms, examples[name], models, cache, options.processes)
-        print(f"{name}: {sum(room.pieces.things for room in clusters)} clusters", flush=True)
-        if trained:
-            pairs = _fit_pairs(clusters, rounds["pairs"], options.seed)
-            half = [_fit_pairs(clusters[k::2] or clusters, rounds["pairs"], options.seed) for k in (0, 1)]
-        trees = [half[1 - k % 2] if trained else pairs for k in range(len(rooms))]
-        found[name] = proposals_of(clusters, trees, cache, options.processes)
+    scorers = (_shipped if options.proposals_only else _trained)(splits, examples, cache, options)
+    found = {}
+    for name, rooms in scorers.clusters.items():
+        print(f"{name}: {sum(room.pieces.things for room in rooms)} clusters", flush=True)
+        found[name] = proposals_of(rooms, scorers.trees[name], cache, options.processes)
         print(f"{name}: {sum(len(room.rows) for room in found[name])} proposals", flush=True)
-    proposals = _fit_proposals(found["train"], rounds["proposals"], options.seed)
+    proposals = _fit_proposals(found["train"], options.rounds or _ROUNDS["proposals"], options.seed)
     said = {name: [expit(proposals(room.rows)) for room in rooms] for name, rooms in found.items()}
     chosen_on = [name for name in found if name != "train"] or ["train"]
     least = options.least
     if least is None:
         least = best_least([r for n in chosen_on for r in found[n]], [v for n in chosen_on for v in said[n]])
     print(f"proposals of an IoU above {least} are chosen", flush=True)
-    export(networks, {"pairs": pairs, "proposals": proposals}, least, options.out / "partition.safetensors")
-    figures = {f"{name}, superpoints": figures_of(finished, rooms) for name, rooms in examples.items()}
+    trees = {"pairs": scorers.pairs, "proposals": proposals}
+    export(scorers.superpoints, trees, least, options.out / "partition.safetensors")
+    figures = {
+        f"{name}, superpoints": figures_of(scorers.superpoints, rooms) for name, rooms in examples.items()
+    }
     for name, rooms in found.items():
         figures[f"{name}, things"] = proposal_figures(rooms, said[name], least)
-    if options.rules:
-        for name in [name for name in splits if name != "train"]:
-            figures[f"{name}, rules"] = rules_figures(splits[name], examples[name], cache)
     for name, row in figures.items():
         print(name, json.dumps(row), flush=True)
     (options.out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
     return 0
+
+
+def _trained(
+    splits: dict[str, list[Room]],
+    examples: dict[str, list[Example]],
+    cache: Path,
+    options: argparse.Namespace,
+) -> Scorers:
+    """Fit networks and trees for pairs to the rooms of "train"; each half is scored by those of the other half."""
+    fit = replace(_SUPERPOINTS, steps=options.steps or _SUPERPOINTS.steps)
+    members = partial(_members, kept=options.out / "networks", seed=options.seed)
+    finished = _ensemble(members(examples["train"], fit))
+    halves = [examples["train"][0::2], examples["train"][1::2] or examples["train"]]
+    by_half = [_ensemble(members(half, replace(fit, members=1))) for half in halves]
+    rounds, clusters, trees = options.rounds or _ROUNDS["pairs"], {}, {}
+    for name, rooms in splits.items():  # those trained on first
+        models = [by_half[1 - k % 2] if name == "train" else finished for k in range(len(rooms))]
+        clusters[name] = clusters_of(rooms, examples[name], models, cache, options.processes)
+    pairs = _fit_pairs(clusters["train"], rounds, options.seed)
+    half = [_fit_pairs(clusters["train"][k::2] or clusters["train"], rounds, options.seed) for k in (0, 1)]
+    for name, rooms in splits.items():
+        trees[name] = [half[1 - k % 2] if name == "train" else pairs for k in range(len(rooms))]
+    return Scorers(finished, pairs, clusters, trees)
+
+
+def _shipped(
+    splits: dict[str, list[Room]],
+    examples: dict[str, list[Example]],
+    cache: Path,
+    options: argparse.Namespace,
+) -> Scorers:
+    """Read networks and trees for pairs from the weights that ship; the rooms have to be others than theirs."""
+    models = load_models()
+    clusters = {
+        name: clusters_of(rooms, examples[name], [models.superpoints] * len(rooms), cache, options.processes)
+        for name, rooms in splits.items()
+    }
+    trees = {name: [models.pairs] * len(rooms) for name, rooms in splits.items()}
+    return Scorers(models.superpoints, models.pairs, clusters, trees)
 
 
 def _fit_pairs(rooms: list[Clusters], rounds: int, seed: int) -> Boosted:
@@ -190,10 +227,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of weights and order (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="of training (default: %(default)s)")
     parser.add_argument(
-        "--processes", type=int, default=1, help="that make clusters and proposals (default: %(default)s)"
+        "--processes",
+        type=int,
+        default=1,
+        help="that make graphs, clusters and proposals (default: %(default)s)",
     )
     parser.add_argument(
-        "--rules", action="store_true", help="measure the cut by rules on the same surfaces, too"
+        "--proposals-only",
+        action="store_true",
+        help="fit the proposals' trees alone and keep the rest of the weights that ship; needs rooms new to them",
     )
     return parser
 
@@ -334,17 +376,18 @@ def losses(network: Network, room: Example, targets: Targets) -> tuple[torch.Ten
     return edges, (each * weight).sum() / weight.sum().clamp_min(1e-6)
 
 
-def export(networks: list[Network], trees: dict[str, Boosted], least_iou: float, file: Path) -> None:
+def export(superpoints: Ensemble, trees: dict[str, Boosted], least_iou: float, file: Path) -> None:
     """Write the weights as `reconstruction.instances.partition.model.load_models` reads them, layers as float16."""
     load_models.cache_clear()
     arrays = {
-        f"superpoints.{k}.{name}": (value if name in _SCALING else value.half()).detach().contiguous()
-        for k, network in enumerate(networks)
-        for name, value in network.state_dict().items()
+        f"superpoints.{k}.{name}": value if name in _SCALING else value.astype(np.float16)
+        for k, member in enumerate(superpoints.members)
+        for name, value in member.weights.items()
     }
     for kind, boosted in trees.items():
-        arrays |= {f"{kind}.{name}": torch.from_numpy(value) for name, value in boosted.arrays().items()}
-    save_file(arrays | {"least_iou": torch.tensor([least_iou])}, file)
+        arrays |= {f"{kind}.{name}": value for name, value in boosted.arrays().items()}
+    arrays |= {"least_iou": np.array([least_iou], np.float32)}
+    save_file({name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}, file)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
@@ -10,8 +11,9 @@ from typing import TypeVar
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from priors.partition_rooms import Example, room_view
+from priors.partition_rooms import TRIMMED, Example, example, room_view
 from priors.samples import Room
+from reconstruction.evaluation.matching import box_iou
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
 from reconstruction.instances.partition.graph import Scores, region_graph
@@ -62,9 +64,22 @@ class RoomProposals:
 
     members: csr_matrix  # (m, n)
     rows: np.ndarray  # float32 (m, F)
-    best_iou: np.ndarray  # float (m,) with the true thing that each is most like
+    best_iou: (
+        np.ndarray
+    )  # float (m,) mean IoU of surface and of boxes with the true thing that each is most like
     region: np.ndarray  # int (v,) cluster of each vertex
     example: Example
+
+
+def examples_of(
+    rooms: Sequence[Room], cache: Path, photographs: Path | None, processes: int
+) -> list[Example]:
+    """Return each room's graph of superpoints with its truth (`priors.partition_rooms.example`), cached."""
+    return _each(_example, [(room, cache, photographs) for room in rooms], processes)
+
+
+def _example(job: tuple[Room, Path, Path | None]) -> Example:
+    return example(*job)
 
 
 def clusters_of(
@@ -132,5 +147,19 @@ def _proposals(job: tuple[Clusters, Boosted, Path]) -> tuple[csr_matrix, np.ndar
     e, inside = found.example, proposals.members @ found.table()
     whole = np.bincount(e.true_ids, weights=np.maximum(e.areas, _TINY), minlength=len(e.pixels))
     iou = inside / np.maximum(inside.sum(axis=1)[:, None] + whole - inside, _TINY)
+    boxes = _boxes(view.mesh.points, found.pieces.graph.region, proposals.members)
+    iou = 0.5 * (iou + np.nan_to_num(box_iou(boxes, e.boxes)))
     best = iou[:, int(e.base_entities) + 1 :].max(axis=1, initial=0.0)
     return proposals.members, rows, best
+
+
+def _boxes(points: np.ndarray, region: np.ndarray, members: csr_matrix) -> np.ndarray:
+    """Return the trimmed boxes (m, 2, 3) of sets of clusters (m, n); `region` is the cluster of each point."""
+    order = np.argsort(region, kind="stable")
+    first = np.searchsorted(region[order], np.arange(members.shape[1] + 1))
+    own = [points[order[a:b]] for a, b in pairwise(first)]
+    out = np.empty((members.shape[0], 2, 3))
+    for row, (start, end) in enumerate(pairwise(members.indptr)):
+        inside = np.concatenate([own[k] for k in members.indices[start:end]])
+        out[row] = np.percentile(inside, (TRIMMED, 100 - TRIMMED), axis=0)
+    return out

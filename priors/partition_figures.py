@@ -1,21 +1,17 @@
-"""Figures of the learned cut and of the cut by rules on whole rooms, by the same ruler."""
-
-from pathlib import Path
+"""Figures of the learned cut on whole rooms."""
 
 import numpy as np
 from scipy.stats import rankdata
 
 from priors.partition_clusters import RoomProposals
-from priors.partition_rooms import Example, cached, frames_and_depth, fused
+from priors.partition_rooms import Example
 from priors.partition_ruler import NOTHING, compare
-from priors.samples import Room
-from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.instances import InstancesConfig
 from reconstruction.instances.partition.cut import clusters_of_things
 from reconstruction.instances.partition.graph import LABELS, Scores
 from reconstruction.instances.partition.model import Ensemble
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposals import best_disjoint
-from reconstruction.progress import NO_PROGRESS
 
 _LEAST = tuple(0.025 * k for k in range(6, 17))  # IoU
 _HITS = (0.25, 0.5)
@@ -89,22 +85,6 @@ def things_figures(rooms: list[Example], found: list[np.ndarray]) -> dict[str, f
     for room, predicted in zip(rooms, found):
         total += compare(predicted, room.true_ids, int(room.base_entities), room.areas, room.pixels)[0]
     return {name: round(value, 3) for name, value in total.shares().items()} | {"things": total.true}
-
-
-def rules_figures(rooms: list[Room], examples: list[Example], cache: Path) -> dict[str, float]:
-    """Return the same figures for the cut by rules, with default settings; its results are cached by room."""
-    found = []
-    for room in rooms:
-        file = cached(room, cache, "rules").with_suffix(".npy")
-        if not file.is_file():
-            posed, depth = frames_and_depth(room, cache)
-            config = InstancesConfig(cut="rules")
-            instances = find_instances(posed, depth, fused(room, cache), config, progress=NO_PROGRESS)
-            ids = instances.vertex_instance
-            file.parent.mkdir(parents=True, exist_ok=True)
-            np.save(file, np.where(ids > len(instances.base), ids, 0))
-        found.append(np.load(file))
-    return things_figures(examples, found)
 
 
 def superpoint_figures(rooms: list[Example]) -> dict[str, float]:

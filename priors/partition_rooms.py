@@ -43,6 +43,8 @@ _FEATURE_MODULES = (
         )
     ),
 )
+TRIMMED = 1.0  # percent of a thing's points at either side of its box, as in `reconstruction.evaluation`
+_STEP_PX = 4
 _LEAST_PURITY = 0.6  # of a superpoint's known surface must be of one entity
 
 
@@ -59,6 +61,9 @@ class Example:
     true_ids: np.ndarray  # uint16 (v,) entity, 0 = artifact
     base_entities: np.ndarray  # int () ids 1 to this one are floor and walls
     pixels: np.ndarray  # float64 (ids,) greatest share of a keyframe that shows each entity
+    boxes: (
+        np.ndarray
+    )  # float64 (ids, 2, 3) around the true points that keyframes show of each entity, nan for none
 
     def region_ids(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the entity int (n,) with most surface in each region, and whether the region is pure."""
@@ -161,9 +166,9 @@ def _made(room: Room, cache: Path, photographs: Path | None) -> Example:
 
 
 def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) -> dict[str, np.ndarray]:
-    """Return the last three fields of a room's example, from the cache if they are there."""
+    """Return the last fields of a room's example, from the cache if they are there."""
     split, number = room.folder.parent.name, room.folder.name
-    file = cached(room, cache, "truth").with_suffix(".npz")
+    file = cached(room, cache, "truths").with_suffix(".npz")
     if not file.is_file():
         film = draw_film(split, int(number), photographs=photographs)
         eyes = np.asarray(room.arrays["world_from_camera"])[:, :3, 3]
@@ -171,9 +176,34 @@ def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) 
         exact = np.asarray(room.arrays["exact_ids"])
         count = int(max(exact.max(), film.film_set.face_entity.max())) + 1
         pixels = np.stack([np.bincount(row.ravel(), minlength=count) for row in exact]).max(axis=0)
-        _write(file, true_ids=ids, base_entities=np.array(film.base_entities), pixels=pixels / exact[0].size)
+        _write(
+            file, true_ids=ids, base_entities=np.array(film.base_entities), pixels=pixels / exact[0].size,
+            boxes=_shown_boxes(room, count),
+        )  # fmt: skip
     with np.load(file) as stored:
         return dict(stored)
+
+
+def _shown_boxes(room: Room, count: int) -> np.ndarray:
+    """Return the boxes float64 (count, 2, 3) of the true points at every fourth pixel of the keyframes, by entity."""
+    arrays = room.arrays
+    depth, ids = (
+        np.asarray(arrays[name])[:, ::_STEP_PX, ::_STEP_PX] for name in ("exact_depth", "exact_ids")
+    )
+    height, width = arrays["exact_depth"].shape[1:]
+    v, u = np.mgrid[0:height:_STEP_PX, 0:width:_STEP_PX] + 0.5
+    fx, fy = arrays["focal"]
+    rays = np.stack([(u - 0.5 * width) / fx, (v - 0.5 * height) / fy, np.ones_like(u)], axis=-1)
+    points, names = [], []
+    for z, own, pose in zip(depth.astype(np.float64), ids, arrays["world_from_camera"]):
+        seen = (z > 0) & (own > 0)
+        points.append((rays[seen] * z[seen][:, None]) @ pose[:3, :3].T + pose[:3, 3])
+        names.append(own[seen])
+    points, names = np.concatenate(points), np.concatenate(names)
+    out = np.full((count, 2, 3), np.nan)
+    for name in np.unique(names):
+        out[name] = np.percentile(points[names == name], (TRIMMED, 100 - TRIMMED), axis=0)
+    return out
 
 
 def _write(file: Path, **arrays: np.ndarray) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from reconstruction.instances.lens import Lens
+from reconstruction.poses.lens import Lens
 from reconstruction.types import FrameSet, InstanceSet, PosedFrames
 
 _SEEN_WELL = 0.6  # of the best view's pixels

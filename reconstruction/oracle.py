@@ -222,7 +222,7 @@ def _base(entities, owner: np.ndarray, graph, posed: PosedFrames):
 
 def _things(entities: list[TrueEntity], owner: np.ndarray) -> dict:
     """Return the stage's own description of each true object: its vertices, what it rests on, whether it hangs."""
-    from reconstruction.instances.segmentation import Thing
+    from reconstruction.instances.cut import Thing
 
     things = {
         e.id: Thing(np.flatnonzero(owner == e.id), attached=e.relation == "attached_to")

@@ -24,10 +24,10 @@ from reconstruction.avo import SceneViews
 from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input, fingerprint
 from reconstruction.compiling import compilation_shown
 from reconstruction.config import PipelineConfig
+from reconstruction.editing.anchors import Footage, Pointer
+from reconstruction.editing.overrides import Overrides
 from reconstruction.gaussians import GaussianScene
-from reconstruction.instances.anchors import Footage, Pointer
-from reconstruction.instances.lens import Lens
-from reconstruction.overrides import Overrides
+from reconstruction.poses.lens import Lens
 from reconstruction.profiling import Usage, UsageMeter
 from reconstruction.progress import NO_PROGRESS, Progress, StageListener
 from reconstruction.scene_graph import MergedGraph

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from reconstruction.cli import build_parser
-from reconstruction.overrides import Overrides
+from reconstruction.editing.overrides import Overrides
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

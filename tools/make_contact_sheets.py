@@ -19,8 +19,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # runs from a checkout that 
 
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
+from reconstruction.editing.overrides import Overrides
 from reconstruction.instance_views import write_views
-from reconstruction.overrides import Overrides
 from reconstruction.pipeline import Run
 from reconstruction.report.contact_page import save_picture
 from reconstruction.report.contact_sheet import ContactSheet, crops_sheet, frame_picture

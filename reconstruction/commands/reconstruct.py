@@ -117,7 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"--keep-results {arguments.keep_results}: at least 1 result of each stage is needed"
         )
     from reconstruction.commands.reporting import make_listener
-    from reconstruction.overrides import Overrides
+    from reconstruction.editing.overrides import Overrides
     from reconstruction.pipeline import reconstruct
 
     listener = make_listener(quiet=arguments.quiet or arguments.json)

@@ -14,7 +14,7 @@ from registry import SceneBundle
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.instances.lens import Lens
+    from reconstruction.poses.lens import Lens
 
 IOU_BOUNDS = (0.25, 0.5)
 _LEAST_SHARE = 0.0008  # of a frame that an object covers to be counted for precision

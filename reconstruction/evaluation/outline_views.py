@@ -14,7 +14,7 @@ from registry import SceneBundle
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.instances.lens import Lens
+    from reconstruction.poses.lens import Lens
 
 _ASPECT_TOLERANCE = 0.02
 

@@ -11,7 +11,7 @@ from reconstruction.evaluation.stage_results import StageResults
 from registry import SceneBundle
 
 if TYPE_CHECKING:
-    from reconstruction.instances.lens import Lens
+    from reconstruction.poses.lens import Lens
 
 
 def measure_outlines(
@@ -38,7 +38,7 @@ def measure_outlines(
 
 
 def _lens(stages: StageResults) -> "Lens | None":
-    from reconstruction.instances.lens import Lens
+    from reconstruction.poses.lens import Lens
 
     frames, posed = stages.get("frames"), stages.get("poses")
     return None if frames is None or posed is None else Lens.measure(frames, posed)

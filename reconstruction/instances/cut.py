@@ -6,7 +6,6 @@ import numpy as np
 
 from reconstruction.instances.base import base_entities, base_planes
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.base_planes import FittedPlane, base_owner, behind_base
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -34,6 +33,15 @@ class Shell:
     def entity_id(self, plane: int) -> int:
         """Return the id of the base entity of a plane, by its row in `planes`."""
         return plane + 1 + len(self.base) - len(self.planes)
+
+
+@dataclass
+class Thing:
+    """Surface of one thing; `rests_on` is the thing that carries it, None where the base does or it hangs."""
+
+    vertices: np.ndarray  # int (n,) sorted
+    rests_on: "Thing | None" = None
+    attached: bool = False  # it hangs on a wall
 
 
 @dataclass(frozen=True)

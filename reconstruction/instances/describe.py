@@ -3,9 +3,9 @@
 import numpy as np
 
 from reconstruction.instances.boxes import UprightBox, quantiles, upright_box, with_bottom
-from reconstruction.instances.convexity import is_inside
+from reconstruction.instances.containment import is_inside
+from reconstruction.instances.cut import Thing
 from reconstruction.instances.labels import coarse_label, shape_facts
-from reconstruction.instances.segmentation import Thing
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import BaseEntity, Instance
 

@@ -1,27 +1,32 @@
-"""The stage itself: base planes, the cut, boxes and labels, id maps."""
+"""The instances stage: base planes, the cut, boxes and labels, id maps, names."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from reconstruction.instances.config import InstancesConfig
-from reconstruction.instances.contact_skirts import cut_cleaned_stacks
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
-from reconstruction.instances.doubts import as_drawn, without_doubts
 from reconstruction.instances.hung import add_hung
-from reconstruction.instances.id_maps import render_id_maps
+from reconstruction.instances.id_maps import render_id_maps, without_unseen
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
 from reconstruction.instances.masks.base import FrameMasks
+from reconstruction.instances.naming import load_namer, name_instances
 from reconstruction.instances.outlined import add_outlined
 from reconstruction.instances.partition import cut_by_partition
-from reconstruction.instances.refine import refine_by_views
-from reconstruction.instances.rules import cut_by_rules
-from reconstruction.instances.scraps import without_unseen
 from reconstruction.instances.sightings import sightings
 from reconstruction.progress import Progress
 from reconstruction.types import DepthMaps, InstanceSet, PosedFrames, Surface
+
+
+def make_instances(
+    posed: PosedFrames, depth: DepthMaps, surface: Surface, config: InstancesConfig, *, progress: Progress
+) -> InstanceSet:
+    """Find things and name them; see `find_instances` and `load_namer`, whose errors come before any work."""
+    namer = load_namer(config)
+    found = find_instances(posed, depth, surface, config, progress=progress)
+    return found if namer is None else name_instances(namer, found, posed, progress=progress)
 
 
 def find_instances(
@@ -33,12 +38,13 @@ def find_instances(
         posed: keyframes with cameras in world space.
         depth: their depth in metres.
         surface: the fused surface in world space, floor at z = 0, walls roughly along the axes.
-        config: where the cut comes from, and thresholds.
+        config: whose masks, and the least size of things.
         progress: told of decisions: a floor that had to be assumed, an empty room.
 
     Raises:
         UsageError: a folder of masks does not fit the capture.
-        EnvironmentMissing: the learned masks asked for need something that is not here.
+        EnvironmentMissing: the learned masks asked for need something that is not here, or the weights of the
+            partition cannot be read.
 
     Returns:
         The instances; ids count from 1, base entities first (floor, walls, ceiling), then objects by size.
@@ -48,19 +54,10 @@ def find_instances(
     progress.start(3, "base planes and things")
     shell = Shell.of(surface, progress)
     progress.advance()
-    frames = sightings(surface, posed, depth)
-    by_rules = masks is None and config.cut == "rules"
-    if masks is not None:
-        cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
-    elif by_rules:
-        cut = cut_by_rules(shell, surface, posed, depth, frames, config, progress)
-        cut = refine_by_views(shell, cut, surface, posed, depth, config, progress)
+    if masks is None:
+        cut = cut_by_partition(shell, surface, sightings(surface, posed, depth), config, progress)
     else:
-        cut = cut_by_partition(shell, surface, frames, config, progress)
-    taken = without_doubts(shell, cut.things, frames, progress)
-    if by_rules:
-        again = cut_cleaned_stacks(shell.graph, surface, cut.things, posed, depth, config, progress)
-        cut = replace(cut, things=again)
+        cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     progress.advance()
     vertex_instance = cut.owner.copy()
     objects = describe(shell.graph, cut.things, shell.base, vertex_instance)
@@ -68,14 +65,13 @@ def find_instances(
     if not objects:
         progress.note("No separate things were found: the scene is an empty room.")
     told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
-    drawn = as_drawn(shell.graph, vertex_instance, taken)
-    id_maps = render_id_maps(posed, depth, surface, drawn, config, told, progress=progress)
+    id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, told, progress=progress)
     found = InstanceSet(vertex_instance, shell.base, objects, id_maps)
-    if told is not None and masks is not None:
+    if masks is None:
+        found = add_hung(found, posed, depth, surface, config, progress)
+    else:
         asked = masks.resized(told.camera.width, told.camera.height)
         found = add_outlined(found, asked, told, posed, depth, surface, config, progress)
-    elif masks is None:
-        found = add_hung(found, posed, depth, surface, config, progress)
     return without_unseen(found, config, progress)
 
 

@@ -1,5 +1,7 @@
 """Which instance each pixel of each keyframe shows: the labeled surface drawn, its borders moved to image edges."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -8,7 +10,7 @@ from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.told_maps import ToldMaps
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import lab_from_rgb
-from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
+from reconstruction.types import Camera, DepthMaps, InstanceSet, PosedFrames, Surface
 
 
 def render_id_maps(
@@ -80,3 +82,30 @@ def snapped_ids(
 
 def _measured(depth: DepthMaps, row: int) -> np.ndarray:
     return np.where(depth.confidence[row] > 0, depth.depth[row], 0).astype(np.float32)
+
+
+def without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progress) -> InstanceSet:
+    """Return the instances without objects that cover less of every id map than the config asks for."""
+    count = max((o.id for o in found.objects), default=0) + 1
+    best = np.zeros(count, np.int64)
+    for id_map in found.id_maps:
+        seen = np.bincount(id_map.ravel(), minlength=count)[:count]
+        best = np.maximum(best, seen)
+    fewest = config.min_object_image_share * found.id_maps[0].size
+    gone = {o.id: o.support_hint for o in found.objects if best[o.id] < fewest}
+    if not gone:
+        return found
+    progress.note(f"{len(gone)} scraps that show in no keyframe are not kept as things")
+
+    def carrier(hint: int) -> int:
+        while hint in gone:
+            hint = gone[hint]
+        return hint
+
+    erased = np.array(sorted(gone))
+    return InstanceSet(
+        np.where(np.isin(found.vertex_instance, erased), 0, found.vertex_instance).astype(np.int32),
+        found.base,
+        tuple(replace(o, support_hint=carrier(o.support_hint)) for o in found.objects if o.id not in gone),
+        np.where(np.isin(found.id_maps, erased), 0, found.id_maps).astype(np.uint16),
+    )

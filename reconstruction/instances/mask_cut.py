@@ -8,10 +8,9 @@ from scipy.spatial import cKDTree
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
-from reconstruction.instances.cut import Cut, Shell
+from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.lifting import Lifted, lift_masks
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.instances.segmentation import Thing
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import MeshGraph, pieces
 from reconstruction.types import DepthMaps, PosedFrames, Surface

@@ -13,9 +13,6 @@ from registry.geometry import invert_rigid
 
 _MAX_FRAMES = 36
 _SLACK = 0.012  # of depth: surface this far behind what is drawn is seen all the same
-_AGREES = 0.015  # of depth: measured depth this near to a vertex confirms it
-_LEAST_CONFIRMED = 0.3  # of the frames that see a vertex
-_LEAST_COSINE = 0.2  # between its normal and the line of sight of the frame that faces it best
 
 
 @dataclass(frozen=True)
@@ -67,31 +64,3 @@ def sightings(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[Si
             Sighting(camera, invert_rigid(pose), pose[:3, 3], lab, measured, raster.depth, vertex, affinity)
         )
     return out
-
-
-def unconfirmed(points: np.ndarray, normals: np.ndarray, frames: list[Sighting]) -> np.ndarray:
-    """Return which vertices of the fused surface the frames speak against.
-
-    Between the outline of a thing and what is behind it depth fills in sheets. They run along the lines of sight, so
-    that every frame sees them at a slant, most frames measure another depth where they show, and those behind the
-    thing show in no frame at all. A surface that is there has been seen, and is measured again and again.
-
-    Args:
-        points: float64 (n, 3) vertices.
-        normals: float64 (n, 3) theirs.
-        frames: keyframes, the surface drawn into them.
-
-    Returns:
-        bool (n,).
-    """
-    shown, agreed, facing = np.zeros(len(points)), np.zeros(len(points)), np.full(len(points), -1.0)
-    for frame in frames:
-        row, column, z = frame.seen_at(points)
-        there = np.flatnonzero(frame.shown(row, column, z))
-        measured, z = frame.measured[row[there], column[there]], z[there]
-        rays = frame.eye - points[there]
-        cosine = (rays * normals[there]).sum(axis=1) / np.maximum(np.linalg.norm(rays, axis=1), 1e-9)
-        shown[there] += 1
-        agreed[there] += (measured > 0) & (np.abs(measured - z) < _AGREES * z)
-        facing[there] = np.maximum(facing[there], cosine)
-    return (shown == 0) | (agreed < _LEAST_CONFIRMED * shown) | (facing < _LEAST_COSINE)

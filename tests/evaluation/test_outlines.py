@@ -10,7 +10,7 @@ from truth_bundle import KINDS, Change, write_bundle
 from reconstruction.evaluation import LabelledFrame, Outline, load_outlines, score_outlines
 from reconstruction.evaluation.outline_labels import filled
 from reconstruction.evaluation.scene import placed_meshes
-from reconstruction.instances.lens import Lens
+from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
 from registry.geometry import rigid
 

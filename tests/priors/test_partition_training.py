@@ -116,7 +116,7 @@ def test_numpy_says_what_pytorch_says(tmp_path):
     networks = [Network(FEATURES, 16, 2) for _ in range(2)]
     rng = np.random.default_rng(0)
     trees = {name: stumps(count, rng)[0] for name, count in TREES.items()}
-    partition.export(networks, trees, 0.25, tmp_path / "w.safetensors")
+    partition.export(partition._ensemble(networks), trees, 0.25, tmp_path / "w.safetensors")
     models = load_models(tmp_path / "w.safetensors")
     assert models.least_iou == 0.25
     nodes, edges, pairs = graph_of(rng, FEATURES)

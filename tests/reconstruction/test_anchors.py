@@ -9,14 +9,14 @@ import pytest
 
 from reconstruction.cache import StageStore, fingerprint
 from reconstruction.config import PipelineConfig
+from reconstruction.editing.addresses import Address, parse_address
+from reconstruction.editing.anchors import Footage, Pointer
+from reconstruction.editing.overrides import Overrides
 from reconstruction.gaussians import Gaussians, GaussianScene
 from reconstruction.instance_views import choose_views
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.instances.addresses import Address, parse_address
-from reconstruction.instances.anchors import Footage, Pointer
-from reconstruction.instances.lens import Lens
-from reconstruction.overrides import Overrides
 from reconstruction.pipeline import STAGES, Run
+from reconstruction.poses.lens import Lens
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.types import ScaleEstimate, WorldFrame

@@ -11,8 +11,8 @@ from reconstruction.assembly.base import convex_part
 from reconstruction.assembly.baselines import in_situ
 from reconstruction.assembly.collision import cut, flatten_foot
 from reconstruction.assembly.placement import base_specs
-from reconstruction.instances.anchors import Pointer
-from reconstruction.overrides import Overrides
+from reconstruction.editing.anchors import Pointer
+from reconstruction.editing.overrides import Overrides
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
 from reconstruction.types import AssembledScene, AssetSet, Edge, Instance, InstanceSet, SceneGraph
 from registry.errors import SimReconError, UsageError

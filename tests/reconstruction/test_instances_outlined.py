@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from surfaces import floor_sheet, frames_of, looking_at, merged, sheet, solid_box, surface_from
 
+from reconstruction.editing.instances import apply_overrides
 from reconstruction.evaluation.alignment import Alignment
 from reconstruction.evaluation.object_boxes import instance_boxes
-from reconstruction.instances import InstancesConfig, apply_overrides, find_instances
+from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.outlined_box import Wall, WallBox, Window, fit_box, silhouette
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import BaseEntity, Camera, DepthMaps, Plane

@@ -6,7 +6,7 @@ from scipy.special import expit
 
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
-from reconstruction.instances.cut import Cut, Shell
+from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.mask_cut import mark_attached
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
 from reconstruction.instances.partition.features import Shapes, Together, View, edge_features, node_features
@@ -15,7 +15,6 @@ from reconstruction.instances.partition.model import Models, load_models
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposal_features import proposal_features
 from reconstruction.instances.partition.proposals import best_disjoint, propose
-from reconstruction.instances.segmentation import Thing
 from reconstruction.instances.sightings import Sighting
 from reconstruction.progress import Progress
 from reconstruction.types import Surface

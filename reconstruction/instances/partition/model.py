@@ -143,8 +143,7 @@ def load_models(weights: Path = WEIGHTS) -> Models:
         least = float(stored["least_iou"][0])
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise EnvironmentMissing(
-            f"instances: the weights {weights} cannot be read ({error}). Install the package again, or use "
-            "--set instances.cut=rules."
+            f"instances: the weights {weights} cannot be read ({error}). Install the package again."
         ) from error
     superpoints = Ensemble(tuple(Model(members[k]) for k in sorted(members)))
     return Models(superpoints, trees["pairs"], trees["proposals"], least)

@@ -213,9 +213,9 @@ def _single_clusters(sums: _Sums, a: np.ndarray, b: np.ndarray, odds: np.ndarray
     number = (members @ csr_matrix((np.ones(2 * len(a)), ends), shape=shape)).tocoo()
     row, other = number.row, number.col
     # sums of log-odds that cancel out have no entry, so that all are looked up
-    total = np.asarray((members @ csr_matrix((np.r_[odds, odds], ends), shape=shape))[row, other]).ravel()
+    total = _entries(members @ csr_matrix((np.r_[odds, odds], ends), shape=shape), row, other)
     mean = total / number.data
-    own = np.asarray(members[row, other]).ravel() > 0
+    own = _entries(members, row, other) > 0
     large = sums.cluster_area[other] > _LARGE * sums.area[row]
     out = []
     for values, chosen, lowest in ((mean, ~own, -8.0), (total, ~own, -20.0), (mean, ~own & large, -8.0)):
@@ -225,6 +225,11 @@ def _single_clusters(sums: _Sums, a: np.ndarray, b: np.ndarray, odds: np.ndarray
     weakest = np.full(members.shape[0], 8.0)
     np.minimum.at(weakest, row[own], mean[own])
     return [*out, weakest]
+
+
+def _entries(matrix: csr_matrix, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Return the entries (k,) of a sparse matrix at rows and columns (k,); scipy returns a matrix for k = 0."""
+    return np.asarray(matrix[row, column]).ravel() if len(row) else np.zeros(0)
 
 
 class _Outward:

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruction.instances.addresses import KINDS, parse_address, parse_addresses, parse_parts, vector
-from reconstruction.instances.anchors import Footage, Pointer
+from reconstruction.editing.addresses import KINDS, parse_address, parse_addresses, parse_parts, vector
+from reconstruction.editing.anchors import Footage, Pointer
+from reconstruction.editing.clicked_split import grown_parts, split_maps
 from reconstruction.instances.base import BASE_LABELS
 from reconstruction.instances.boxes import UprightBox, upright_box
-from reconstruction.instances.clicked_split import grown_parts, split_maps
 from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.surface.base_planes import base_outline
 from reconstruction.surface.mesh_graph import MeshGraph

@@ -1,7 +1,7 @@
 """The user's corrections (`--overrides FILE`), read once, checked at once, and applied by the stage that they concern.
 
 The file is a YAML list; each entry says which thing it means, by `id`, `at` or `pixel`
-(`reconstruction.instances.addresses`), and what to do with it. See docs/overrides.md.
+(`reconstruction.editing.addresses`), and what to do with it. See docs/overrides.md.
 """
 
 from dataclasses import dataclass, field, replace
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.instances.anchors import Pointer
+    from reconstruction.editing.anchors import Pointer
     from reconstruction.types import (
         AssetSet,
         InstanceSet,
@@ -76,7 +76,7 @@ class Overrides:
 
     def apply_to_instances(self, pointer: "Pointer") -> "InstanceSet":
         """Relabel, drop, merge, split, make base what the pointer's cut holds."""
-        from reconstruction.instances import apply_overrides
+        from reconstruction.editing.instances import apply_overrides
 
         return apply_overrides(pointer.found, pointer.surface, self.of_stage("instances"), pointer.footage)
 
@@ -90,7 +90,7 @@ class Overrides:
 
     def apply_to_graph(self, graph: "SceneGraph", assets: "AssetSet", pointer: "Pointer") -> "SceneGraph":
         """Give objects other parents; refuses a parent that does not exist or that makes a cycle."""
-        from reconstruction.instances.addresses import parse_address
+        from reconstruction.editing.addresses import parse_address
 
         objects = {item.id: item for item in assets.objects}
         known = set(objects) | {item.id for item in assets.base}
@@ -163,7 +163,7 @@ def _check(entry: Any, where: str) -> None:
 
 def _check_addresses(entry: dict, where: str) -> None:
     """Refuse an entry that does not say which thing it means."""
-    from reconstruction.instances.addresses import KINDS, parse_address, parse_addresses, parse_parts
+    from reconstruction.editing.addresses import KINDS, parse_address, parse_addresses, parse_parts
 
     clicked = isinstance(entry.get("split"), list)
     if clicked:
@@ -179,7 +179,7 @@ def _check_addresses(entry: dict, where: str) -> None:
 
 
 def _addressed(entry: dict, objects: dict[int, "ObjectAsset"], pointer: "Pointer") -> "ObjectAsset":
-    from reconstruction.instances.addresses import parse_address
+    from reconstruction.editing.addresses import parse_address
 
     found = pointer.thing(parse_address(entry, "overrides"))
     if found.id not in objects:

@@ -1,27 +1,17 @@
-"""Whether a piece of surface has a shape of its own, or is a part of the hollow of what surrounds it."""
+"""Containment: whether one thing lies in the hollow of another."""
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.instances.outlines import inset
 from reconstruction.surface.mesh_graph import MeshGraph
 
-MIN_BULGE = 0.2
 _ENCLOSED = 0.9  # share of a piece that is within an outline
 _SLACK_M = 0.005
 _RIM_M, _AROUND_M = 0.15, 0.3  # a container's rim above the end of what is in it, and around that
 _DEEPER_M, _MIN_LOWER_M2 = 0.01, 2e-4
 _LEVEL, _LOWER_RATIO = 0.8, 2.0
 _SECTORS, _MIN_SECTORS = 8, 7  # directions around a thing, and how many of them meet the rim
-
-
-def bulge(graph: MeshGraph, vertices: np.ndarray) -> float:
-    """Return how normals turn outwards over a piece of surface: > 0 around a thing, 0 on a sheet, < 0 inside a bowl."""
-    weight = graph.areas[vertices, None] / max(graph.areas[vertices].sum(), 1e-12)
-    away = graph.points[vertices] - (weight * graph.points[vertices]).sum(axis=0)
-    turn = graph.normals[vertices] - (weight * graph.normals[vertices]).sum(axis=0)
-    return float((weight * away * turn).sum()) / max(float(weight[:, 0] @ np.linalg.norm(away, axis=1)), 1e-9)
 
 
 def is_within(graph: MeshGraph, vertices: np.ndarray, other: np.ndarray) -> bool:
@@ -56,3 +46,17 @@ def is_inside(graph: MeshGraph, container: np.ndarray, inner: np.ndarray, bottom
     lower = area[within & (height < -_DEEPER_M) & (up > 0.0)].sum()
     level = area[within & (np.abs(height) < _DEEPER_M) & (up > _LEVEL)].sum()
     return bool(lower > max(_MIN_LOWER_M2, _LOWER_RATIO * level))
+
+
+def inset(outline: np.ndarray, points_xy: np.ndarray) -> np.ndarray:
+    """Return how far points are within an outline in plan, in meters; negative outside of it.
+
+    Args:
+        outline: float32 (k, 1, 2) or (k, 2) corners of a polygon in order, such as `cv2.convexHull` returns.
+        points_xy: (n, 2), rounded to float32 as the corners are.
+
+    Returns:
+        float64 (n,) distance to the nearest side.
+    """
+    points = np.asarray(points_xy, np.float64).tolist()
+    return np.array([cv2.pointPolygonTest(outline, (x, y), True) for x, y in points], np.float64)

@@ -5,9 +5,9 @@ from functools import cached_property
 
 import numpy as np
 
-from reconstruction.instances.addresses import Address
+from reconstruction.editing.addresses import Address
 from reconstruction.instances.id_maps import seen_vertices
-from reconstruction.instances.lens import Lens
+from reconstruction.poses.lens import Lens
 from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 from registry.errors import UsageError
 
