@@ -29,9 +29,7 @@ def describe(
         vertex_instance[thing.vertices] = number[id(thing)]
         box = _box_on_support(graph, thing, boxes[id(thing)], base)
         carries = sum(1 for t in things if t.rests_on is thing)
-        on_floor = (
-            not thing.attached and thing.rests_on is None and box.center[2] - 0.5 * box.extents_m[2] < 0.1
-        )
+        on_floor = not thing.attached and thing.rests_on is None and _stands_on_floor(graph, box)
         label, confidence = coarse_label(
             shape_facts(graph, thing.vertices, box, on_floor, thing.attached, carries)
         )
@@ -53,6 +51,15 @@ def describe(
     return tuple(out)
 
 
+def _stands_on_floor(graph: MeshGraph, box: UprightBox) -> bool:
+    """Tell whether a thing that nothing carries stands on the floor, whose contact is hidden or was not measured.
+
+    Something has to hold it: the floor, unless it is nearer to the highest point of the room, where it may hang.
+    """
+    bottom, top = box.center[2] + 0.5 * box.extents_m[2] * np.array([-1.0, 1.0])
+    return bool(bottom <= graph.points[:, 2].max() - top)
+
+
 def _nearest_wall(graph: MeshGraph, thing: Thing, base: tuple[BaseEntity, ...]) -> int:
     walls = [b for b in base if b.label == "wall"]
     if not walls:
@@ -70,9 +77,7 @@ def _box_on_support(
         return _box_to_wall(graph, thing, box, base)
     bottom = box.center[2] - 0.5 * box.extents_m[2]
     if thing.rests_on is None:
-        return (
-            with_bottom(box, 0.0) if base[0].observed and bottom < max(0.06, 0.15 * box.extents_m[2]) else box
-        )
+        return with_bottom(box, 0.0) if base[0].observed and _stands_on_floor(graph, box) else box
     if is_inside(graph, thing.rests_on.vertices, thing.vertices, bottom):
         floor = _bottom_of(graph, thing.rests_on, base) + _CONTAINER_FLOOR_M
         return with_bottom(box, float(np.clip(floor, bottom - box.extents_m[2], bottom)))
