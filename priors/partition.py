@@ -387,7 +387,7 @@ def export(superpoints: Ensemble, trees: dict[str, Boosted], least_iou: float, f
     for kind, boosted in trees.items():
         arrays |= {f"{kind}.{name}": value for name, value in boosted.arrays().items()}
     arrays |= {"least_iou": np.array([least_iou], np.float32)}
-    save_file({name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}, file)
+    save_file({name: torch.from_numpy(value.copy()) for name, value in arrays.items()}, file)
 
 
 if __name__ == "__main__":

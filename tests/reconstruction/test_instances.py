@@ -59,24 +59,6 @@ def test_two_colored_box_stays_whole():
     assert len(found.objects) == 2
 
 
-def test_stack_of_three():
-    """Book on table, mug-sized box on book: each rests on the next."""
-    surface = surface_from(
-        merged(
-            floor_sheet((200, 200, 190)),
-            solid_box(*TABLE_TOP),
-            solid_box((-0.1, -0.1, 0.5), (0.2, 0.15, 0.54), (20, 20, 25)),
-            solid_box((0.0, 0.0, 0.54), (0.08, 0.08, 0.64), (40, 160, 60)),
-        )
-    )
-    found = run(surface)
-    book, box = object_at(found, surface, (-0.05, -0.05, 0.54)), object_at(found, surface, (0.04, 0.04, 0.64))
-    table = object_at(found, surface, (-0.4, 0.3, 0.5))
-    assert len({book, box, table}) == 3
-    assert by_id(found, box).support_hint == book
-    assert by_id(found, book).support_hint == table
-
-
 def test_bump_of_the_table_is_no_object():
     """A low swelling of the support's own color is noise of the depth."""
     table = solid_box(*TABLE_TOP)
