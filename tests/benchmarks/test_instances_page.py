@@ -124,8 +124,8 @@ def test_scenes_and_growth_are_shown_where_they_were_measured():
 def test_a_run_is_what_the_command_line_would_do(tmp_path):
     video = tmp_path / "video.mp4"
     video.write_bytes(b"not looked at yet")
-    run = stage_run(video, tmp_path / "work", ["--preset", "fast", "--set", "instances.min_object_m=0.05"])
-    assert run.config.instances.min_object_m == 0.05
+    run = stage_run(video, tmp_path / "work", ["--preset", "fast", "--set", "instances.min_picture_m=0.05"])
+    assert run.config.instances.min_picture_m == 0.05
     assert run.config.instances.snap_radius_px == 0  # of the preset
     assert run.oracle is None
 

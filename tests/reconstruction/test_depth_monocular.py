@@ -121,7 +121,7 @@ def test_alignment_withstands_wrong_anchors() -> None:
 
 def test_the_stage_uses_the_backend_where_nothing_else_reaches() -> None:
     posed, truth = make_posed()
-    config = replace(CONFIG, complete=False)
+    config = replace(CONFIG, complete=False, prior="none")
     plain = estimate_depth(posed, config)
     watcher = Notes()
     maps = estimate_depth(posed, config, backend=Oracle(posed.images, truth), progress=watcher)

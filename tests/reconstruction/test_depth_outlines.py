@@ -10,7 +10,7 @@ from reconstruction.rasterize import rasterize_mesh
 from reconstruction.types import Camera, PosedFrames, VideoSource
 
 CAMERA = Camera(240, 180, 210.0, 210.0, 120.0, 90.0)
-CONFIG = DepthConfig(depth_side_px=240, sweep_side_px=160, planes=64, min_speckle_px=20)
+CONFIG = DepthConfig(depth_side_px=240, sweep_side_px=160, planes=64, min_speckle_px=20, prior="none")
 FLOOR, WALL, TABLE, BOX = 0, 1, 2, 3
 TABLE_LOW, TABLE_HIGH = np.array([-0.45, -0.25, 0.25]), np.array([0.45, 0.35, 0.3])
 BOXES = (

@@ -13,7 +13,7 @@ from reconstruction.types import InstanceSet, Surface
 
 
 def run(surface: Surface, progress=NO_PROGRESS) -> InstanceSet:
-    posed, depth = frames_of(surface)
+    posed, depth = frames_of(surface, 480, 360)
     return find_instances(posed, depth, surface, InstancesConfig(), progress=progress)
 
 
