@@ -1,6 +1,7 @@
 """Which instance each pixel of each keyframe shows: the labeled surface drawn, its borders moved to image edges."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.told_maps import ToldMaps
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import lab_from_rgb
 from reconstruction.types import Camera, DepthMaps, InstanceSet, PosedFrames, Surface
@@ -28,8 +30,10 @@ def render_id_maps(
     asked = None if told is None else ToldMaps(told, surface)
     maps = np.zeros((len(posed.images), camera.height, camera.width), np.uint16)
     progress.start(len(maps), "instance maps")
-    for row in range(len(maps)):
-        ids = snapped_ids(draw_ids(surface, vertex_instance, posed, depth, row), posed, depth, row, config)
+    # Frames are drawn ahead on all cores; the kernels after that use all of them by themselves.
+    drawn = ordered_map(partial(draw_ids, surface, vertex_instance, posed, depth), range(len(maps)))
+    for row, ids in enumerate(drawn):
+        ids = snapped_ids(ids, posed, depth, row, config)
         maps[row] = ids if asked is None else cv2.medianBlur(asked.ids(ids, posed, depth, row), 3)
         progress.advance()
     return maps

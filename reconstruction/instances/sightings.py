@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.surface.mesh_graph import lab_from_rgb
 from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
@@ -49,8 +50,8 @@ class Sighting:
 def sightings(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[Sighting]:
     """Return keyframes spread over the film, the fused surface drawn into each."""
     count, camera = len(posed.images), depth.camera
-    out = []
-    for row in np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int)):
+
+    def sighting(row: int) -> Sighting:
         pose = np.asarray(posed.world_from_camera[row], np.float64)
         image = cv2.resize(posed.images[row], (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         raster = rasterize_mesh(surface.vertices, surface.faces, camera, pose)
@@ -60,7 +61,9 @@ def sightings(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[Si
         affinity = None if depth.affinity is None else np.asarray(depth.affinity[row])
         lab = lab_from_rgb(image) * LIGHTNESS_WEIGHT
         measured = np.asarray(depth.depth[row])
-        out.append(
-            Sighting(camera, invert_rigid(pose), pose[:3, 3], lab, measured, raster.depth, vertex, affinity)
+        return Sighting(
+            camera, invert_rigid(pose), pose[:3, 3], lab, measured, raster.depth, vertex, affinity
         )
-    return out
+
+    rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int))
+    return list(ordered_map(sighting, rows))

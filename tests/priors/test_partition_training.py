@@ -63,7 +63,9 @@ def test_superpoints_and_targets_hold_the_truth(graph):
     assert np.isfinite(graph.edges).all()
     assert pure.mean() > 0.9
     a, b = graph.pairs.T
-    two = (ids[a] != ids[b]) & (np.maximum(ids[a], ids[b]) > graph.base_entities)  # a thing and something else
+    two = (ids[a] != ids[b]) & (
+        np.maximum(ids[a], ids[b]) > graph.base_entities
+    )  # a thing and something else
     assert two.any()
     assert (targets.same[two] == 0).all()
     assert (targets.same_weight[~(pure[a] & pure[b])] == 0).all()

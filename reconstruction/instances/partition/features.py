@@ -15,6 +15,7 @@ from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.partition.evidence import FrameLook, VertexEvidence, gather, look
 from reconstruction.instances.partition.graph import RegionGraph
 from reconstruction.instances.sightings import Sighting
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import Surface
 
@@ -54,7 +55,7 @@ class View:
     @classmethod
     def of(cls, mesh: MeshGraph, surface: Surface, frames: list[Sighting]) -> "View":
         """Look at the surface from every keyframe."""
-        looks = [look(frame, mesh.points, mesh.normals) for frame in frames]
+        looks = list(ordered_map(lambda frame: look(frame, mesh.points, mesh.normals), frames))
         return cls(mesh, surface, frames, looks, gather(looks))
 
 
