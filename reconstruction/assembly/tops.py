@@ -100,6 +100,8 @@ def _common(one: np.ndarray, other: np.ndarray) -> np.ndarray | None:
     try:
         inside = [Delaunay(a).find_simplex(b) >= 0 for a, b in ((other, one), (one, other))]
         points = np.concatenate([one[inside[0]], other[inside[1]]])
+        if not len(points):  # they cross, and no corner of either is in the other
+            return None
         hull = ConvexHull(points)
     except QhullError:
         return None

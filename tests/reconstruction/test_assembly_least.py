@@ -159,6 +159,12 @@ def test_a_seat_leaves_walls_and_other_boards():
     assert seat(beside, rigid(), place - 1.0, 0.015, 0.024) is beside
 
 
+def test_a_plank_across_a_foot_is_kept_where_their_outlines_cross_without_a_corner_in_common():
+    plank = box_part((0.8, 0.04, 0.01), (0, 0, 0.005))
+    place = np.array([[-0.02, -0.4], [0.02, -0.4], [0.02, 0.4], [-0.02, 0.4]])
+    assert len(seat((plank,), rigid(), place, 0.012, 0.024)) == 1
+
+
 def test_the_margin_of_a_stand():
     square = np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.1]], float)
     assert support_margin(square, np.array([0.05, 0.02])) == pytest.approx(0.02)
