@@ -23,7 +23,7 @@ from benchmarks.machine import ROOT, describe_code
 from benchmarks.spread import spread_tree
 from benchmarks.table import DEFAULT_OUT, table_lines
 from reconstruction.evaluation.ground_truth import GroundTruth
-from reconstruction.pipeline import Run
+from reconstruction.runner import Run
 from reconstruction.types import DepthMaps
 from registry.errors import UsageError
 

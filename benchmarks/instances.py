@@ -31,7 +31,7 @@ from benchmarks.results import load_result, result_path
 from benchmarks.run import add_arguments, measure_scenes
 from benchmarks.variants import Variant, choose_variants, home_of
 from reconstruction.cache import StageStore, digest_input
-from reconstruction.pipeline import Run
+from reconstruction.runner import Run
 from registry.errors import SimReconError, UsageError
 
 DEFAULT_PAGE = ROOT / "docs" / "instances_benchmark.md"

@@ -19,7 +19,8 @@ import numpy as np
 
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
-from reconstruction.pipeline import STAGE_NAMES, Run
+from reconstruction.pipeline import STAGE_NAMES
+from reconstruction.runner import Run
 from registry.errors import SimReconError, UsageError
 
 UNTIL = "surface"

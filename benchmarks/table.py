@@ -15,7 +15,7 @@ from benchmarks.machine import ROOT, describe_code, machine_line
 from benchmarks.results import Result, last_line, load_results
 from benchmarks.spread import PooledResult, Spread, pool, save_spreads, spread_of
 from benchmarks.variants import BASELINE, VARIANTS, is_oracle
-from reconstruction.profiling import cost_rows
+from reconstruction.costs import cost_rows
 from registry.errors import SimReconError, UsageError
 
 DEFAULT_OUT = ROOT / "benchmarks" / "out"

@@ -1,20 +1,20 @@
 """From a video to a simulation-ready scene bundle in the registry.
 
-`reconstruct` is the whole pipeline (see `reconstruction.pipeline`); `PipelineConfig` holds its options. Both are loaded
-on first use, so that importing the package stays light.
+`reconstruct` is the whole pipeline; its stages are in `reconstruction.pipeline`. `PipelineConfig` holds its options.
+Both are loaded on first use, so that importing the package stays light.
 """
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from reconstruction.config import PipelineConfig
-    from reconstruction.pipeline import Reconstruction, reconstruct
+    from reconstruction.video_to_scene import Reconstruction, reconstruct
 
 __all__ = ["PipelineConfig", "Reconstruction", "reconstruct"]
 _HOME = {
     "PipelineConfig": "reconstruction.config",
-    "Reconstruction": "reconstruction.pipeline",
-    "reconstruct": "reconstruction.pipeline",
+    "Reconstruction": "reconstruction.video_to_scene",
+    "reconstruct": "reconstruction.video_to_scene",
 }
 
 

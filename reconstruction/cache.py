@@ -1,18 +1,19 @@
 """The stage cache: finished stages are kept under the fingerprint of what went in, and written whole or not at all.
 
-A stage's fingerprint is the SHA-256 over its name, VERSION and source, its config, and the fingerprints of the stages
-before it (the first one has the input's digest). On disk a stage is `<work>/<NN>_<stage>-<fingerprint>/`, written as a
-temporary sibling and renamed when complete, so a killed run leaves nothing that looks finished. Two fingerprints of
-each stage are kept unless more are asked for, so going back and forth between two options costs nothing.
+A stage's fingerprint is the SHA-256 over its name, the code behind it (`code_digest`), its options, and the
+fingerprints of the stages that it reads (the first one has the input's digest). On disk a stage is
+`<work>/<NN>_<stage>-<fingerprint>/`, written as a temporary sibling and renamed when complete, so a killed run leaves
+nothing that looks finished. Two fingerprints of each stage are kept unless more are asked for, so going back and forth
+between two options costs nothing.
 """
 
 import dataclasses
 import hashlib
-import importlib
 import json
 import logging
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,13 +25,6 @@ T = TypeVar("T")
 KEPT_PER_STAGE = 2
 _NEEDED_BYTES = 3 << 29  # The stages of one video take about 1.5 GB.
 _MANIFEST = "manifest.json"
-# What several stages compute with; a change there invalidates all of them.
-_SHARED_MODULES = (
-    "reconstruction.types",
-    "reconstruction.artifacts",
-    "reconstruction.rasterize",
-    "registry.geometry",
-)
 
 
 def canonical_json(value: Any) -> str:
@@ -46,26 +40,16 @@ def canonical_json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, default=default, separators=(",", ":"), allow_nan=False)
 
 
-def source_digest(module_name: str) -> str:
-    """Digest a module or package with its prompts, word lists and weights: changed code never reuses old results."""
-    module = importlib.import_module(module_name)
-    root = Path(module.__file__)
-    files = [root]
-    if root.name == "__init__.py":
-        files = sorted(
-            file for file in root.parent.rglob("*") if file.suffix in (".py", ".txt", ".safetensors")
-        )
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+def fingerprint(stage: str, code: Sequence[str], inputs: Any, upstream: tuple[str, ...]) -> str:
+    """Fingerprint a stage: 16 hex digits over everything that its result depends on.
 
-
-def fingerprint(stage: str, module_name: str, config: Any, upstream: tuple[str, ...]) -> str:
-    """Fingerprint a stage: 16 hex digits over everything that its result depends on."""
-    version = importlib.import_module(module_name).VERSION
-    sources = [source_digest(name) for name in (module_name, *_SHARED_MODULES)]
-    parts = [stage, str(version), *sources, canonical_json(config), *upstream]
+    Args:
+        stage: its name.
+        code: digests of the code that makes it (`code_digest`).
+        inputs: its options, and whatever else goes in: dataclasses and plain values.
+        upstream: fingerprints of the stages that it reads, or the input's digest.
+    """
+    parts = [stage, *code, canonical_json(inputs), *upstream]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 

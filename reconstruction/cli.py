@@ -5,7 +5,6 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from registry.errors import SimReconError
 
@@ -64,19 +63,6 @@ def _version() -> str:
         return f"simrecon {version('simrecon')}"
     except PackageNotFoundError:
         return "simrecon (source tree, not installed)"
-
-
-def add_common(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
-    """Add the flags that several verbs share."""
-    parser.add_argument(
-        "--registry",
-        type=Path,
-        metavar="DIR",
-        help="where scenes live (default: $SIMRECON_HOME/registry, or ~/.simrecon/registry)",
-    )
-    parser.add_argument("--verbose", action="store_true", help="log what each stage decides")
-    if json:
-        parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -21,13 +21,12 @@ from reconstruction.keyframes import (
     choose_keyframes,
     repeats_of,
 )
-from reconstruction.poses.importers.exports import Export, find_export
-from reconstruction.poses.importers.polycam import polycam_turns
+from reconstruction.phone_exports.exports import Export, find_export
+from reconstruction.phone_exports.polycam import polycam_turns
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import FrameSet, VideoSource
 from registry.errors import InputError, UsageError
 
-VERSION = 1
 HELD_OUT_EVERY = 10  # CONTRACT section 4: every tenth video frame is kept out of all fitting
 
 

@@ -10,9 +10,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from reconstruction.code_digest import code_digest
+from reconstruction.depth.images import sized_camera
 from reconstruction.evaluation.alignment import Alignment, align
 from reconstruction.evaluation.ground_truth import GroundTruth, TrueEntity
 from reconstruction.evaluation.scene import joined
@@ -32,6 +35,9 @@ from reconstruction.types import (
     WorldFrame,
 )
 from registry.errors import UsageError
+
+if TYPE_CHECKING:
+    from reconstruction.pipeline import Call
 
 ORACLE_STAGES = ("poses", "depth", "world", "instances")
 _NEAR_TRUTH_M = 0.05
@@ -74,9 +80,18 @@ class Oracle:
 
     def of_stage(self, stage: str) -> list[str]:
         """Return what belongs into a stage's fingerprint: nothing where the stage runs as usual."""
-        from reconstruction.cache import source_digest
+        return [self.digest, code_digest(__name__)] if stage in self.stages else []
 
-        return [self.digest, source_digest(__name__)] if stage in self.stages else []
+    def make(self, stage: str, call: "Call") -> Any:
+        """Return what the truth says in a stage's place."""
+        call.progress.note(f"{stage}: taken from the ground truth")
+        if stage == "poses":
+            return self.poses(call["frames"], call.options, work_dir=call.scratch, progress=call.progress)
+        if stage == "depth":
+            return self.depth(call["poses"], sized_camera(call["poses"].camera, call.options.depth_side_px))
+        if stage == "world":
+            return self.world(call["poses"])
+        return self.instances(*call.in_world(), call["surface"])
 
     def poses(
         self, frames: FrameSet, config: PosesConfig, *, work_dir: Path, progress: Progress

@@ -1,8 +1,9 @@
 """Progress reporting as an argument: stages call it, only the command line shows it."""
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from reconstruction.profiling import Usage
+if TYPE_CHECKING:
+    from reconstruction.profiling import Usage
 
 
 class Progress(Protocol):
@@ -24,7 +25,7 @@ class StageListener(Progress, Protocol):
     def begin_stage(self, name: str, number: int, total: int, cached: bool) -> None:
         """A stage begins, or is taken from the cache."""
 
-    def end_stage(self, name: str, usage: Usage | None) -> None:
+    def end_stage(self, name: str, usage: "Usage | None") -> None:
         """A stage is done; `usage` is None if it came from the cache."""
 
 
@@ -34,7 +35,7 @@ class NoProgress:
     def begin_stage(self, name: str, number: int, total: int, cached: bool) -> None:
         """See `StageListener.begin_stage`."""
 
-    def end_stage(self, name: str, usage: Usage | None) -> None:
+    def end_stage(self, name: str, usage: "Usage | None") -> None:
         """See `StageListener.end_stage`."""
 
     def start(self, total: int, label: str) -> None:

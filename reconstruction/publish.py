@@ -16,13 +16,14 @@ from reconstruction.assembly import base_slabs
 from reconstruction.assets.gltf import write_glb, write_obj
 from reconstruction.assets.physics.load import physics_backend
 from reconstruction.cache import canonical_json
+from reconstruction.costs import OTHER, PUBLISH
 from reconstruction.gaussians import write_ply
 from reconstruction.instance_views import write_views
 from reconstruction.instances import backends as instance_backends
 from reconstruction.instances.gaussian_ids import add_instances_to_ply, gaussian_instances
 from reconstruction.phrases import Described, phrases
 from reconstruction.preview import render_preview
-from reconstruction.profiling import OTHER, PUBLISH, Usage, UsageMeter
+from reconstruction.profiling import Usage, UsageMeter
 from reconstruction.scene_graph import backend_name
 from reconstruction.scene_graph.publishing import graph_of_bundle
 from reconstruction.types import (
@@ -40,7 +41,7 @@ from registry.primitives import primitive_of
 from registry.report_card import failures
 
 if TYPE_CHECKING:
-    from reconstruction.pipeline import Run
+    from reconstruction.runner import Run
 
 SCHEMA = "simrecon.scene/1"
 _RECORDED_PACKAGES = (

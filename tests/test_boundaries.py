@@ -1,11 +1,15 @@
 """Imports stay light and point inward: reconstruction -> registry <- simrecon_envs."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from reconstruction.code_digest import imported_modules
+from reconstruction.pipeline import STAGES
 
 ROOT = Path(__file__).resolve().parent.parent
 HEAVY = ("torch", "sapien", "mani_skill", "numba", "pycolmap", "trimesh", "cv2", "scipy", "coacd", "skimage")
@@ -48,3 +52,31 @@ def test_no_file_imports_against_the_direction(package, forbidden):
                 names = [node.module]
             wrong = {name for name in names if name.split(".")[0] in forbidden}
             assert not wrong, f"{file.relative_to(ROOT)} imports {wrong}"
+
+
+PACKAGES = ("registry", "reconstruction", "simrecon_envs", "synthetic", "priors", "benchmarks")
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    names = {
+        ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
+        for package in PACKAGES
+        for file in (ROOT / package).rglob("*.py")
+    }
+    graph = {name: imported_modules(file, PACKAGES) & names.keys() for name, file in names.items()}
+    order = list(
+        graphlib.TopologicalSorter(graph).static_order()
+    )  # raises CycleError, which names the circle
+    assert len(order) == len(names) > 500
+
+
+def test_a_stage_imports_no_later_stage():
+    packages = [stage.package for stage in STAGES]
+    for row, package in enumerate(packages):
+        folder = ROOT.joinpath(*package.split("."))
+        files = list(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
+        for file in files:
+            for name in imported_modules(file, ("reconstruction",)):
+                later = [p for p in packages[row + 1 :] if name == p or name.startswith(f"{p}.")]
+                assert not later, f"{file.relative_to(ROOT)} imports {name}"
+                assert not name.startswith(("reconstruction.runner", "reconstruction.pipeline")), file

@@ -21,9 +21,9 @@ from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
 from reconstruction.editing.overrides import Overrides
 from reconstruction.instance_views import write_views
-from reconstruction.pipeline import Run
 from reconstruction.report.contact_page import save_picture
 from reconstruction.report.contact_sheet import ContactSheet, crops_sheet, frame_picture
+from reconstruction.runner import Run
 from reconstruction.types import InstanceSet
 
 WIDTH_PX, GAP_PX, MAX_BYTES = 1320, 8, 250_000

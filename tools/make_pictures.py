@@ -25,8 +25,8 @@ def main() -> None:
     parser.add_argument("--scene", default="demo_room")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "demo.png")
     arguments = parser.parse_args()
-    from reconstruction.pipeline import reconstruct
     from reconstruction.preview import best_view, render_textured, scene_meshes
+    from reconstruction.video_to_scene import reconstruct
 
     run = reconstruct(arguments.video, scene_id=arguments.scene).run
     posed, _ = run.in_world()

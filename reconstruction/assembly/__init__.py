@@ -30,7 +30,6 @@ from registry.report_card import (
 )
 from registry.simulation import TIMESTEP_S, BodySpec, build_physics, pose_change
 
-VERSION = 7
 _MARGIN = 0.5  # of each bound of the report card: what moves more than this share of it is repaired
 _FREE_S = 0.5  # without damping, after all have settled together
 
@@ -250,4 +249,4 @@ def _finish(placement: Placement, stable: bool) -> PlacedObject:
     )
 
 
-__all__ = ["ASSEMBLY_PRESETS", "VERSION", "AssemblyConfig", "assemble", "base_slabs"]
+__all__ = ["ASSEMBLY_PRESETS", "AssemblyConfig", "assemble", "base_slabs"]

@@ -8,9 +8,7 @@ from reconstruction.avo import SceneViews
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, Surface
 
-__all__ = ("ASSETS_PRESETS", "VERSION", "AssetsConfig", "build_assets", "outside_inputs", "wants_views")
-
-VERSION = 22
+__all__ = ("ASSETS_PRESETS", "AssetsConfig", "build_assets", "outside_inputs", "wants_views")
 
 
 def build_assets(

@@ -11,12 +11,9 @@ from reconstruction.avo.scene import Target, ViewScene, make_target, prepare_sce
 from reconstruction.avo.stage import SceneViews, make_views
 from reconstruction.avo.strategies import STRATEGIES, Strategy, Viewpoint, load_strategy
 
-VERSION = 5
-
 __all__ = [
     "AVO_PRESETS",
     "STRATEGIES",
-    "VERSION",
     "AvoConfig",
     "Inpainter",
     "SceneViews",

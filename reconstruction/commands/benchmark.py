@@ -214,7 +214,7 @@ def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None
 
 
 def _add_work(parser: argparse.ArgumentParser, jobs: bool = True) -> None:
-    from reconstruction.cli import add_common
+    from reconstruction.commands.options import add_common
 
     if jobs:
         parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")

@@ -31,7 +31,7 @@ on something is fixed to it. Units are metres and kilograms, +z is up (in scene.
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Register the verb."""
-    from reconstruction.cli import add_common
+    from reconstruction.commands.options import add_common
 
     parser = verbs.add_parser(
         "export",

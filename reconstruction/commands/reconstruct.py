@@ -29,7 +29,7 @@ examples:
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Register the verb."""
-    from reconstruction.cli import add_common
+    from reconstruction.commands.options import add_common
 
     parser = verbs.add_parser(
         "reconstruct",
@@ -118,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     from reconstruction.commands.reporting import make_listener
     from reconstruction.editing.overrides import Overrides
-    from reconstruction.pipeline import reconstruct
+    from reconstruction.video_to_scene import reconstruct
 
     listener = make_listener(quiet=arguments.quiet or arguments.json)
     with listener:
@@ -197,7 +197,7 @@ def config_of(arguments: argparse.Namespace) -> object:
 
 def _print_result(result: object, arguments: argparse.Namespace) -> None:
     from reconstruction.commands.scenes import describe_scene
-    from reconstruction.profiling import costs_json
+    from reconstruction.costs import costs_json
     from registry import SceneRegistry
 
     registry = SceneRegistry(arguments.registry)

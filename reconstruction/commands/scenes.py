@@ -12,7 +12,7 @@ from registry.errors import EnvironmentMissing, UsageError
 
 def add_parsers(verbs: argparse._SubParsersAction) -> None:
     """Register the verbs."""
-    from reconstruction.cli import add_common
+    from reconstruction.commands.options import add_common
 
     def add(name: str, text: str, run: object, scene: bool = True) -> argparse.ArgumentParser:
         parser = verbs.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
@@ -122,7 +122,7 @@ def run_show(arguments: argparse.Namespace) -> int:
     if arguments.out:
         raise UsageError("--out belongs to: simrecon show SCENE --instances, --views or --graph")
     if arguments.json:
-        from reconstruction.profiling import costs_json
+        from reconstruction.costs import costs_json
 
         costs = costs_json(bundle.scene["report"])
         print(json.dumps({"record": _record_json(record), "costs": costs, "scene": bundle.scene}, indent=2))
@@ -175,7 +175,7 @@ def _show_instances(arguments: argparse.Namespace, bundle: SceneBundle) -> int:
 
 def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
     """Say what was found, how sure it is, what it cost, and where the files are."""
-    from reconstruction.profiling import describe_costs
+    from reconstruction.costs import describe_costs
 
     scene = bundle.scene
     names = {b["id"]: b["label"] for b in scene["base"]} | {o["id"]: o["label"] for o in scene["objects"]}

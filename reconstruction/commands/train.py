@@ -31,7 +31,7 @@ examples:
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Register the verb."""
-    from reconstruction.cli import add_common
+    from reconstruction.commands.options import add_common
 
     parser = verbs.add_parser(
         "train",

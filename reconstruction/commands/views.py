@@ -9,8 +9,9 @@ from reconstruction.cache import StageStore
 from reconstruction.commands.reporting import make_listener
 from reconstruction.config import PipelineConfig
 from reconstruction.evaluation.stage_results import StageResults
-from reconstruction.pipeline import STAGES, Run
+from reconstruction.pipeline import STAGES
 from reconstruction.report.view_sheet import write_view_sheets
+from reconstruction.runner import Run
 from registry import SceneBundle
 from registry.errors import EnvironmentMissing, UsageError
 

@@ -3,6 +3,4 @@
 from reconstruction.depth.config import DEPTH_PRESETS, DepthConfig
 from reconstruction.depth.estimate import estimate_depth
 
-VERSION = 10
-
-__all__ = ["DEPTH_PRESETS", "VERSION", "DepthConfig", "estimate_depth"]
+__all__ = ["DEPTH_PRESETS", "DepthConfig", "estimate_depth"]

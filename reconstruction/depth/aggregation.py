@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.depth.channels import BINS, PLANES
+
 WEIGHTS = Path(__file__).parent / "weights" / "aggregation.safetensors"
-PLANES, BINS = 96, 48  # of the sweeps that the network is trained on, and of its input
 _HOPELESS = 508.0  # sum of eight path costs behind the winner from which a bin has no chance
 
 

@@ -1,16 +1,16 @@
 """Stage 3: posed frames -> depth maps."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.evidence import PREDICTED, Evidence, count_views, inverse
+from reconstruction.depth.images import gray_images, sized_camera, small_color
 from reconstruction.depth.monocular import MonocularBackend, fill_from_predictions, load_monocular
 from reconstruction.depth.perturb import perturbed
 from reconstruction.depth.views import ViewPlan, plan_views
+from reconstruction.depth.workers import Workers
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import Camera, DepthMaps, PosedFrames
 from registry.errors import InputError
@@ -21,54 +21,11 @@ _BEND_REACH = 0.06  # of the width: how far known depth bends predictions beside
 _SURE_CORRELATION = 0.5  # a pixel that changed its surface counts as measured from here on
 
 
-def sized_camera(camera: Camera, side: int) -> Camera:
-    """Return the camera at a resolution whose longer side is at most `side` pixels."""
-    scale = min(1.0, side / max(camera.width, camera.height))
-    return camera.resized(max(16, round(camera.width * scale)), max(16, round(camera.height * scale)))
-
-
-def gray_images(images: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return float32 gray levels minus 128 (n, h, w) at the camera's resolution."""
-    import cv2
-
-    out = np.empty((len(images), camera.height, camera.width), np.float32)
-    for i, image in enumerate(images):
-        gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float32)
-        out[i] = cv2.resize(gray, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    out -= 128.0
-    return out
-
-
-def small_color(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return a picture float32 (h, w, 3), 0 to 255, at the camera's resolution."""
-    import cv2
-
-    size = (camera.width, camera.height)
-    return cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA).astype(np.float32)
-
-
 def _warps(posed: PosedFrames, camera: Camera, i: int, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (s, 3, 3) and (s, 3): a pixel p of frame i at inverse depth rho is at h_inf @ p + rho * shift."""
     k, k_inv = camera.matrix, np.linalg.inv(camera.matrix)
     relative = invert_rigid(posed.world_from_camera[sources]) @ posed.world_from_camera[i]
     return k @ relative[:, :3, :3] @ k_inv, relative[:, :3, 3] @ k.T
-
-
-class Workers:
-    """Runs a function for every frame on a few threads; the kernels release the interpreter."""
-
-    def __init__(self, threads: int):
-        import os
-
-        self.threads = (
-            threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads or 2
-        )
-
-    def each(self, n: int, work: Callable[[int], None], label: str, progress: Progress) -> None:
-        progress.start(n, label)
-        with ThreadPoolExecutor(self.threads) as pool:
-            for _ in pool.map(work, range(n)):
-                progress.advance()
 
 
 def sweep_frame(i, gray, posed, camera: Camera, plan: ViewPlan, rhos: np.ndarray, noise: float) -> np.ndarray:

@@ -13,15 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.depth.candidates import candidate_depths, choose_candidates
+from reconstruction.depth.channels import AFFINITIES, FEATURES
 from reconstruction.depth.evidence import COMPLETED, MEASURED, PREDICTED, Evidence, count_views, inverse
+from reconstruction.depth.images import small_color
 from reconstruction.progress import NO_PROGRESS, Progress
 from reconstruction.types import PosedFrames
 
 WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
-FEATURES = 13
-OFFSETS_PX = (1, 4, 12)
-"""Distances at which the network says whether two pixels are of one thing, to the right and downwards."""
-AFFINITIES = 2 * len(OFFSETS_PX)
 _AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against
 _MANY_VIEWS = 10.0
 _OWN_ODDS = 8.0  # odds of a pixel's own depth over those in the rooms of the training (docs/priors.md)
@@ -77,7 +75,7 @@ def candidate_shares(
 
     The first array, float32 (k, h, w), sums to 1 with what is missing: "none of them". The second, float32 (6, h, w),
     is the probability that a pixel and the one 1 px to its right, 1 px below, 4 px to the right, ... are of one thing
-    (`OFFSETS_PX`).
+    (`channels.OFFSETS_PX`).
 
     One thread, so that the result does not depend on how many there are; call it from several.
 
@@ -126,8 +124,6 @@ def mend_depth(
         progress: Where steps and shares are reported.
         weights: Of the network.
     """
-    from reconstruction.depth.estimate import small_color
-
     agree, through = count_views(found.depth, posed, found.camera, found.neighbors, each, progress)
     depth, origin = np.zeros_like(found.depth), np.zeros_like(found.origin)
     count, h, w = depth.shape

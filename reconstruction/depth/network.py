@@ -11,9 +11,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from reconstruction.depth.aggregation import BINS
 from reconstruction.depth.candidates import OFFSETS
-from reconstruction.depth.mending import FEATURES, OFFSETS_PX
+from reconstruction.depth.channels import BINS, FEATURES, OFFSETS_PX
 
 WIDTHS = (48, 64, 96, 128, 128)
 """Channels at a half, a quarter, ... of the resolution."""

@@ -9,14 +9,12 @@ from reconstruction.gaussians.fit import fit_gaussians
 from reconstruction.gaussians.model import Gaussians, moved
 from reconstruction.gaussians.ply import read_ply, write_ply
 from reconstruction.gaussians.rasterizer import RasterSettings
-from reconstruction.gaussians.rendering import Render, render_gaussians
+from reconstruction.gaussians.rendering import Render
 from reconstruction.gaussians.stage import GaussianScene, make_gaussians
-
-VERSION = 4
+from reconstruction.gaussians.views import render_gaussians
 
 __all__ = [
     "GAUSSIANS_PRESETS",
-    "VERSION",
     "GaussianScene",
     "Gaussians",
     "GaussiansConfig",

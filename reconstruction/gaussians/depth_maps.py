@@ -6,7 +6,7 @@ import numpy as np
 
 from reconstruction.depth import DepthConfig
 from reconstruction.depth.views import plan_views
-from reconstruction.gaussians.backends import Backend
+from reconstruction.gaussians.backend import Backend
 from reconstruction.gaussians.config import GaussiansConfig
 from reconstruction.gaussians.model import Gaussians
 from reconstruction.gaussians.rasterizer import RasterSettings

@@ -8,7 +8,7 @@ import numpy as np
 from reconstruction.gaussians.losses import ssim
 from reconstruction.gaussians.model import Gaussians
 from reconstruction.gaussians.rasterizer import RasterSettings
-from reconstruction.gaussians.rendering import render_gaussians
+from reconstruction.gaussians.views import render_gaussians
 from reconstruction.types import PosedFrames
 
 

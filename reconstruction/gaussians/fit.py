@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.gaussians.backends import Backend, load_backend
+from reconstruction.gaussians.backend import Backend
+from reconstruction.gaussians.backends import load_backend
 from reconstruction.gaussians.config import GaussiansConfig
 from reconstruction.gaussians.holes import fill_holes
 from reconstruction.gaussians.losses import FrameTarget, weights_of

@@ -6,7 +6,7 @@ blended depth, and the distortion is its L1 form. Cut-offs are gsplat's own; of 
 
 import numpy as np
 
-from reconstruction.gaussians.backends import StepResult
+from reconstruction.gaussians.backend import StepResult
 from reconstruction.gaussians.losses import FrameTarget, LossWeights
 from reconstruction.gaussians.model import SH_C0
 from reconstruction.gaussians.rasterizer import RasterSettings

@@ -4,10 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.gaussians.model import Gaussians
-from reconstruction.gaussians.rasterizer import RasterSettings
-from reconstruction.types import Camera
-
 
 @dataclass(frozen=True)
 class Render:
@@ -26,30 +22,3 @@ class Render:
     def uint8(self) -> np.ndarray:
         """Return the color as an image."""
         return np.round(np.clip(self.color, 0, 1) * 255).astype(np.uint8)
-
-
-def render_gaussians(
-    gaussians: Gaussians,
-    camera: Camera,
-    world_from_camera: np.ndarray,
-    *,
-    settings: RasterSettings | None = None,
-    pixel_weights: np.ndarray | None = None,
-    backend: str = "cpu",
-) -> Render:
-    """Render a view.
-
-    Args:
-        gaussians: Of `fit_gaussians`, or read from a .ply.
-        camera: Pinhole camera.
-        world_from_camera: (4, 4) rigid, in the space of the Gaussians.
-        settings: Cut-offs; `near` counts in the units of the scene.
-        pixel_weights: (h, w) to also sum alpha T of every Gaussian over the pixels with these weights: ones for its
-            contribution to the view, a mask of one object's pixels for its share in that object.
-        backend: "cpu" or "gsplat".
-    """
-    from reconstruction.gaussians.backends import load_backend
-
-    return load_backend(backend).render(
-        gaussians.packed(), camera, world_from_camera, settings or RasterSettings(), pixel_weights
-    )

@@ -1,8 +1,16 @@
 """Stage 2: poses. A `FrameSet` in, `PosedFrames` in `sfm` space out."""
 
+from pathlib import Path
+
+from reconstruction.cache import digest_input
 from reconstruction.poses.config import POSES_PRESETS, PosesConfig
 from reconstruction.poses.estimate import estimate_poses
 
-VERSION = 2
 
-__all__ = ["POSES_PRESETS", "VERSION", "PosesConfig", "estimate_poses"]
+def outside_inputs(config: PosesConfig) -> tuple[str, ...]:
+    """Return the digest of imported poses: other ones must not reuse a result."""
+    path = Path(config.import_path) if config.import_path else None
+    return (digest_input(path),) if path is not None and path.exists() else ()
+
+
+__all__ = ["POSES_PRESETS", "PosesConfig", "estimate_poses", "outside_inputs"]

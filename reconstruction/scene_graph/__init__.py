@@ -18,7 +18,7 @@ from reconstruction.scene_graph.base import (
     SaidEdge,
 )
 from reconstruction.scene_graph.config import SCENE_GRAPH_PRESETS, SceneGraphConfig
-from reconstruction.scene_graph.load import RECORDS, backend_name, load_relations, outside_inputs
+from reconstruction.scene_graph.load import RECORDS, backend_name, load_relations, outside_inputs, wants_views
 from reconstruction.scene_graph.regions import find_regions
 from reconstruction.scene_graph.relations import GeometryRelations
 from reconstruction.scene_graph.synthesis import synthesize
@@ -27,8 +27,6 @@ from registry.errors import InputError
 
 if TYPE_CHECKING:
     from reconstruction.avo import ViewScene
-
-VERSION = 2
 
 
 def infer_scene_graph(
@@ -84,7 +82,6 @@ def region_questions(assets: AssetSet, config: SceneGraphConfig) -> list[Questio
 __all__ = [
     "RECORDS",
     "SCENE_GRAPH_PRESETS",
-    "VERSION",
     "GeometryRelations",
     "LocalGraph",
     "MergeStep",
@@ -98,4 +95,5 @@ __all__ = [
     "outside_inputs",
     "region_questions",
     "synthesize",
+    "wants_views",
 ]

@@ -94,6 +94,11 @@ def backend_name(config: SceneGraphConfig) -> str:
     return f"{config.backend} ({config.model or default})"
 
 
+def wants_views(config: SceneGraphConfig) -> bool:
+    """Tell whether the backend looks at views of the scene."""
+    return config.backend != "geometry"
+
+
 def outside_inputs(config: SceneGraphConfig) -> tuple[str, ...]:
     """Return what stands behind the names in the config: another model must not reuse a result."""
     return () if config.backend == "geometry" else (f"relations {backend_name(config)}",)

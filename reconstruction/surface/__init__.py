@@ -3,6 +3,4 @@
 from reconstruction.surface.config import SURFACE_PRESETS, SurfaceConfig
 from reconstruction.surface.fuse import fuse_surface
 
-VERSION = 3
-
-__all__ = ["SURFACE_PRESETS", "VERSION", "SurfaceConfig", "fuse_surface"]
+__all__ = ["SURFACE_PRESETS", "SurfaceConfig", "fuse_surface"]

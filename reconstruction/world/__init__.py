@@ -5,10 +5,7 @@ from reconstruction.world.frame import find_world, rescale_for_object
 from reconstruction.world.object_scale import settle_object_height
 from reconstruction.world.request import ScaleRequest, parse_scale
 
-VERSION = 3
-
 __all__ = [
-    "VERSION",
     "WORLD_PRESETS",
     "ScaleRequest",
     "WorldConfig",

@@ -1,34 +1,18 @@
 """The oracle's runs of a suite, recorded: every episode is run again, and kept if it succeeds."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from registry import UsageError
+from simrecon_envs.benchmark.demonstration import Demonstration
 from simrecon_envs.benchmark.episodes import run_episode
 from simrecon_envs.benchmark.policies import CONTROL_MODE, OraclePolicy
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.run import RunSettings, check_revisions
 from simrecon_envs.benchmark.suite import Suite, SuiteTask
 from simrecon_envs.files import absolute
-
-
-@dataclass(frozen=True, kw_only=True)
-class Demonstration:
-    """One episode: what was seen before each action, the action, and what came of it."""
-
-    task: str
-    instruction: str
-    robot: str
-    seed: int
-    fps: int
-    joint_names: tuple[str, ...]
-    observations: list[dict]  # t of them, NumPy, as with obs_mode "state_dict" or one with pictures
-    actions: np.ndarray  # float32 (t, a)
-    rewards: np.ndarray  # float32 (t,)
-    success: np.ndarray  # bool (t,)
 
 
 def record_demonstrations(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from registry import EnvironmentMissing, UsageError
-from simrecon_envs.benchmark.demonstrations import Demonstration
+from simrecon_envs.benchmark.demonstration import Demonstration
 from simrecon_envs.files import write_json
 from simrecon_envs.rollout import open_video
 

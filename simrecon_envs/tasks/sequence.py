@@ -8,6 +8,7 @@ import torch
 from simrecon_envs.arrays import Array, clamp, pick, real, stack, where, whole
 from simrecon_envs.tasks.base import Info, Task
 from simrecon_envs.tasks.facts import SceneFacts
+from simrecon_envs.tasks.kinds import KINDS
 from simrecon_envs.tasks.spec import TaskSpec
 
 
@@ -22,17 +23,13 @@ class Sequence(Task):
 
     @classmethod
     def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
-        from simrecon_envs.tasks import kind_of
-
-        out = [goals for stage in spec.stages for goals in kind_of(stage).interests(facts, stage)]
+        out = [goals for stage in spec.stages for goals in KINDS[stage.kind].interests(facts, stage)]
         others = {stage.subject for stage in spec.stages[1:]} & facts.targets.keys()
         return out + [facts.targets[key].center[None] for key in sorted(others)]
 
     def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
         super().__init__(env, spec, placement)
-        from simrecon_envs.tasks import kind_of
-
-        self.stages = [kind_of(stage)(env, stage, placement) for stage in spec.stages]
+        self.stages = [KINDS[stage.kind](env, stage, placement) for stage in spec.stages]
 
     @property
     def max_reward(self) -> float:
@@ -40,9 +37,7 @@ class Sequence(Task):
 
     @classmethod
     def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
-        from simrecon_envs.tasks import kind_of
-
-        return " Then: ".join(kind_of(stage).words(facts, stage) for stage in spec.stages)
+        return " Then: ".join(KINDS[stage.kind].words(facts, stage) for stage in spec.stages)
 
     def start(self, env_idx: torch.Tensor, rng: object) -> None:
         if not hasattr(self, "stage"):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.cache import StageStore, fingerprint
+from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
 from reconstruction.editing.addresses import Address, parse_address
 from reconstruction.editing.anchors import Footage, Pointer
@@ -15,9 +15,10 @@ from reconstruction.editing.overrides import Overrides
 from reconstruction.gaussians import Gaussians, GaussianScene
 from reconstruction.instance_views import choose_views
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.pipeline import STAGES, Run
+from reconstruction.pipeline import STAGES
 from reconstruction.poses.lens import Lens
 from reconstruction.progress import NO_PROGRESS
+from reconstruction.runner import Run
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.types import ScaleEstimate, WorldFrame
 from registry.errors import UsageError
@@ -164,13 +165,13 @@ def shifted(camera) -> np.ndarray:
 
 def seeded_store(folder, results: dict, config: PipelineConfig) -> StageStore:
     """Return a store in which the stages before the cut are finished."""
-    store, keys = StageStore(folder), {}
+    store = StageStore(folder)
+    run = Run(Path("film.mp4"), config, store, input_digest=results["frames"].source.sha256)
     for number, stage in enumerate(STAGES[:6], start=1):
-        upstream = tuple(keys[name] for name in stage.needs) or (results["frames"].source.sha256,)
-        keys[stage.name] = fingerprint(stage.name, stage.module, (getattr(config, stage.name), []), upstream)
+        run.keys[stage.name] = run.key_of(stage, [])
         usage = {"wall_s": 1.0, "cpu_s": 1.0, "peak_memory_mb": 1.0}
         record = {"usage": usage, "notes": []}
-        store.save(results[stage.name], number, stage.name, keys[stage.name], record)
+        store.save(results[stage.name], number, stage.name, run.keys[stage.name], record)
     return store
 
 

@@ -10,9 +10,11 @@ import pytest
 from benchmarks.depth_figures import ring_counts
 from reconstruction.depth import DepthConfig, estimate_depth, mending
 from reconstruction.depth.candidates import OFFSETS, candidate_depths, choose_candidates
-from reconstruction.depth.estimate import Workers, gather_evidence
+from reconstruction.depth.channels import OFFSETS_PX
+from reconstruction.depth.estimate import gather_evidence
 from reconstruction.depth.mending import candidate_shares, mending_features
 from reconstruction.depth.weights import load_network
+from reconstruction.depth.workers import Workers
 from synthetic.capture import make_test_capture
 
 
@@ -143,8 +145,8 @@ def test_affinities_of_the_keyframes_go_with_the_maps():
     maps = estimate_depth(capture.posed, DepthConfig(depth_side_px=320, prior="mending"))
     assert maps.affinity.shape == (6, mending.AFFINITIES, 120, 160)
     ids = capture.id_maps[:, ::2, ::2]
-    step = mending.OFFSETS_PX[-1] // 2
-    said = maps.affinity[:, 2 * (len(mending.OFFSETS_PX) - 1), :, :-step]
+    step = OFFSETS_PX[-1] // 2
+    said = maps.affinity[:, 2 * (len(OFFSETS_PX) - 1), :, :-step]
     same = ids[:, :, :-step] == ids[:, :, step:]
     known = (ids[:, :, :-step] > 0) & (ids[:, :, step:] > 0)
     assert said[known & same].mean() > said[known & ~same].mean() + 64

@@ -145,7 +145,7 @@ def test_hard_input_works_through_the_poses(name, tmp_path):
     HARD_VIDEOS[name](path)
     code = (
         "import sys\nfrom pathlib import Path\nfrom reconstruction.cache import StageStore\n"
-        "from reconstruction.config import PipelineConfig\nfrom reconstruction.pipeline import Run\n"
+        "from reconstruction.config import PipelineConfig\nfrom reconstruction.runner import Run\n"
         "run = Run(Path(sys.argv[1]), PipelineConfig.from_preset('fast'), StageStore(Path(sys.argv[2])))\n"
         "run.execute(until='world')\nposed = run.results['poses']\n"
         "print(len(posed.images) / posed.chosen_frames, run.results['world'].floor_observed)\n"

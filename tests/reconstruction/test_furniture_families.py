@@ -8,7 +8,7 @@ import pytest
 
 from registry.errors import UsageError
 from synthetic import footprints
-from synthetic.arrangements import LAYOUTS, draw_room
+from synthetic.arrangements import LAYOUTS
 from synthetic.furniture import Workshop
 from synthetic.furniture_families import (
     CLOTH_KINDS,
@@ -19,6 +19,7 @@ from synthetic.furniture_families import (
 )
 from synthetic.layout import KINDS, Shape
 from synthetic.procedural import RoomSpec, build_procedural_room, furnish, plan_room
+from synthetic.random_rooms import draw_room
 from synthetic.shapes import COARSE, signed_volume
 
 ROUGH = {"step_m": COARSE, "density": 0.03}

@@ -18,11 +18,11 @@ from reconstruction.instances.lifting import lift_masks
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import FrameMasks
 from reconstruction.instances.superpoints import superpoints
-from reconstruction.pipeline import reconstruct
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.rasterize import rasterize_mesh
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import Camera, DepthMaps
+from reconstruction.video_to_scene import reconstruct
 from registry.errors import UsageError
 
 WHITE = (200, 200, 190)

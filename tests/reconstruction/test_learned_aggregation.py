@@ -10,14 +10,13 @@ import torch
 
 from reconstruction.depth import DepthConfig, aggregation
 from reconstruction.depth.aggregation import (
-    BINS,
-    PLANES,
     aggregate_costs,
     bin_costs,
     line_of_places,
     place_of_depth,
     smoothed_scores,
 )
+from reconstruction.depth.channels import BINS, PLANES
 from reconstruction.depth.estimate import gather_evidence
 from reconstruction.depth.evidence import PREDICTED
 from reconstruction.depth.network import Aggregation, place_of

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reconstruction.profiling import UsageMeter, cost_rows, costs_json, describe_costs
+from reconstruction.costs import cost_rows, costs_json, describe_costs
+from reconstruction.profiling import UsageMeter
 
 ROOT = Path(__file__).resolve().parents[2]
 _MB = 2**20

@@ -18,7 +18,8 @@ from reconstruction.avo.pictures import _hidden_holes
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
 from reconstruction.instances.naming.views import ObjectView
-from reconstruction.pipeline import DEFAULT_STAGE_NAMES, STAGE_NAMES, STAGES, Run
+from reconstruction.pipeline import DEFAULT_STAGE_NAMES, STAGE_NAMES, STAGES
+from reconstruction.runner import Run
 from reconstruction.types import Instance, InstanceSet, PosedFrames
 from registry.errors import UsageError
 

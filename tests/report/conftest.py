@@ -16,11 +16,12 @@ from reconstruction.evaluation.evaluate import evaluate_scene
 from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.gaussians import GaussiansConfig, make_gaussians
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.pipeline import STAGES, Run
+from reconstruction.pipeline import STAGES
 from reconstruction.profiling import Usage
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.publish import publish_scene
 from reconstruction.report.page import build_page
+from reconstruction.runner import Run
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.types import ScaleEstimate, WorldFrame

@@ -13,7 +13,7 @@ import numpy as np
 from reconstruction.assets.collision.build import collision_parts
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid
-from reconstruction.cache import source_digest
+from reconstruction.code_digest import code_digest
 from reconstruction.progress import NoProgress, Progress
 from reconstruction.requesting import write_whole
 from reconstruction.types import ConvexPart
@@ -69,8 +69,7 @@ class _Watch(NoProgress):
 
 def _digest(solid: Solid, config: AssetsConfig, levels: tuple[float, ...]) -> str:
     options = {key: value for key, value in asdict(config).items() if not key.startswith(_ELSEWHERE)}
-    modules = ("reconstruction.assets.collision", "reconstruction.assets.solid", "registry.primitives")
-    code = [source_digest(module) for module in modules]
+    code = code_digest("reconstruction.assets.collision")
     digest = hashlib.sha256(json.dumps([options, levels, code, version("coacd")]).encode())
     for array in (np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int32)):
         digest.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())

@@ -9,13 +9,13 @@ import re
 from pathlib import Path
 
 from reconstruction.decoding import ImageFolder
+from reconstruction.phone_exports.exports import find_export, turned_camera
+from reconstruction.phone_exports.named_poses import ImportedPoses, NamedPoses
+from reconstruction.phone_exports.polycam import read_polycam
+from reconstruction.phone_exports.record3d import read_record3d
 from reconstruction.poses.importers.colmap import read_colmap
-from reconstruction.poses.importers.exports import find_export, turned_camera
 from reconstruction.poses.importers.model import check_consistency, model_from_poses
 from reconstruction.poses.importers.nerfstudio import read_transforms
-from reconstruction.poses.importers.polycam import read_polycam
-from reconstruction.poses.importers.record3d import read_record3d
-from reconstruction.poses.importers.shared import ImportedPoses, NamedPoses
 from reconstruction.types import FrameSet
 from registry.errors import UsageError
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.poses.importers.shared import NamedPoses
+from reconstruction.phone_exports.named_poses import NamedPoses
 from registry.errors import UsageError
 
 

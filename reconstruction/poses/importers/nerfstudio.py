@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.poses.importers.shared import OPENGL_FROM_OPENCV, NamedPoses
+from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses
 from registry.errors import UsageError
 
 

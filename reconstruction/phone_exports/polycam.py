@@ -4,8 +4,8 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from reconstruction.poses.importers.exports import Export, turned_camera, upright_turns
-from reconstruction.poses.importers.shared import OPENGL_FROM_OPENCV, NamedPoses, pinhole
+from reconstruction.phone_exports.exports import Export, turned_camera, upright_turns
+from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, pinhole
 from registry.errors import InputError
 
 _MAX_FOCAL_SPREAD = 0.03  # relative; autofocus moves it by less

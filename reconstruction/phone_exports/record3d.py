@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from reconstruction.poses.importers.exports import Export
-from reconstruction.poses.importers.shared import OPENGL_FROM_OPENCV, NamedPoses, pinhole
+from reconstruction.phone_exports.exports import Export
+from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, pinhole
 from registry.errors import InputError
 
 

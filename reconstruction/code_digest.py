@@ -1,0 +1,123 @@
+"""Digest of the code behind a module: the module and all that it imports, directly or not, in this project.
+
+Comments, docstrings and layout do not count: the digest is over syntax trees. Files that a package reads beside its
+code (weights, prompts, word lists) count with the modules of their folder. Imports inside functions are followed,
+those for type checkers alone are not. Nothing is imported.
+"""
+
+import ast
+import hashlib
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+
+PACKAGES = ("reconstruction", "registry")
+_DATA = (".txt", ".safetensors")
+
+
+def code_digest(module: str, packages: tuple[str, ...] = PACKAGES) -> str:
+    """Return the SHA-256 over a module and all modules of `packages` that it imports, with their data files.
+
+    Args:
+        module: dotted name.
+        packages: top-level packages whose imports are followed; the module may be of another one.
+    """
+    digest = hashlib.sha256()
+    folders = set()
+    for name in modules_behind(module, packages):
+        file = _file_of(name)
+        digest.update(f"{name}\0{_source(file, packages)[0]}\0".encode())
+        folders.add(file.parent)
+    for file in sorted({data for folder in folders for data in _data_files(folder)}):
+        digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def modules_behind(module: str, packages: tuple[str, ...] = PACKAGES) -> list[str]:
+    """Return the names of the modules that a module imports, directly or not, and its own, in order."""
+    found, open_ends = {module}, [module]
+    while open_ends:
+        new = set(_source(_file_of(open_ends.pop()), packages)[1]) - found
+        found |= new
+        open_ends += sorted(new)
+    return sorted(found)
+
+
+def tree_digest(file: Path) -> str:
+    """Return the SHA-256 over the syntax tree of one file, without docstrings."""
+    return _source(file, ())[0]
+
+
+def imported_modules(file: Path, packages: tuple[str, ...] = PACKAGES) -> frozenset[str]:
+    """Return the modules of `packages` that a file imports, anywhere but for type checkers alone."""
+    return _source(file, packages)[1]
+
+
+def _source(file: Path, packages: tuple[str, ...]) -> tuple[str, frozenset[str]]:
+    """Return the digest of a file's syntax tree, and the modules of `packages` that it imports."""
+    stat = file.stat()
+    return _parsed(file, stat.st_mtime_ns, stat.st_size, packages)
+
+
+@lru_cache(maxsize=4096)
+def _parsed(file: Path, mtime_ns: int, size: int, packages: tuple[str, ...]) -> tuple[str, frozenset[str]]:
+    tree = _Bare().visit(ast.parse(file.read_bytes(), str(file)))
+    imported: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names}
+            modules = {name for name in inside if name.split(".")[0] in packages and _exists(name)}
+            imported |= modules if modules == inside else modules | {node.module}
+    own = frozenset(name for name in imported if name.split(".")[0] in packages)
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), own
+
+
+class _Bare(ast.NodeTransformer):
+    """Drops docstrings and what only type checkers read."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if is_text else self.generic_visit(node)
+
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt] | None:
+        if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            return [self.visit(statement) for statement in node.orelse] or None
+        return self.generic_visit(node)
+
+
+def _file_of(module: str) -> Path:
+    base = _base_of(module)
+    package = base / "__init__.py"
+    return package if package.is_file() else base.with_suffix(".py")
+
+
+def _exists(module: str) -> bool:
+    return _file_of(module).is_file()
+
+
+def _base_of(module: str) -> Path:
+    package, *rest = module.split(".")
+    return _root_of(package).joinpath(*rest)
+
+
+@lru_cache(maxsize=64)
+def _root_of(package: str) -> Path:
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError(f"no package {package}", name=package)
+    file = Path(spec.origin)
+    return file.parent if file.name == "__init__.py" else file.with_suffix("")
+
+
+@lru_cache(maxsize=1024)
+def _data_files(folder: Path) -> tuple[Path, ...]:
+    """Return the data files in a folder and in those below it that hold no code."""
+    out = []
+    for item in sorted(folder.iterdir()):
+        if item.suffix in _DATA:
+            out.append(item)
+        elif item.is_dir() and not any(item.glob("*.py")):
+            out += _data_files(item)
+    return tuple(out)

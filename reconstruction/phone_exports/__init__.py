@@ -1,0 +1,1 @@
+"""Exports of phone apps, which hold images and poses, and poses by the names of images."""

@@ -1,0 +1,199 @@
+"""Runs the stages of `pipeline` on one video: results are kept under fingerprints, measured, corrected.
+
+A stage is computed where no result is kept under its fingerprint: of its code, its options, the user's corrections,
+what its options name outside, and the fingerprints of the stages that it reads.
+"""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from reconstruction.cache import StageStore, digest_input, fingerprint
+from reconstruction.code_digest import code_digest, tree_digest
+from reconstruction.compiling import compilation_shown
+from reconstruction.config import PipelineConfig
+from reconstruction.editing.anchors import Footage, Pointer
+from reconstruction.editing.overrides import Overrides
+from reconstruction.pipeline import STAGE_NAMES, STAGES, Call, Stage, in_world, view_scene
+from reconstruction.poses.lens import Lens
+from reconstruction.profiling import Usage, UsageMeter
+from reconstruction.progress import NO_PROGRESS, Progress, StageListener
+from reconstruction.types import DepthMaps, InstanceSet, PosedFrames
+
+if TYPE_CHECKING:
+    from reconstruction.avo import ViewScene
+    from reconstruction.oracle import Oracle
+
+logger = logging.getLogger(__name__)
+_PIPELINE = Path(__file__).with_name("pipeline.py")
+_EDITING = "reconstruction.editing.corrections"
+
+
+@dataclass
+class Run:
+    """One reconstruction in progress: results by stage name, with their fingerprints and costs."""
+
+    video: Path
+    config: PipelineConfig
+    store: StageStore
+    overrides: Overrides = field(default_factory=Overrides)
+    oracle: "Oracle | None" = None  # stages whose output the truth replaces, for measuring
+    listener: StageListener = NO_PROGRESS
+    results: dict[str, Any] = field(default_factory=dict)
+    keys: dict[str, str] = field(default_factory=dict)
+    usage: dict[str, Usage] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    input_digest: str = ""  # of the video; computed where it is not given
+    computed: set[str] = field(default_factory=set)  # stages that this run did itself; the others were kept
+    started: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        """Digest the input once."""
+        self.input_digest = self.input_digest or digest_input(self.video)
+
+    def execute(self, until: str = STAGE_NAMES[-1]) -> None:
+        """Run or load every stage up to and including `until`, and of those on demand what is asked for."""
+        wanted = self.wanted_stages()
+        if until not in wanted:
+            wanted = tuple(name for name in STAGE_NAMES if name in (*wanted, until))
+        for stage in STAGES:
+            if stage.name in wanted:
+                self._execute_stage(stage, wanted)
+            if stage.name == until:
+                return
+
+    def complete(self, name: str) -> None:
+        """Run or load one stage whose inputs are among the results already."""
+        self._execute_stage(next(stage for stage in STAGES if stage.name == name), (name,))
+
+    def wanted_stages(self) -> tuple[str, ...]:
+        """Return the stages that make this scene, in order."""
+        asked = {name for stage in STAGES for name in self.needs_of(stage)}
+        return tuple(stage.name for stage in STAGES if not stage.on_demand or stage.name in asked)
+
+    def needs_of(self, stage: Stage) -> tuple[str, ...]:
+        """Return which stages a stage reads under this config."""
+        return tuple(dict.fromkeys((*stage.needs, *stage.needs_also(self.options_of(stage)))))
+
+    def options_of(self, stage: Stage) -> Any:
+        """Return a stage's config."""
+        options = getattr(self.config, stage.options or stage.name)
+        if stage.name == "gaussians" and self.oracle is not None and "depth" in self.oracle.stages:
+            return replace(options, refine_depth=False)  # true depth has nothing to gain
+        return options
+
+    def in_world(self) -> tuple[PosedFrames, DepthMaps]:
+        """Return the posed frames and the depth maps that the Gaussians corrected, in world space, metres."""
+        return in_world(self.results)
+
+    def view_scene(self) -> "ViewScene":
+        """Return what `reconstruction.avo.find_views` looks at, for views of any things or regions of them."""
+        return view_scene(self.results)
+
+    def lens(self) -> Lens:
+        """Return the map from the film's pixels to those of its straightened frames."""
+        return Lens.measure(self.results["frames"], self.results["poses"])
+
+    def pointer(self, found: InstanceSet) -> Pointer:
+        """Return what addresses of the overrides are looked up in."""
+        posed, depth = self.in_world()
+        surface = self.results["surface"]
+        return Pointer(found, surface, Footage(posed, depth, surface, self.lens()))
+
+    def _execute_stage(self, stage: Stage, wanted: tuple[str, ...]) -> None:
+        number = STAGE_NAMES.index(stage.name) + 1  # of its folder
+        corrections = self.overrides.fingerprint_of_stage(stage.name)
+        key = self.keys[stage.name] = self.key_of(stage, corrections)
+        kept = self.store.has(number, stage.name, key)
+        self.listener.begin_stage(stage.name, wanted.index(stage.name) + 1, len(wanted), kept)
+        if not kept:
+            with compilation_shown(self.listener) as shown:
+                if corrections:
+                    self._keep_corrected(number, stage, key, shown)
+                else:
+                    self._keep(number, stage, key, lambda noted: self._compute(stage, noted), shown)
+            self.computed.add(stage.name)
+        manifest = self.store.manifest(number, stage.name, key)
+        # Always continue from what is on disk: a resumed run then computes with the very same values.
+        self.results[stage.name] = self.store.load(stage.produces, number, stage.name, key)
+        self.usage[stage.name] = Usage(**manifest["usage"])
+        self.notes.extend(
+            note if note.startswith(f"{stage.name}:") else f"{stage.name}: {note}"
+            for note in manifest["notes"]
+        )
+        self.listener.end_stage(stage.name, None if kept else self.usage[stage.name])
+
+    def key_of(self, stage: Stage, corrections: list) -> str:
+        """Return a stage's fingerprint, with these corrections."""
+        upstream = tuple(self.keys[name] for name in self.needs_of(stage)) or (self.input_digest,)
+        options = self.options_of(stage)
+        said_by_truth = self.oracle.of_stage(stage.name) if self.oracle is not None else []
+        code = [tree_digest(_PIPELINE), code_digest(stage.package), code_digest("reconstruction.artifacts")]
+        if corrections:
+            code.append(code_digest(_EDITING))
+        inputs = (options, corrections, stage.outside(options), said_by_truth)
+        return fingerprint(stage.name, code, inputs, upstream)
+
+    def _keep(
+        self,
+        number: int,
+        stage: Stage,
+        key: str,
+        make: Callable[[Progress], Any],
+        shown: Progress,
+        before: dict | None = None,
+    ) -> None:
+        """Make a stage's result and keep it; `before` is the manifest of the result that it was made from."""
+        notes = list(before["notes"]) if before else []
+        with UsageMeter() as meter:
+            result = make(_NoteTaker(shown, notes))
+        usage = meter.usage if before is None else Usage(**before["usage"]).followed_by(meter.usage)
+        config = self.options_of(stage)
+        record = {"stage": stage.name, "key": key, "usage": asdict(usage), "notes": notes, "config": config}
+        self.store.save(result, number, stage.name, key, record)
+
+    def _keep_corrected(self, number: int, stage: Stage, key: str, shown: Progress) -> None:
+        """Correct a stage's result as the user says; the result before that is kept too, for the next correction."""
+        from reconstruction.editing.corrections import corrected
+
+        plain_key = self.key_of(stage, [])
+        if not self.store.has(number, stage.name, plain_key):
+            self._keep(number, stage, plain_key, lambda noted: self._compute(stage, noted), shown)
+        plain = self.store.load(stage.produces, number, stage.name, plain_key)
+        before = self.store.manifest(number, stage.name, plain_key)
+        pointer = self.pointer(plain if stage.name == "instances" else self.results["instances"])
+
+        def make(progress: Progress) -> Any:
+            done = {name: self.results[name] for name in self.needs_of(stage)}
+            return corrected(
+                stage.name, plain, done, self.options_of(stage), self.overrides, pointer, progress
+            )
+
+        self._keep(number, stage, key, make, shown, before)
+
+    def _compute(self, stage: Stage, progress: Progress) -> Any:
+        scratch = self.store.scratch(stage.name)
+        needed = {name: self.results[name] for name in self.needs_of(stage)}
+        call = Call(self.video, self.options_of(stage), needed, scratch, self.store.work_dir, progress)
+        try:
+            if self.oracle is not None and stage.name in self.oracle.stages:
+                return self.oracle.make(stage.name, call)
+            return stage.make(call)
+        finally:
+            self.store.discard(scratch)
+
+
+class _NoteTaker:
+    """Passes progress on and keeps the notes for the stage's manifest."""
+
+    def __init__(self, listener: Progress, notes: list[str]) -> None:
+        self._listener, self._notes = listener, notes
+        self.start, self.advance = listener.start, listener.advance
+
+    def note(self, message: str) -> None:
+        self._notes.append(message)
+        logger.info(message)
+        self._listener.note(message)

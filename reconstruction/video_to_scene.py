@@ -1,0 +1,180 @@
+"""From a video to a registered scene: all stages, a second pass where the scale asks for one, the published bundle."""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input
+from reconstruction.config import PipelineConfig
+from reconstruction.editing.overrides import Overrides
+from reconstruction.progress import NO_PROGRESS, StageListener
+from reconstruction.publish import publish_scene
+from reconstruction.runner import Run
+from reconstruction.types import ObjectAsset
+from registry import SceneRecord, SceneRegistry
+from registry.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from reconstruction.oracle import Oracle
+
+_OBJECT_SCALE_PASSES = 3
+_OBJECT_SCALE_TOLERANCE = 0.015  # half of what the scale is said to be sure to
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What `reconstruct` returns."""
+
+    record: SceneRecord
+    run: Run
+
+    @property
+    def env_id(self) -> str:
+        """The id to give to `gym.make`."""
+        return f"SimRecon/{self.record.scene_id}"
+
+
+def reconstruct(
+    video: Path,
+    *,
+    scene_id: str | None = None,
+    registry_root: Path | None = None,
+    work_dir: Path | None = None,
+    config: PipelineConfig | None = None,
+    overrides: Overrides | None = None,
+    oracle: "Oracle | None" = None,
+    require_stable: bool = False,
+    keep_results: int = KEPT_PER_STAGE,
+    listener: StageListener = NO_PROGRESS,
+) -> Reconstruction:
+    """Turn a video (or a folder of images) into a registered scene.
+
+    Args:
+        video: any file that ffmpeg decodes, or a folder of images in name order.
+        scene_id: id in the registry, `[a-z0-9_]+`; None takes the next free `sceneNNNN`.
+        registry_root: where scenes live; None is `$SIMRECON_HOME/registry` or `~/.simrecon/registry`.
+        work_dir: where finished stages are kept for resuming; None is a folder beside the registry, named by the
+            input's digest.
+        config: options of every stage.
+        overrides: the user's corrections.
+        oracle: stages that the ground truth replaces, to measure what they cost.
+        require_stable: refuse to publish a scene in which an object does not stay put.
+        keep_results: how many results of each stage stay in the work folder; more of them make going back and forth
+            between several configs cheap.
+        listener: told of stages, progress and notes.
+
+    Raises:
+        UsageError: the video does not exist, or the id is malformed.
+        InputError: the video cannot be reconstructed.
+        SceneBusy: another process is reconstructing the same scene into the same registry.
+        EnvironmentMissing: no space, no permission, something not installed.
+    """
+    started = time.perf_counter()
+    video = Path(video)
+    if not video.exists():
+        raise UsageError(f"{video}: no such file or folder")
+    config = config or PipelineConfig()
+    _refuse_missing(config)
+    registry = SceneRegistry(registry_root, create=True)
+    holder = registry.hold(scene_id) if scene_id is not None else registry.reserve_next_id()
+    with holder as held_id:
+        scene_id = scene_id or held_id
+        digest = digest_input(video)
+        folder = Path(work_dir) if work_dir else registry.root.parent / "work" / digest[:16]
+        run = Run(
+            video,
+            config,
+            StageStore(folder, keep_results),
+            overrides or Overrides(),
+            oracle,
+            listener,
+            input_digest=digest,
+            started=started,
+        )
+        run.execute()
+        run = _with_object_scale(run)
+        record = publish_scene(run, registry, scene_id, require_stable=require_stable)
+        run.store.note_published(scene_id, record.revision, run.keys)
+    return Reconstruction(record, run)
+
+
+def _refuse_missing(config: PipelineConfig) -> None:
+    """Raise what a backend lacks now, not minutes later: a folder, an endpoint, a key."""
+    if config.instances.masks == "folder":
+        from reconstruction.instances.masks import load_mask_backend
+
+        load_mask_backend(config.instances)
+    if config.instances.labels == "vlm":
+        from reconstruction.instances import load_namer
+
+        load_namer(config.instances)
+    if config.assets.physics != "table":
+        from reconstruction.assets.physics.load import load_physicist
+
+        load_physicist(config.assets)
+    if config.scene_graph.backend != "geometry":
+        from reconstruction.scene_graph.load import check_backend
+
+        check_backend(config.scene_graph)
+    if config.assets.generator != "none":
+        from reconstruction.assets.generation import check_generator
+
+        check_generator(config.assets)
+
+
+def _with_object_scale(run: Run) -> Run:
+    """Apply `--scale object:ID.height=H`: run again at the scale that its height asks for, until it is that high."""
+    from reconstruction.world import parse_scale, settle_object_height
+
+    request = parse_scale(run.config.world.scale) if run.config.world.scale else None
+    if request is None or request.kind != "object" or run.results["world"].scale.method == "marker":
+        return run
+    found = [item for item in run.results["assets"].objects if item.id == request.object_id]
+    if not found:
+        ids = ", ".join(f"{item.id} ({item.label})" for item in run.results["assets"].objects)
+        raise UsageError(
+            f"--scale {run.config.world.scale}: no object {request.object_id}; there are {ids or 'none'}"
+        )
+    place = _place_in_sfm(run, found[0])
+    passes: dict[float, Run] = {}
+
+    def height_at(measured_m: float) -> float:
+        world = replace(run.config.world, object_measured_height_m=measured_m)
+        again = replace(run, config=replace(run.config, world=world), results={}, keys={}, usage={}, notes=[])
+        again.execute()
+        passes[measured_m] = again
+        objects = again.results["assets"].objects
+        if not objects:
+            raise InputError(
+                f"--scale {run.config.world.scale}: at that scale nothing is found any more. Is it in metres?"
+            )
+        # Ids are given by size and may change with the scale; the place stays.
+        return _height(min(objects, key=lambda item: np.linalg.norm(_place_in_sfm(again, item) - place)))
+
+    best, error = settle_object_height(
+        _height(found[0]),
+        request.value_m,
+        height_at,
+        tolerance=_OBJECT_SCALE_TOLERANCE,
+        passes=_OBJECT_SCALE_PASSES,
+    )
+    again = passes[best]
+    if best != list(passes)[-1]:
+        again.results, again.keys, again.usage, again.notes = {}, {}, {}, []
+        again.execute()
+    again.notes.append(
+        f"world: object {request.object_id} ends {error:.1%} off the {request.value_m:g} m asked for"
+    )
+    return again
+
+
+def _height(item: ObjectAsset) -> float:
+    return float(np.ptp(item.visual.vertices[:, 2]))
+
+
+def _place_in_sfm(run: Run, item: ObjectAsset) -> np.ndarray:
+    """Return where an object is in sfm space, which the scale does not change."""
+    return np.linalg.solve(run.results["world"].world_from_sfm, item.world_from_object[:, 3])[:3]
