@@ -3,7 +3,7 @@
 import torch
 from torch.nn import functional
 
-from reconstruction.depth.mending import OFFSETS_PX
+from reconstruction.depth.channels import OFFSETS_PX
 
 
 def affinity_loss(affinity: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:

@@ -165,7 +165,8 @@ def _measure_costs(
     import cv2
 
     from reconstruction.depth.aggregation import bin_costs, smoothed_scores
-    from reconstruction.depth.estimate import gray_images, sized_camera, sweep_frame, winner_of
+    from reconstruction.depth.estimate import sweep_frame, winner_of
+    from reconstruction.depth.images import gray_images, sized_camera
     from reconstruction.depth.views import plan_views
 
     small = sized_camera(posed.camera, config.sweep_side_px)
@@ -199,8 +200,9 @@ def _measure_depth(
     """Return the arrays at depth resolution, what the mending network sees and the truth; and the finished maps."""
     import cv2
 
-    from reconstruction.depth.estimate import Workers, gather_evidence
+    from reconstruction.depth.estimate import gather_evidence
     from reconstruction.depth.evidence import count_views
+    from reconstruction.depth.workers import Workers
 
     found = gather_evidence(posed, config, keep_agreed=True)
     camera, each = found.camera, Workers(1).each

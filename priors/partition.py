@@ -25,10 +25,18 @@ from safetensors.torch import load_file, save_file
 from scipy.special import expit
 from torch.nn import functional
 
-from priors.partition_clusters import Clusters, RoomProposals, clusters_of, examples_of, proposals_of
+from priors.partition_clusters import (
+    Clusters,
+    RoomProposals,
+    clusters_of,
+    examples_of,
+    proposals_of,
+    shipped_proposals,
+)
 from priors.partition_figures import best_least, figures_of, proposal_figures
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, Example
+from priors.partition_targets import Targets
 from priors.partition_trees import PAIRS, PROPOSALS, fit_trees
 from priors.rooms import HELD_OUT
 from priors.samples import Room, open_rooms
@@ -50,8 +58,6 @@ _COLORS = [k for k, name in enumerate(EDGE_FEATURES) if name.startswith(("color"
 _SCALING = {"node_mean", "node_scale", "edge_mean", "edge_scale"}  # kept as float32 in the file
 _WITHOUT_IMAGES = 0.3  # share of crops without what the image network says
 _TOLD_EVERY = 100  # steps
-_CRUMB_M2 = 1e-4  # regions below this count less
-_LEAST_WEIGHT = 0.05
 _ANYWHERE = 0.25  # of the crops have any middle, the others one on a thing
 
 
@@ -74,38 +80,12 @@ _SUPERPOINTS = Fit(3000, 2, 32, 3, 1e-2, 0.0, 0.0, 1000)
 
 
 @dataclass(frozen=True)
-class Targets:
-    """True affinities and labels of a graph, with weights."""
-
-    same: np.ndarray  # float32 (e,) 1 = both sides are of one thing, or both base, or both artifacts
-    same_weight: np.ndarray  # float32 (e,)
-    label: np.ndarray  # int64 (n,) row in LABELS
-    label_weight: np.ndarray  # float32 (n,)
-
-    @classmethod
-    def of(cls, room: Example) -> "Targets":
-        """Read the truth off a room."""
-        ids, pure = room.region_ids()
-        base = (ids > 0) & (ids <= room.base_entities)
-        area = np.bincount(room.region, weights=room.areas, minlength=len(ids))
-        weight = np.clip(area / _CRUMB_M2, _LEAST_WEIGHT, 1.0) * pure
-        a, b = room.pairs[:, 0], room.pairs[:, 1]
-        ids = np.where(base, 1, ids)
-        label = np.where(ids == 0, LABELS.index("artifact"), np.where(base, LABELS.index("base"), 0))
-        return cls(
-            (ids[a] == ids[b]).astype(np.float32), np.minimum(weight[a], weight[b]).astype(np.float32),
-            label.astype(np.int64), weight.astype(np.float32),
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
 class Scorers:
-    """Models of superpoints and of pairs of clusters, and for each room of each split those that never saw it."""
+    """Models of superpoints and of pairs of clusters, and the proposals of rooms that they were not fitted to."""
 
     superpoints: Ensemble
     pairs: Boosted
-    clusters: dict[str, list[Clusters]]  # by split
-    trees: dict[str, list[Boosted]]  # by split, of pairs, one a room
+    proposals: dict[str, list[RoomProposals]]  # by split
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -114,18 +94,15 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
     cache = options.cache or options.out / "cache"
-    splits = _split_rooms(options.data)
-    examples = {
-        name: examples_of(rooms, cache, options.photographs, options.processes)
-        for name, rooms in splits.items()
-    }
+    splits = split_rooms(options.data)
     print({name: len(rooms) for name, rooms in splits.items()}, flush=True)
-    scorers = (_shipped if options.proposals_only else _trained)(splits, examples, cache, options)
-    found = {}
-    for name, rooms in scorers.clusters.items():
-        print(f"{name}: {sum(room.pieces.things for room in rooms)} clusters", flush=True)
-        found[name] = proposals_of(rooms, scorers.trees[name], cache, options.processes)
-        print(f"{name}: {sum(len(room.rows) for room in found[name])} proposals", flush=True)
+    scorers = (_shipped if options.proposals_only else _trained)(splits, cache, options)
+    found = scorers.proposals
+    print(
+        {name: sum(len(room.rows) for room in rooms) for name, rooms in found.items()},
+        "proposals",
+        flush=True,
+    )
     proposals = _fit_proposals(found["train"], options.rounds or _ROUNDS["proposals"], options.seed)
     said = {name: [expit(proposals(room.rows)) for room in rooms] for name, rooms in found.items()}
     chosen_on = [name for name in found if name != "train"] or ["train"]
@@ -136,7 +113,8 @@ def main(arguments: list[str] | None = None) -> int:
     trees = {"pairs": scorers.pairs, "proposals": proposals}
     export(scorers.superpoints, trees, least, options.out / "partition.safetensors")
     figures = {
-        f"{name}, superpoints": figures_of(scorers.superpoints, rooms) for name, rooms in examples.items()
+        f"{name}, superpoints": figures_of(scorers.superpoints, [room.example for room in rooms])
+        for name, rooms in found.items()
     }
     for name, rooms in found.items():
         figures[f"{name}, things"] = proposal_figures(rooms, said[name], least)
@@ -146,43 +124,38 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _trained(
-    splits: dict[str, list[Room]],
-    examples: dict[str, list[Example]],
-    cache: Path,
-    options: argparse.Namespace,
-) -> Scorers:
+def _trained(splits: dict[str, list[Room]], cache: Path, options: argparse.Namespace) -> Scorers:
     """Fit networks and trees for pairs to the rooms of "train"; each half is scored by those of the other half."""
+    examples = {
+        name: examples_of(rooms, cache, options.photographs, options.processes)
+        for name, rooms in splits.items()
+    }
     fit = replace(_SUPERPOINTS, steps=options.steps or _SUPERPOINTS.steps)
     members = partial(_members, kept=options.out / "networks", seed=options.seed)
     finished = _ensemble(members(examples["train"], fit))
     halves = [examples["train"][0::2], examples["train"][1::2] or examples["train"]]
     by_half = [_ensemble(members(half, replace(fit, members=1))) for half in halves]
-    rounds, clusters, trees = options.rounds or _ROUNDS["pairs"], {}, {}
+    rounds, clusters = options.rounds or _ROUNDS["pairs"], {}
     for name, rooms in splits.items():  # those trained on first
         models = [by_half[1 - k % 2] if name == "train" else finished for k in range(len(rooms))]
         clusters[name] = clusters_of(rooms, examples[name], models, cache, options.processes)
     pairs = _fit_pairs(clusters["train"], rounds, options.seed)
     half = [_fit_pairs(clusters["train"][k::2] or clusters["train"], rounds, options.seed) for k in (0, 1)]
-    for name, rooms in splits.items():
-        trees[name] = [half[1 - k % 2] if name == "train" else pairs for k in range(len(rooms))]
-    return Scorers(finished, pairs, clusters, trees)
+    proposals = {}
+    for name, rooms in clusters.items():
+        trees = [half[1 - k % 2] if name == "train" else pairs for k in range(len(rooms))]
+        proposals[name] = proposals_of(rooms, trees, cache, options.processes)
+    return Scorers(finished, pairs, proposals)
 
 
-def _shipped(
-    splits: dict[str, list[Room]],
-    examples: dict[str, list[Example]],
-    cache: Path,
-    options: argparse.Namespace,
-) -> Scorers:
+def _shipped(splits: dict[str, list[Room]], cache: Path, options: argparse.Namespace) -> Scorers:
     """Read networks and trees for pairs from the weights that ship; the rooms have to be others than theirs."""
     models = load_models()
-    clusters = {
-        name: clusters_of(rooms, examples[name], [models.superpoints] * len(rooms), cache, options.processes)
+    proposals = {
+        name: shipped_proposals(rooms, cache, options.photographs, options.processes)
         for name, rooms in splits.items()
     }
-    trees = {name: [models.pairs] * len(rooms) for name, rooms in splits.items()}
-    return Scorers(models.superpoints, models.pairs, clusters, trees)
+    return Scorers(models.superpoints, models.pairs, proposals)
 
 
 def _fit_pairs(rooms: list[Clusters], rounds: int, seed: int) -> Boosted:
@@ -275,7 +248,7 @@ def _ensemble(networks: list[Network]) -> Ensemble:
     return Ensemble(tuple(Model({k: v.numpy() for k, v in n.state_dict().items()}) for n in networks))
 
 
-def _split_rooms(data: Path) -> dict[str, list[Room]]:
+def split_rooms(data: Path) -> dict[str, list[Room]]:
     """Return rooms by split: those trained on, those of the same families kept out, and other families."""
     rooms = open_rooms(data / "train", NEEDED)
     kept_out = [room for room in rooms if int(room.folder.name) % _KEPT_OUT == _KEPT_OUT - 1]

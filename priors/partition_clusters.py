@@ -11,13 +11,14 @@ from typing import TypeVar
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from priors.partition_rooms import TRIMMED, Example, example, room_view
+from priors.partition_rooms import TRIMMED, Example, cached, digest_of, example, room_view, write_arrays
 from priors.samples import Room
 from reconstruction.evaluation.matching import box_iou
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
+from reconstruction.instances.partition.features import View
 from reconstruction.instances.partition.graph import Scores, region_graph
-from reconstruction.instances.partition.model import Ensemble
+from reconstruction.instances.partition.model import Ensemble, load_models
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposal_features import proposal_features
 from reconstruction.instances.partition.proposals import propose
@@ -75,7 +76,7 @@ def examples_of(
     rooms: Sequence[Room], cache: Path, photographs: Path | None, processes: int
 ) -> list[Example]:
     """Return each room's graph of superpoints with its truth (`priors.partition_rooms.example`), cached."""
-    return _each(_example, [(room, cache, photographs) for room in rooms], processes)
+    return each(_example, [(room, cache, photographs) for room in rooms], processes)
 
 
 def _example(job: tuple[Room, Path, Path | None]) -> Example:
@@ -99,7 +100,7 @@ def clusters_of(
         cache: folder with the fused surfaces.
         processes: at work at once.
     """
-    found = _each(_clusters, [(*job, cache) for job in zip(rooms, examples, models, strict=True)], processes)
+    found = each(_clusters, [(*job, cache) for job in zip(rooms, examples, models, strict=True)], processes)
     return [Clusters(room, example, *values) for room, example, values in zip(rooms, examples, found)]
 
 
@@ -107,11 +108,39 @@ def proposals_of(
     found: Sequence[Clusters], trees: Sequence[Boosted], cache: Path, processes: int
 ) -> list[RoomProposals]:
     """Return the proposals of each room by trees for pairs that were not fitted to it."""
-    rows = _each(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
+    rows = each(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
     return [RoomProposals(*values, c.pieces.graph.region, c.example) for values, c in zip(rows, found)]
 
 
-def _each(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
+def shipped_proposals(
+    rooms: Sequence[Room], cache: Path, photographs: Path | None, processes: int
+) -> list[RoomProposals]:
+    """Return the proposals of each room by the networks and trees for pairs that ship, cached."""
+    return each(shipped_proposals_of, [(room, cache, photographs) for room in rooms], processes)
+
+
+def shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
+    """Return the proposals of a room, a folder for caches and one of photographs, by the weights that ship; cached."""
+    room, cache, photographs = job
+    models, known = load_models(), example(room, cache, photographs)
+    digest = digest_of(["reconstruction.instances.partition.cut"])  # weights included
+    file = cached(room, cache, f"proposals-{digest}").with_suffix(".npz")
+    if not file.is_file():
+        view = room_view(room, cache)
+        found = Clusters(room, known, *_clustered(view, known, models.superpoints))
+        members, rows, best = _proposed(view, found, models.pairs)
+        parts = {"indices": members.indices, "indptr": members.indptr, "count": np.array(members.shape[1])}
+        write_arrays(file, rows=rows, best_iou=best, region=found.pieces.graph.region, **parts)
+    with np.load(file) as stored:
+        shape = len(stored["indptr"]) - 1, int(stored["count"])
+        members = csr_matrix(
+            (np.ones(len(stored["indices"])), stored["indices"], stored["indptr"]), shape=shape
+        )
+        return RoomProposals(members, stored["rows"], stored["best_iou"], stored["region"], known)
+
+
+def each(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
+    """Return what a function makes of every job, in order, by so many processes."""
     if processes == 1:
         return [work(job) for job in jobs]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_alone) as pool:
@@ -129,16 +158,23 @@ def _alone() -> None:
 
 
 def _clusters(job: tuple[Room, Example, Ensemble, Path]) -> tuple[Scores, np.ndarray, ClusterGraph]:
-    room, example, model, cache = job
-    view = room_view(room, cache)
-    scores = model.scores(example.nodes, example.edges, example.pairs)
-    label, cluster = partition_with_labels(example.pairs, scores.affinity, scores.label)
+    room, known, model, cache = job
+    return _clustered(room_view(room, cache), known, model)
+
+
+def _clustered(view: View, known: Example, model: Ensemble) -> tuple[Scores, np.ndarray, ClusterGraph]:
+    scores = model.scores(known.nodes, known.edges, known.pairs)
+    label, cluster = partition_with_labels(known.pairs, scores.affinity, scores.label)
     return scores, label, cluster_graph(view, region_graph(view.mesh), scores, label, cluster)
 
 
 def _proposals(job: tuple[Clusters, Boosted, Path]) -> tuple[csr_matrix, np.ndarray, np.ndarray]:
     found, trees, cache = job
-    view = room_view(found.room, cache)
+    return _proposed(room_view(found.room, cache), found, trees)
+
+
+def _proposed(view: View, found: Clusters, trees: Boosted) -> tuple[csr_matrix, np.ndarray, np.ndarray]:
+    """Return the members (m, n), features (m, F) and true IoUs (m,) of a room's proposals."""
     odds = trees(found.pieces.pair_rows())
     proposals = propose(view, found.pieces, odds)
     rows = proposal_features(

@@ -6,6 +6,7 @@ from scipy.stats import rankdata
 from priors.partition_clusters import RoomProposals
 from priors.partition_rooms import Example
 from priors.partition_ruler import NOTHING, compare
+from priors.partition_targets import Targets
 from reconstruction.instances import InstancesConfig
 from reconstruction.instances.partition.cut import clusters_of_things
 from reconstruction.instances.partition.graph import LABELS, Scores
@@ -105,8 +106,6 @@ def superpoint_figures(rooms: list[Example]) -> dict[str, float]:
 
 def affinity_figures(rooms: list[Example], scores: list[Scores]) -> dict[str, float]:
     """Return area under the curve and log loss of affinities, and the accuracy of labels by area."""
-    from priors.partition import Targets
-
     targets = [Targets.of(room) for room in rooms]
     said = np.concatenate([s.affinity for s in scores]).astype(np.float64)
     same = np.concatenate([t.same for t in targets])

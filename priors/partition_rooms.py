@@ -1,22 +1,28 @@
-"""Graphs with truth from rooms on disk: fused surfaces, features of superpoints and borders, true entities; cached."""
+"""Graphs with truth from rooms on disk: fused surfaces, features of superpoints and borders, true entities; cached.
+
+Every second room keeps the depth that the aggregation network predicted, where the dataset holds it: the cut has to do
+with surfaces of both `prior=mending` and `prior=both`.
+"""
 
 import hashlib
+import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
-from priors.rooms import draw_film
+from priors.rooms import Film, draw_film
 from priors.samples import Room
 from priors.surfaces import true_ids
 from reconstruction import artifacts
-from reconstruction.cache import source_digest
+from reconstruction.code_digest import code_digest, tree_digest
 from reconstruction.depth import DepthConfig
-from reconstruction.depth.estimate import Workers
 from reconstruction.depth.evidence import PREDICTED, Evidence
 from reconstruction.depth.mending import WEIGHTS, drop_unconfirmed, mend_depth
 from reconstruction.depth.views import plan_views
+from reconstruction.depth.workers import Workers
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition.cut import features
 from reconstruction.instances.partition.features import Shapes, View
@@ -25,23 +31,14 @@ from reconstruction.instances.sightings import sightings
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
+from registry.errors import UsageError
 from synthetic.capture import posed_capture
 
 NEEDED = (
-    "picture", "depth", "origin", "correlation", "exact_depth", "exact_ids", "world_from_camera", "focal",
+    "picture", "depth", "origin", "correlation", "surety", "exact_depth", "exact_ids", "world_from_camera", "focal",
 )  # fmt: skip
-_FEATURE_MODULES = (
-    "priors.partition_rooms",
-    *(
-        f"reconstruction.instances.{name}"
-        for name in (
-            "superpoints",
-            "sightings",
-            "partition.graph",
-            "partition.evidence",
-            "partition.features",
-        )
-    ),
+_FEATURE_MODULES = tuple(
+    f"reconstruction.instances.{name}" for name in ("cut", "superpoints", "sightings", "partition.features")
 )
 TRIMMED = 1.0  # percent of a thing's points at either side of its box, as in `reconstruction.evaluation`
 _STEP_PX = 4
@@ -76,11 +73,22 @@ class Example:
 def cached(room: Room, cache: Path, kind: str) -> Path:
     """Return where something of a room is kept, which follows from its depth as the shipped weights mend it."""
     weights = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()[:12]
+    kind = f"{kind}-predicted" if _keeps_predictions(room) else kind
     return cache / kind / weights / room.folder.parent.name / room.folder.name
 
 
+def _keeps_predictions(room: Room) -> bool:
+    return int(room.folder.name) % 2 == 1 and bool((np.asarray(room.arrays["origin"]) == PREDICTED).any())
+
+
+def digest_of(modules: Sequence[str]) -> str:
+    """Return a digest of this file and of the code behind modules."""
+    code = [tree_digest(Path(__file__)), *(code_digest(name) for name in modules)]
+    return hashlib.sha256("".join(code).encode()).hexdigest()[:12]
+
+
 def frames_and_depth(room: Room, cache: Path) -> tuple[PosedFrames, DepthMaps]:
-    """Return the keyframes with true cameras, and their depth as the depth stage mends it, without predictions.
+    """Return the keyframes with true cameras, and their depth as the depth stage mends it.
 
     Mended maps are taken from the cache if the same weights made them.
     """
@@ -95,21 +103,22 @@ def frames_and_depth(room: Room, cache: Path) -> tuple[PosedFrames, DepthMaps]:
 
 
 def _evidence(room: Room) -> tuple[PosedFrames, Evidence]:
-    """Return the keyframes with true cameras, and their depth as measured and completed by planes."""
+    """Return the keyframes with true cameras, and their depth before it is mended."""
     a = room.arrays
-    origin = np.asarray(a["origin"])
-    depth = np.where(origin == PREDICTED, 0, a["depth"]).astype(np.float32)
+    left_out = np.asarray(a["origin"]) == PREDICTED
+    if _keeps_predictions(room):
+        left_out[:] = False
+    depth = np.where(left_out, 0, a["depth"]).astype(np.float32)
     height, width = depth.shape[1:]
     fx, fy = (float(f) for f in a["focal"])
     camera = Camera(width, height, fx, fy, 0.5 * width, 0.5 * height)
     posed = posed_capture(
         camera, np.asarray(a["world_from_camera"]), np.asarray(a["picture"]), depth, room.folder.name
     )
-    origin = np.where(origin == PREDICTED, 0, origin).astype(np.uint8)
-    correlation = np.asarray(a["correlation"], np.float32) / 100
+    origin = np.where(left_out, 0, a["origin"]).astype(np.uint8)
+    correlation, surety = (np.asarray(a[name], np.float32) / 100 for name in ("correlation", "surety"))
     neighbors = plan_views(posed, DepthConfig()).neighbors
-    nothing = np.zeros(0, np.float32)
-    return posed, Evidence(camera, neighbors, depth, origin, correlation, nothing, nothing)
+    return posed, Evidence(camera, neighbors, depth, origin, correlation, surety, np.zeros(0, np.float32))
 
 
 def fused(room: Room, cache: Path) -> Surface:
@@ -138,8 +147,7 @@ def room_view(room: Room, cache: Path) -> View:
 
 def example(room: Room, cache: Path, photographs: Path | None) -> Example:
     """Return the graph of a room with its truth, from the cache if the code that made it is the same."""
-    digest = hashlib.sha256("".join(source_digest(name) for name in _FEATURE_MODULES).encode()).hexdigest()
-    file = cached(room, cache, f"graphs-{digest[:12]}").with_suffix(".npz")
+    file = cached(room, cache, f"graphs-{digest_of(_FEATURE_MODULES)}").with_suffix(".npz")
     if not file.is_file():
         write_example(file, _made(room, cache, photographs))
     return read_example(file)
@@ -147,7 +155,7 @@ def example(room: Room, cache: Path, photographs: Path | None) -> Example:
 
 def write_example(file: Path, made: Example) -> None:
     """Write a graph with its truth, whole or not at all."""
-    _write(file, **{f.name: getattr(made, f.name) for f in fields(Example)})
+    write_arrays(file, **{f.name: getattr(made, f.name) for f in fields(Example)})
 
 
 def read_example(file: Path) -> Example:
@@ -167,21 +175,33 @@ def _made(room: Room, cache: Path, photographs: Path | None) -> Example:
 
 def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) -> dict[str, np.ndarray]:
     """Return the last fields of a room's example, from the cache if they are there."""
-    split, number = room.folder.parent.name, room.folder.name
     file = cached(room, cache, "truths").with_suffix(".npz")
     if not file.is_file():
-        film = draw_film(split, int(number), photographs=photographs)
+        film = film_of(room, photographs)
         eyes = np.asarray(room.arrays["world_from_camera"])[:, :3, 3]
         ids = true_ids(film.film_set, np.asarray(surface.vertices, np.float64), eyes)
         exact = np.asarray(room.arrays["exact_ids"])
         count = int(max(exact.max(), film.film_set.face_entity.max())) + 1
         pixels = np.stack([np.bincount(row.ravel(), minlength=count) for row in exact]).max(axis=0)
-        _write(
+        write_arrays(
             file, true_ids=ids, base_entities=np.array(film.base_entities), pixels=pixels / exact[0].size,
             boxes=_shown_boxes(room, count),
         )  # fmt: skip
     with np.load(file) as stored:
         return dict(stored)
+
+
+def film_of(room: Room, photographs: Path | None) -> Film:
+    """Draw the film again that a room on disk was made of.
+
+    Raises:
+        UsageError: it is another one: drawn by other code or with other photographs.
+    """
+    film = draw_film(room.folder.parent.name, int(room.folder.name), photographs=photographs)
+    made = json.loads((room.folder / "room.json").read_text())["film"]
+    if json.loads(json.dumps(film.describe())) != made:
+        raise UsageError(f"{room.folder}: made by other code or with other photographs, make it anew")
+    return film
 
 
 def _shown_boxes(room: Room, count: int) -> np.ndarray:
@@ -206,7 +226,7 @@ def _shown_boxes(room: Room, count: int) -> np.ndarray:
     return out
 
 
-def _write(file: Path, **arrays: np.ndarray) -> None:
+def write_arrays(file: Path, **arrays: np.ndarray) -> None:
     """Write arrays whole or not at all."""
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(".part.npz")

@@ -21,6 +21,10 @@ PROPOSALS = _COMMON | {
     "objective": "cross_entropy", "learning_rate": 0.04, "min_data_in_leaf": 60, "feature_fraction": 0.4,
     "bagging_fraction": 0.6, "lambda_l2": 5.0,
 }  # fmt: skip
+LABELS = _COMMON | {
+    "objective": "multiclass", "num_leaves": 12, "learning_rate": 0.06, "min_data_in_leaf": 12, "feature_fraction": 0.5,
+    "bagging_fraction": 0.7, "lambda_l2": 3.0,
+}  # fmt: skip
 _LEAVES_OF_FEW_ROWS = 20  # at the most, where there are too few rows for leaves of the usual size
 
 
@@ -32,6 +36,25 @@ def fit_trees(
     Raises:
         EnvironmentMissing: LightGBM is not installed.
     """
+    return arrays_of(_fitted(rows, target, weight, settings, rounds, seed)["tree_info"], rows.shape[1])
+
+
+def fit_classes(
+    rows: np.ndarray, target: np.ndarray, classes: int, settings: dict[str, Any], rounds: int, seed: int
+) -> tuple[Boosted, ...]:
+    """Fit trees to features float32 (m, F) and classes int (m,); one sum a class, whose softmax is its probability.
+
+    Raises:
+        EnvironmentMissing: LightGBM is not installed.
+    """
+    settings = settings | {"num_class": classes}
+    info = _fitted(rows, target, np.ones(len(rows)), settings, rounds, seed)["tree_info"]
+    return tuple(arrays_of(info[k::classes], rows.shape[1]) for k in range(classes))
+
+
+def _fitted(
+    rows: np.ndarray, target: np.ndarray, weight: np.ndarray, settings: dict[str, Any], rounds: int, seed: int
+) -> dict[str, Any]:
     try:
         import lightgbm
     except ImportError as error:
@@ -41,13 +64,13 @@ def fit_trees(
     data = lightgbm.Dataset(rows, target, weight=weight, free_raw_data=True)
     least = min(settings["min_data_in_leaf"], len(rows) // _LEAVES_OF_FEW_ROWS)
     settings = settings | {"seed": seed, "min_data_in_leaf": max(least, 1)}
-    return arrays_of(lightgbm.train(settings, data, rounds).dump_model())
+    return lightgbm.train(settings, data, rounds).dump_model()
 
 
-def arrays_of(dumped: dict[str, Any]) -> Boosted:
-    """Return the trees of LightGBM's `dump_model`."""
+def arrays_of(tree_info: list[dict[str, Any]], features: int) -> Boosted:
+    """Return the trees of LightGBM's `dump_model()["tree_info"]`, for rows of so many features."""
     root, first_leaf, nodes, values = [0], [], [], []
-    for tree in dumped["tree_info"]:
+    for tree in tree_info:
         own: list[tuple[int, float, int, int]] = []
         first_leaf.append(len(values))
         _walk(tree["tree_structure"], own, values, len(values))
@@ -57,7 +80,7 @@ def arrays_of(dumped: dict[str, Any]) -> Boosted:
     return Boosted(
         np.array(root, np.int32), np.array(first_leaf, np.int32), np.array(feature, np.uint8),
         _rounded_down(np.array(threshold, np.float64)), np.array(left, np.int8), np.array(right, np.int8),
-        np.array(values, np.float32), np.array(dumped["max_feature_idx"] + 1, np.int32),
+        np.array(values, np.float32), np.array(features, np.int32),
     )  # fmt: skip
 
 

@@ -12,14 +12,15 @@ import numpy as np
 
 from reconstruction.types import Camera
 from registry.errors import InputError
-from synthetic.arrangements import draw_room
 from synthetic.camera_paths import phone_camera
 from synthetic.film import FilmSet, prepare, render_truth
 from synthetic.furniture_families import FURNITURE_FAMILIES
+from synthetic.layout import RoomShape
 from synthetic.lighting import draw_light
 from synthetic.materials import MaterialMix, repaint
 from synthetic.photographs import load_photographs
 from synthetic.procedural import RoomSpec, furnish, plan_room
+from synthetic.random_rooms import draw_room
 from synthetic.room import Room
 from synthetic.sensor import Sensor, draw_sensor
 from synthetic.shape_families import SHAPE_FAMILIES
@@ -34,7 +35,11 @@ SPLITS = ("train", *HELD_OUT)
 _WALK_FRAMES = 300  # of a whole film
 _SKETCH = (80, 60)  # pixels at which keyframes are chosen
 _STEPS = (0.035, 0.07)  # between keyframes, as a share of the longer side; the frames stage asks for .045
-_STARTS, _FEWEST_KEYFRAMES, _FEWEST_THINGS = 6, 8, 0.04
+_WALKS_DRAWN = 4  # the one that shows the most things is taken
+_STARTS, _FEWEST_KEYFRAMES, _FEWEST_THINGS = 6, 8, 2.0  # things in view, mean over the keyframes
+_LOOKS = 16  # poses of a walk at which things in view are counted
+_IN_VIEW = 2000 / (640 * 480)  # of a frame
+_OBJECTS = (8, 26)  # things in a room
 _FRAMES_A_STEP = (
     8.0  # frames of a phone's film from keyframe to keyframe: the shutter is open for a share of one
 )
@@ -112,26 +117,25 @@ class Film:
     def keyframes(self, count: int) -> np.ndarray:
         """Return poses (n, 4, 4) of keyframes in a row, as far apart as the frames stage chooses them, n <= count.
 
-        The start is drawn; of a few starts the first is taken that sees things and leads far enough.
+        A few starts are drawn; of the stretches that lead far enough, the one with the most things in view is taken.
         """
         rng = np.random.default_rng((self.number, 7))
         camera, step = self.camera(*_SKETCH), float(rng.uniform(*_STEPS)) * max(_SKETCH)
-        best = self.walk[:0]
+        best, most = self.walk[:0], 0.0
         for start in rng.integers(0, len(self.walk) - count, _STARTS):
-            chosen = [int(start)]
-            depth, ids = render_truth(self.film_set, camera, self.walk[start])
-            empty = (ids > self.base_entities).mean() < _FEWEST_THINGS
-            while len(chosen) < count:
-                ahead = np.flatnonzero(_flow_px(depth, camera, self.walk, chosen[-1]) >= step)
-                if not len(ahead):
+            chosen, shown = [], []
+            row = int(start)
+            while True:
+                depth, ids = render_truth(self.film_set, camera, self.walk[row])
+                chosen.append(row)
+                shown.append(_things_in_view(ids, self.base_entities))
+                ahead = np.flatnonzero(_flow_px(depth, camera, self.walk, row) >= step)
+                if len(chosen) == count or not len(ahead):
                     break
-                chosen.append(chosen[-1] + 1 + int(ahead[0]))
-                depth, _ = render_truth(self.film_set, camera, self.walk[chosen[-1]])
-            if len(chosen) > len(best) and not empty:
-                best = self.walk[chosen]
-            if len(best) == count:
-                return best
-        if len(best) < min(count, _FEWEST_KEYFRAMES):
+                row += 1 + int(ahead[0])
+            if len(chosen) >= min(count, _FEWEST_KEYFRAMES) and np.mean(shown) > most:
+                best, most = self.walk[chosen], float(np.mean(shown))
+        if most < _FEWEST_THINGS:
             raise InputError(f"{self.split}/{self.number}: no stretch of this walk sees enough")
         return best
 
@@ -163,6 +167,28 @@ class Film:
         }  # fmt: skip
 
 
+def _things_in_view(ids: np.ndarray, base_entities: int) -> int:
+    """Return how many things cover a little of a frame of ids (h, w)."""
+    pixels = np.bincount(ids[ids > base_entities].astype(np.int64))
+    return int((pixels >= max(_IN_VIEW * ids.size, 2)).sum())
+
+
+def _walk_past_things(
+    rng: np.random.Generator, shape: RoomShape, film_set: FilmSet, camera: Camera, base_entities: int
+) -> np.ndarray:
+    """Draw a few walks (k, 4, 4); return the one that has the most things in view, as people film."""
+
+    def seen(walk: np.ndarray) -> float:
+        rows = np.linspace(0, len(walk) - 1, _LOOKS).astype(int)
+        return float(
+            np.mean(
+                [_things_in_view(render_truth(film_set, camera, walk[k])[1], base_entities) for k in rows]
+            )
+        )
+
+    return max((draw_walk(rng, shape, _WALK_FRAMES) for _ in range(_WALKS_DRAWN)), key=seen)
+
+
 def _without_walls(room: Room, rng: np.random.Generator) -> Room:
     """Return the room without one or two of its walls, and without all that hangs there."""
     walls = [e.id for e in room.base if e.label == "wall"]
@@ -177,7 +203,9 @@ def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Fi
     """Draw, furnish, paint and light the room of this number in a split, and a walk through it."""
     rng = np.random.default_rng((zlib.crc32(split.encode()), number))
     families = families_of(split)
-    spec = draw_room(int(rng.integers(1 << 30)), shapes=families.shapes, furniture=families.furniture)
+    spec = draw_room(
+        int(rng.integers(1 << 30)), shapes=families.shapes, furniture=families.furniture, objects=_OBJECTS
+    )
     plan = plan_room(spec)
     usual = asdict(families.materials)
     mix = MaterialMix(
@@ -193,8 +221,8 @@ def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Fi
         room = _without_walls(room, drawn)
     background = tuple(float(c) for c in drawn.uniform(20, 235) + drawn.uniform(-20, 20, 3))
     light, sensor = draw_light(rng, room.extent), draw_sensor(rng)
-    return Film(
-        split, number, spec, room, prepare(room, shadow_px=512, light=light, finishes=finishes, background=background),
-        draw_walk(rng, plan.shape, _WALK_FRAMES), sensor, fov_deg=float(rng.uniform(50, 76)),
-        portrait=bool(rng.random() < 0.12), materials=mix, base_entities=base,
-    )  # fmt: skip
+    film_set = prepare(room, shadow_px=512, light=light, finishes=finishes, background=background)
+    fov_deg, portrait = float(rng.uniform(50, 76)), bool(rng.random() < 0.12)
+    sketch = phone_camera(*(_SKETCH[::-1] if portrait else _SKETCH), fov_deg)
+    walk = _walk_past_things(rng, plan.shape, film_set, sketch, base)
+    return Film(split, number, spec, room, film_set, walk, sensor, fov_deg, portrait, mix, base)

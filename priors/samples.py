@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.depth.aggregation import BINS, place_of_depth
+from reconstruction.depth.aggregation import place_of_depth
+from reconstruction.depth.channels import BINS
 
 ARRAYS = {
     "color": "uint8 (n, h, w, 3) keyframes at sweep resolution",

@@ -5,11 +5,8 @@ from reconstruction.instances.find import find_instances, make_instances
 from reconstruction.instances.naming import load_namer, name_instances
 from reconstruction.instances.outside import backends, outside_inputs
 
-VERSION = 25
-
 __all__ = [
     "INSTANCES_PRESETS",
-    "VERSION",
     "InstancesConfig",
     "backends",
     "find_instances",

@@ -49,10 +49,7 @@ class InstancesConfig:
     """Things that cover less of every keyframe than this are scraps."""
 
     min_picture_m: float = 0.10
-    """The shorter side of the smallest picture that is looked for on a wall."""
-
-    wall_color_contrast: float = 9.0
-    """CIELAB distance from the wall's own color at which a part of it may be a picture."""
+    """The shorter side of the smallest picture on a wall that only masks show."""
 
     snap_radius_px: int = 3
     """How far the borders of id maps may move to a color edge, at depth resolution."""

@@ -7,7 +7,6 @@ import numpy as np
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
-from reconstruction.instances.hung import add_hung
 from reconstruction.instances.id_maps import render_id_maps, without_unseen
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
@@ -67,9 +66,7 @@ def find_instances(
     told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
     id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, told, progress=progress)
     found = InstanceSet(vertex_instance, shell.base, objects, id_maps)
-    if masks is None:
-        found = add_hung(found, posed, depth, surface, config, progress)
-    else:
+    if masks is not None and told is not None:
         asked = masks.resized(told.camera.width, told.camera.height)
         found = add_outlined(found, asked, told, posed, depth, surface, config, progress)
     return without_unseen(found, config, progress)

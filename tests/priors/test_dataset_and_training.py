@@ -10,7 +10,7 @@ import yaml
 from priors import captures, dataset, mending, train
 from priors.rooms import HELD_OUT, SPLITS, draw_film, families_of
 from priors.samples import border_of, draw_sample, load_sample, open_rooms
-from reconstruction.depth.aggregation import BINS
+from reconstruction.depth.channels import BINS
 
 FRAMES = 4
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from priors import dataset, partition
+from priors import dataset, labels, partition
 from priors.partition_figures import area_under_curve, by_truth
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, example
 from priors.partition_ruler import Figures, compare
-from priors.partition_trees import PAIRS, arrays_of
+from priors.partition_trees import LABELS, PAIRS, arrays_of, fit_classes
 from priors.samples import open_rooms
+from reconstruction.instances.labels import CLASSES, LABEL_FEATURES, LabelModel, load_labels
 from reconstruction.instances.partition.model import FEATURES, TREES, load_models
 
 FRAMES = 6
@@ -110,7 +111,7 @@ def stumps(features, rng):
     rows = rng.normal(size=(400, features)).astype(np.float32)
     target = (rows[:, 0] + rows[:, 1] * rows[:, 2] > 0).astype(float)
     booster = lightgbm.train(PAIRS | {"min_data_in_leaf": 5, "seed": 0}, lightgbm.Dataset(rows, target), 20)
-    return arrays_of(booster.dump_model()), booster
+    return arrays_of(booster.dump_model()["tree_info"], features), booster
 
 
 def test_numpy_says_what_pytorch_says(tmp_path):
@@ -141,7 +142,7 @@ def test_trees_say_what_lightgbm_says():
     with pytest.raises(ValueError, match="12 features got 11"):
         trees(rows[:, 1:])
     alone = lightgbm.train(PAIRS, lightgbm.Dataset(rows[:50], np.r_[np.zeros(25), np.ones(25)]), 3)
-    constant = arrays_of(alone.dump_model())  # too few rows for any node
+    constant = arrays_of(alone.dump_model()["tree_info"], 12)  # too few rows for any node
     np.testing.assert_allclose(constant(rows), alone.predict(rows, raw_score=True), atol=1e-6)
 
 
@@ -172,3 +173,43 @@ def test_noise_on_features_keeps_their_means(graph):
     away = (blurred.edges - graph.edges) * scale
     assert np.abs(away.mean(axis=0)).max() < 0.2
     assert 0.2 < np.isclose(blurred.edges, network.edge_mean.numpy()).mean() < 0.5
+
+
+def test_sums_of_classes_give_the_probabilities_that_lightgbm_gives():
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(600, len(LABEL_FEATURES))).astype(np.float32)
+    classes = (rows[:, 0] > 0) + 2 * (rows[:, 1] > 0.5)
+    trees = fit_classes(rows, classes, 4, LABELS, 15, 0)
+    data = lightgbm.Dataset(rows, classes)
+    booster = lightgbm.train(LABELS | {"num_class": 4, "seed": 0}, data, 15)
+    np.testing.assert_allclose(LabelModel(trees, 1.0).probabilities(rows), booster.predict(rows), atol=1e-5)
+
+
+def test_names_are_learned_and_written(data, tmp_path):
+    arguments = [str(data), "--out", str(tmp_path), "--cache", str(data / "cache"), "--rounds", "30"]
+    assert labels.main(arguments) == 0
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert set(figures) == {"train", "shapes"}
+    room = open_rooms(data / "train", NEEDED)[0]
+    rows = labels.rows_of((room, data / "cache", None))
+    true = ~rows.found
+    assert true.sum() >= 3
+    assert set(np.array(rows.names)[true]) <= {e.label for e in labels.film_of(room, None).room.entities}
+    said = load_labels(tmp_path / "labels.safetensors").probabilities(rows.features)
+    np.testing.assert_allclose(said.sum(axis=1), 1)
+    assert said[np.arange(len(said)), rows.classes].mean() > 1.5 / len(CLASSES)
+
+
+def test_rooms_of_other_code_are_refused(data, tmp_path):
+    import shutil
+
+    from registry.errors import UsageError
+
+    folder = next((data / "train").glob("0*"))
+    other = tmp_path / "train" / folder.name
+    shutil.copytree(folder, other)
+    about = json.loads((other / "room.json").read_text())
+    about["film"]["fov_deg"] += 1
+    (other / "room.json").write_text(json.dumps(about))
+    with pytest.raises(UsageError, match="make it anew"):
+        labels.film_of(open_rooms(tmp_path / "train", NEEDED)[0], None)

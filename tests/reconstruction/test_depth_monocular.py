@@ -9,9 +9,9 @@ from test_depth import CAMERA, CONFIG, make_posed
 
 from reconstruction.depth import estimate_depth
 from reconstruction.depth.config import DepthConfig
-from reconstruction.depth.estimate import Workers
 from reconstruction.depth.monocular import fill_from_predictions, fit_affine
 from reconstruction.depth.views import plan_views
+from reconstruction.depth.workers import Workers
 from registry.errors import EnvironmentMissing, UsageError
 
 HOLE = (slice(20, 110), slice(60, 180))  # over the wall and the box: no plane fills it

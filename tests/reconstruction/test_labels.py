@@ -8,7 +8,7 @@ from benchmarks.labels import compared, table
 from reconstruction.evaluation.labels import Guess, overconfidence, reliability
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.boxes import upright_box
-from reconstruction.instances.labels import ShapeFacts, coarse_label, shape_facts
+from reconstruction.instances.labels import LABEL_FEATURES, coarse_label, label_features
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.surface.mesh_graph import MeshGraph
@@ -48,10 +48,16 @@ def cylinder(radius: float, low: float, high: float, lid: bool, inside: float | 
     )
 
 
-def facts(shape: Patchwork, on_floor: bool = False, attached: bool = False, carries: int = 0) -> ShapeFacts:
+def features(
+    shape: Patchwork, on_floor: bool = False, attached: bool = False, carries: int = 0
+) -> np.ndarray:
     graph = MeshGraph.from_surface(surface_from(shape))
     everything = np.arange(len(graph.points))
-    return shape_facts(graph, everything, upright_box(graph.points, graph.areas), on_floor, attached, carries)
+    return label_features(graph, everything, upright_box(graph.points, graph.areas), on_floor, attached, carries)
+
+
+def facts(shape: Patchwork, **where) -> dict[str, float]:
+    return dict(zip(LABEL_FEATURES, features(shape, **where).tolist(), strict=True))
 
 
 def table_of(width: float, depth: float, height: float) -> Patchwork:

@@ -8,7 +8,7 @@ import pytest
 from fused_surfaces import box, fused
 from surfaces import frames_of, with_planes
 
-from reconstruction.depth.mending import AFFINITIES, OFFSETS_PX
+from reconstruction.depth.channels import AFFINITIES, OFFSETS_PX
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition import multicut as solver

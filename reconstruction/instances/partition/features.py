@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from reconstruction.depth.mending import OFFSETS_PX
+from reconstruction.depth.channels import OFFSETS_PX
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.partition.evidence import FrameLook, VertexEvidence, gather, look
 from reconstruction.instances.partition.graph import RegionGraph

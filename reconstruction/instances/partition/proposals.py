@@ -34,7 +34,10 @@ class Proposals:
 
 
 def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
-    """Return the regions of two merge trees: by the summed, and by the mean log-odds of pairs.
+    """Return the regions of two merge trees, by the summed and by the mean log-odds of pairs.
+
+    Each is proposed with all that is below it, too: what a thing stands on, a pedestal or legs, often has no
+    measured surface in common with the rest of it.
 
     Args:
         view: the surface.
@@ -48,12 +51,13 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
     found = {frozenset([k]) for k in range(count)}
     for linkage in (_total, _mean):
         found |= set(_merged(area, pairs, odds, linkage))
-    regions = sorted(sorted(members) for members in found)
-    members = members_of(regions, count)
     inside = region < count
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, region[inside], view.mesh.points[inside])
     np.maximum.at(high, region[inside], view.mesh.points[inside])
+    found |= {_with_all_below(members, low, high) for members in found}
+    regions = sorted(sorted(members) for members in found)
+    members = members_of(regions, count)
     if not regions:
         return Proposals(members, low, high)
     starts = members.indptr[:-1]
@@ -61,6 +65,20 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
     high = np.maximum.reduceat(high[members.indices], starts, axis=0)
     kept = (np.linalg.norm(high - low, axis=1) < LARGEST_M) & (members @ area >= LEAST_AREA_M2)
     return Proposals(members[kept], low[kept], high[kept])
+
+
+def _with_all_below(members: frozenset[int], low: np.ndarray, high: np.ndarray) -> frozenset[int]:
+    """Return a region with the clusters whose middle is below its foot and within its box in plan.
+
+    Args:
+        members: clusters of the region.
+        low: float (n, 3) least coordinates of the clusters, metres.
+        high: float (n, 3) greatest coordinates.
+    """
+    rows, middle = list(members), 0.5 * (low + high)
+    least, most = low[rows].min(axis=0), high[rows].max(axis=0)
+    within = ((middle[:, :2] > least[:2]) & (middle[:, :2] < most[:2])).all(axis=1)
+    return members | frozenset(np.flatnonzero(within & (middle[:, 2] < least[2])).tolist())
 
 
 def members_of(regions: list[list[int]], count: int) -> csr_matrix:
