@@ -163,7 +163,7 @@ def _seeable(
 ) -> float:
     """Return the share of the true surface that cameras in free space all around the target see together."""
     from reconstruction.avo.cameras import square_camera
-    from reconstruction.avo.starts import input_starts, starts_around
+    from reconstruction.avo.initial_views import input_starts, starts_around
     from reconstruction.evaluation.visibility import seen_points
 
     poses = np.concatenate([starts_around(scene, target, config), input_starts(scene, target, config)[::4]])

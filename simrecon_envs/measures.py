@@ -1,7 +1,7 @@
 """What tasks read of the simulator, each quantity once a control step; b environments, n movable things.
 
 With many environments on a GPU these are tensors of ManiSkill's structs. On the CPU, where there is one, they are
-NumPy's and come straight from SAPIEN (`direct`): the structs and tensors cost more than the physics does.
+NumPy's and come straight from SAPIEN (`cpu_env`): the structs and tensors cost more than the physics does.
 """
 
 import math
@@ -13,7 +13,7 @@ import torch
 
 from registry.geometry import invert_rigid, transform_points
 from simrecon_envs.arrays import Array, atan2, component, largest, norm, rotate
-from simrecon_envs.direct import DirectReads
+from simrecon_envs.cpu_env import DirectReads
 
 _GRASP_REACH_M = 0.12  # nothing farther from the hand than this and its own half diagonal is held
 _GRAVITY_M_S2 = 9.81

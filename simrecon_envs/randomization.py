@@ -1,7 +1,7 @@
 """Domain randomization: what may differ from one reset to the next, all of it drawn from the reset's seed.
 
 Poses stay within the support: a thing and what stands on it move together, stay on the level they stand on, and
-touch nothing that they did not touch before, nor the robot (`shifting`). Mass and friction stay within the
+touch nothing that they did not touch before, nor the robot (`layout_randomization`). Mass and friction stay within the
 bundle's `ranges`.
 """
 
@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from registry import UsageError
-from simrecon_envs.rehearsal import rehearse
+from simrecon_envs.layout_randomization import Group, about, group_things
+from simrecon_envs.reset_settling import rehearse
 from simrecon_envs.robots import traits_of
-from simrecon_envs.shifting import Group, about, group_things
 
 _TRIES = 6
 _TINTS = 4  # of each texture, made when they are first drawn

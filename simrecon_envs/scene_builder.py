@@ -30,10 +30,10 @@ from registry.geometry import (
     quat_from_matrix,
     transform_points,
 )
+from registry.rigid_groups import moving_ids, welded_to
 
 # The same shapes and masses as in the report card that the bundle carries.
 from registry.simulation import BodySpec, convex_shape, set_inertial
-from registry.welding import moving_ids, welded_to
 from simrecon_envs.occupancy import ConvexSolid, base_slab, glb_vertices, read_obj_vertices, slab_corners
 
 BASE_FRICTION = 0.5

@@ -30,10 +30,10 @@ from registry.errors import did_you_mean
 from simrecon_envs.arrays import Array, tensor, tensors
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
-from simrecon_envs.direct import DirectDrive
+from simrecon_envs.cpu_env import DirectDrive
 from simrecon_envs.errors import SceneAssetsMissing
-from simrecon_envs.forgetting import renew_physics
 from simrecon_envs.measures import Measures
+from simrecon_envs.physics_reset import renew_physics
 from simrecon_envs.placement import Target
 from simrecon_envs.planning import Plan, plan_task
 from simrecon_envs.randomization import Randomization, Randomizer

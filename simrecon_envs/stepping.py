@@ -14,7 +14,7 @@ from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.envs.sapien_env import BaseEnv
 
 from registry import UsageError
-from simrecon_envs.direct import DirectDrive
+from simrecon_envs.cpu_env import DirectDrive
 
 _HOOKS = ("_before_control_step", "_after_control_step", "_before_simulation_step", "_after_simulation_step")
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reconstruction.assembly.collision import cut
+from reconstruction.assembly.collision_trimming import in_world, overlap_of
 from reconstruction.assembly.placement import Placement
-from reconstruction.assembly.yielding import in_world, overlap_of
 from reconstruction.assets.solid import Solid, manifold_of
 from reconstruction.types import ConvexPart
 from registry.geometry import transform_points

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction.assembly.clear import make_clear
 from reconstruction.assembly.config import AssemblyConfig
+from reconstruction.assembly.depenetration import make_clear
 from reconstruction.assembly.placement import (
     WORTH_SAYING_M,
     Placement,

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruction.assembly.clear import make_clear
 from reconstruction.assembly.collision import cut
+from reconstruction.assembly.collision_trimming import cut_out, give_way
 from reconstruction.assembly.config import AssemblyConfig
+from reconstruction.assembly.depenetration import make_clear
 from reconstruction.assembly.hollow import fills_air, hollowed, volume
 from reconstruction.assembly.placement import (
     TOUCH_GAP_M,
@@ -20,7 +21,6 @@ from reconstruction.assembly.placement import (
     world_points,
 )
 from reconstruction.assembly.workbench import STANDING, Workbench, object_spec
-from reconstruction.assembly.yielding import cut_out, give_way
 from reconstruction.types import AssetSet, BaseAsset
 from registry.simulation import pose_change
 

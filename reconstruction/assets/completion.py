@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from reconstruction.assets import symmetry
 from reconstruction.assets.boards import find_board, with_underside
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.tails import without_whiskers
+from reconstruction.assets.rim_artifacts import without_whiskers
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 
 _HIDDEN_M = 0.02  # of a foot

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.tails import away_directions, behind_rims
+from reconstruction.assets.rim_artifacts import away_directions, behind_rims
 from reconstruction.assets.views import ScenePixels, SeenPoints
 from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, rigid, transform_points

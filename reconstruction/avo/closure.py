@@ -89,7 +89,7 @@ def close_shape(scene: ViewScene, target: Target) -> ClosedShape:
 
 
 def _kernel():
-    from reconstruction.avo.sight import see_points
+    from reconstruction.avo.line_of_sight import see_points
 
     return see_points
 

@@ -11,9 +11,9 @@ from reconstruction.avo.cameras import look_at, square_camera
 from reconstruction.avo.closure import close_shape
 from reconstruction.avo.config import AvoConfig
 from reconstruction.avo.coverage import LEAST_PX, Coverage, Unseen
+from reconstruction.avo.initial_views import input_starts, starts_around, starts_below, zoomed_camera
 from reconstruction.avo.scene import Target, ViewScene, reach_of, thinned
 from reconstruction.avo.search import Search
-from reconstruction.avo.starts import input_starts, starts_around, starts_below, zoomed_camera
 from reconstruction.types import Camera
 from registry.errors import UsageError
 from registry.geometry import matrix_from_quat

@@ -10,8 +10,8 @@ from reconstruction.types import ConvexPart
 from registry import SceneBundle
 from registry.errors import BundleError
 from registry.primitives import Primitive
+from registry.rigid_groups import moving_ids, welded_to
 from registry.simulation import cookable_points, specs_from_bundle, standing_primitive
-from registry.welding import moving_ids, welded_to
 
 # The shares of the largest moment below which PhysX is not given the smaller ones (registry/simulation.py).
 _LEAST_MOMENT = 1e-3

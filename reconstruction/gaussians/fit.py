@@ -13,7 +13,7 @@ import numpy as np
 from reconstruction.gaussians.backend import Backend
 from reconstruction.gaussians.backends import load_backend
 from reconstruction.gaussians.config import GaussiansConfig
-from reconstruction.gaussians.holes import fill_holes
+from reconstruction.gaussians.hole_seeding import fill_holes
 from reconstruction.gaussians.losses import FrameTarget, weights_of
 from reconstruction.gaussians.model import Gaussians, from_packed
 from reconstruction.gaussians.optimizer import Adam, SplatState, prune, rates_of, split

@@ -3,7 +3,7 @@
 from reconstruction.instances.config import INSTANCES_PRESETS, InstancesConfig
 from reconstruction.instances.find import find_instances, make_instances
 from reconstruction.instances.naming import load_namer, name_instances
-from reconstruction.instances.outside import backends, outside_inputs
+from reconstruction.instances.outside_inputs import backends, outside_inputs
 
 __all__ = [
     "INSTANCES_PRESETS",

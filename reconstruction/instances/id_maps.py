@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from reconstruction.instances.config import InstancesConfig
+from reconstruction.instances.mask_propagation import MaskPropagation
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.instances.told_maps import ToldMaps
 from reconstruction.poses.parallel import ordered_map
 from reconstruction.progress import Progress
 from reconstruction.surface.mesh_graph import lab_from_rgb
@@ -27,7 +27,7 @@ def render_id_maps(
 ) -> np.ndarray:
     """Return uint16 (n, h, w) ids per keyframe at depth resolution, as masks with ids `told` them, if there are any."""
     camera = depth.camera
-    asked = None if told is None else ToldMaps(told, surface)
+    asked = None if told is None else MaskPropagation(told, surface)
     maps = np.zeros((len(posed.images), camera.height, camera.width), np.uint16)
     progress.start(len(maps), "instance maps")
     # Frames are drawn ahead on all cores; the kernels after that use all of them by themselves.

@@ -8,7 +8,7 @@ import numpy as np
 from reconstruction.avo import AvoConfig, ViewScene, load_strategy, make_target
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize
 from reconstruction.scene_graph.base import Question
-from reconstruction.scene_graph.numbering import id_map, number_things
+from reconstruction.scene_graph.set_of_marks import id_map, number_things
 from reconstruction.types import AssetSet
 
 _SETTINGS = RasterSettings(near=0.02)

@@ -116,7 +116,7 @@ def fuse_surface(
     """
     from reconstruction.surface.pixels import prepare_views
     from reconstruction.surface.planes import find_planes
-    from reconstruction.surface.thinning import drop_small_components, thin
+    from reconstruction.surface.simplification import drop_small_components, thin
 
     low, high = _observed_box(posed, depth, config)
     views = prepare_views(

@@ -15,7 +15,7 @@ from reconstruction.progress import Progress
 from reconstruction.surface.config import SurfaceConfig
 from reconstruction.surface.extract import RawMesh, extract_mesh
 from reconstruction.surface.pixels import FusionViews
-from reconstruction.surface.thinning import cluster_keys, merge_vertices, thinning_level
+from reconstruction.surface.simplification import cluster_keys, merge_vertices, thinning_level
 from reconstruction.surface.tsdf import BLOCK, BlockVolume, integrate, tile_reach
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from registry import SceneRegistry, UsageError
 from simrecon_envs.benchmark.candidates import SEQUENCE, Candidate, check_kinds, composites, scene_candidates
+from simrecon_envs.benchmark.feasibility import Proof, ProofSettings, prove
 from simrecon_envs.benchmark.parallel import Workers
-from simrecon_envs.benchmark.proof import Proof, ProofSettings, prove
 from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.splits import side_of

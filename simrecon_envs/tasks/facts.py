@@ -8,7 +8,7 @@ from collections import OrderedDict
 import numpy as np
 
 from registry import SceneBundle
-from registry.welding import moving_ids, welded_to
+from registry.rigid_groups import moving_ids, welded_to
 from simrecon_envs.hovering import Hover, most_room
 from simrecon_envs.occupancy import ConvexSolid, scene_solids
 from simrecon_envs.placement import PlacementConfig, Target, candidate_targets

@@ -8,11 +8,11 @@ from boxes import box, box_part, floor, mesh_of, room, thing, wall
 
 from reconstruction.assembly import AssemblyConfig, _faults, assemble, scene_specs
 from reconstruction.assembly.base import convex_part
+from reconstruction.assembly.collision_trimming import cut_out
 from reconstruction.assembly.hollow import fills_air, hollowed, volume
 from reconstruction.assembly.place import Placer
 from reconstruction.assembly.placement import Placement, base_specs
 from reconstruction.assembly.workbench import object_spec
-from reconstruction.assembly.yielding import cut_out
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.types import AssembledScene, AssetSet, Edge, ObjectAsset, SceneGraph
 from registry.geometry import rigid, transform_points

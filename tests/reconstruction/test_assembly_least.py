@@ -7,11 +7,11 @@ import pytest
 from boxes import box, box_part, floor, room, thing
 
 from reconstruction.assembly import AssemblyConfig, _restless, assemble
-from reconstruction.assembly.clear import least_move, make_clear
+from reconstruction.assembly.collision_trimming import cut_out, give_way
+from reconstruction.assembly.depenetration import least_move, make_clear
 from reconstruction.assembly.placement import base_specs
 from reconstruction.assembly.tops import seat
 from reconstruction.assembly.workbench import Workbench, object_spec, support_margin
-from reconstruction.assembly.yielding import cut_out, give_way
 from reconstruction.assets.gltf import read_obj, write_obj
 from reconstruction.types import AssetSet, Edge, SceneGraph
 from registry.geometry import rigid

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from reconstruction.assets.config import AssetsConfig
+from reconstruction.assets.rim_artifacts import away_directions, behind_rims, without_whiskers
 from reconstruction.assets.solid import box_solid
-from reconstruction.assets.tails import away_directions, behind_rims, without_whiskers
 from reconstruction.assets.views import lift_object, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, fuse_volume
 from reconstruction.rasterize import rasterize_mesh

@@ -14,10 +14,10 @@ from reconstruction.avo import AvoConfig, find_views, load_inpainter, load_strat
 from reconstruction.avo.cameras import look_at, moved, square_camera, step_gradient, upright
 from reconstruction.avo.clearance import measure_clearance
 from reconstruction.avo.coverage import Coverage
+from reconstruction.avo.initial_views import starts_below
 from reconstruction.avo.objective import Objective
 from reconstruction.avo.scene import reach_of, thinned
 from reconstruction.avo.search import Search
-from reconstruction.avo.starts import starts_below
 from reconstruction.avo.strategies import STRATEGIES
 from reconstruction.gaussians.fit import exponential
 from reconstruction.gaussians.model import SH_C0

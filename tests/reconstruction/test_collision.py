@@ -9,7 +9,7 @@ import pytest
 from notes import Notes
 from scipy.spatial import cKDTree
 
-from reconstruction.assets.collision import build, collision_parts, kept, kept_parts
+from reconstruction.assets.collision import build, collision_parts, kept_parts, part_cache
 from reconstruction.assets.collision.decomposition import Decomposer
 from reconstruction.assets.collision.primitives import BOUND_M, fitted_primitive
 from reconstruction.assets.collision.rings import find_hole
@@ -183,7 +183,7 @@ def test_parts_are_kept_by_mesh_and_options(tmp_path, monkeypatch):
     (file,) = tmp_path.glob("*.npz")
     for part, fresh in zip(first, collision_parts(bowl, config), strict=True):
         np.testing.assert_array_equal(part.vertices, fresh.vertices)
-    monkeypatch.setattr(kept, "collision_parts", None)  # nothing is cut again
+    monkeypatch.setattr(part_cache, "collision_parts", None)  # nothing is cut again
     for now, before in zip(
         kept_parts(tmp_path, bowl, replace(config, texture_min_px=64), **make), first, strict=True
     ):
@@ -208,7 +208,7 @@ def test_what_failed_is_not_kept(tmp_path, monkeypatch):
 
 
 def test_what_was_not_used_longest_is_forgotten_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(kept, "_MOST_KEPT", 2)
+    monkeypatch.setattr(part_cache, "_MOST_KEPT", 2)
     make = {"levels": (), "progress": NO_PROGRESS, "name": "box"}
     boxes = [box_solid(np.zeros(3), np.full(3, size)) for size in (1.0, 1.1, 1.2)]
     names = []

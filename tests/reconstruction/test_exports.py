@@ -13,7 +13,7 @@ from reconstruction.exports import FORMATS, export_scene
 from reconstruction.exports.scene import possible_inertia, read_scene, safe_name
 from registry import SceneBundle, SceneRegistry, seal_bundle
 from registry.errors import UsageError
-from registry.welding import moving_ids, welded_to
+from registry.rigid_groups import moving_ids, welded_to
 
 
 @pytest.fixture(scope="module")

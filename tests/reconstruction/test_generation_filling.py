@@ -7,9 +7,9 @@ from generation_servers import as_glb, thing_mesh
 from test_generation_registration import free_around
 
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.generation.closing import closed_solid
 from reconstruction.assets.generation.filling import filled_share
 from reconstruction.assets.generation.meshes import read_generated
+from reconstruction.assets.generation.solidify import closed_solid
 from reconstruction.assets.solid import manifold_of
 from synthetic.containers import make_basket, make_bowl, make_crate, make_mug
 from synthetic.furnishing import (

@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from reconstruction.assets import AssetsConfig, build_assets
 from reconstruction.assets.config import ASSETS_PRESETS
-from reconstruction.assets.generation.closing import closed_solid
 from reconstruction.assets.generation.fetch import fetch_meshes
 from reconstruction.assets.generation.meshes import read_generated
+from reconstruction.assets.generation.solidify import closed_solid
 from reconstruction.assets.solid import to_manifold
 from reconstruction.assets.views import lift_object, prepare_pixels
 from reconstruction.config import PipelineConfig

@@ -53,7 +53,9 @@ def features(
 ) -> np.ndarray:
     graph = MeshGraph.from_surface(surface_from(shape))
     everything = np.arange(len(graph.points))
-    return label_features(graph, everything, upright_box(graph.points, graph.areas), on_floor, attached, carries)
+    return label_features(
+        graph, everything, upright_box(graph.points, graph.areas), on_floor, attached, carries
+    )
 
 
 def facts(shape: Patchwork, **where) -> dict[str, float]:

@@ -17,7 +17,7 @@ from reconstruction.scene_graph import (
     synthesize,
 )
 from reconstruction.scene_graph.merge import GraphMerge
-from reconstruction.scene_graph.numbering import id_map, number_things
+from reconstruction.scene_graph.set_of_marks import id_map, number_things
 from reconstruction.types import Camera
 from synthetic.true_assets import true_assets, true_edges
 
@@ -204,7 +204,7 @@ def test_numbers_are_on_the_picture_and_not_on_each_other():
     with_all = number_things(gray, ids, {i: str(i) for i in range(3, 15)}, {1: "floor 1"})
     assert with_all.shape == gray.shape
     # Twelve boxes of the labels' own colors, each whole: nothing is drawn over a label.
-    from reconstruction.scene_graph.numbering import color_of
+    from reconstruction.scene_graph.set_of_marks import color_of
 
     for number in range(3, 15):
         own = (with_all == color_of(number)).all(axis=2).sum()

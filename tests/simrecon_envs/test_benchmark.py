@@ -14,10 +14,10 @@ from reconstruction.cli import main
 from registry import EnvironmentMissing, SceneRegistry, UsageError
 from simrecon_envs.benchmark.candidates import Candidate, composites, scene_candidates
 from simrecon_envs.benchmark.compare import compare_results
+from simrecon_envs.benchmark.feasibility import ProofSettings, prove
 from simrecon_envs.benchmark.generate import generate_suite
 from simrecon_envs.benchmark.parallel import Workers
 from simrecon_envs.benchmark.policies import PolicySpec
-from simrecon_envs.benchmark.proof import ProofSettings, prove
 from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.results import Results, load_results
 from simrecon_envs.benchmark.run import RunSettings, run_suite

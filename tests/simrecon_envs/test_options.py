@@ -12,9 +12,9 @@ from made_scenes import BLOCK, BOX, CRATE, CUBE, CYLINDER, TABLE, BundleWriter, 
 
 import simrecon_envs
 from registry import SceneNotFound, SceneRegistry, UsageError
+from simrecon_envs.layout_randomization import GAP_M, about, gap, group_things
 from simrecon_envs.multi import split_of
 from simrecon_envs.randomization import Randomization
-from simrecon_envs.shifting import GAP_M, about, gap, group_things
 
 
 def _make(root: Path, scene: str = "things", **kwargs: object) -> gym.Env:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.assets.collision import child as child_module
-from reconstruction.assets.collision.child import receive, send
+from reconstruction.assets.collision import coacd_process as child_module
+from reconstruction.assets.collision.coacd_process import receive, send
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid, lighten
 from registry.errors import EnvironmentMissing

@@ -6,10 +6,10 @@ import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.generation.base import GenerationError
-from reconstruction.assets.generation.closing import closed_solid
 from reconstruction.assets.generation.fetch import Fetched
 from reconstruction.assets.generation.filling import filled_share
 from reconstruction.assets.generation.meshes import GeneratedMesh, read_generated
+from reconstruction.assets.generation.solidify import closed_solid
 from reconstruction.assets.registration import FreeDepth, Registration, SeenSurface, register
 from reconstruction.assets.solid import Solid, manifold_of
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume

@@ -324,9 +324,8 @@ class _Tip:
         return plain and less and controller.config.frame == frames[type(controller)]
 
     def __init__(self, share: slice, controller: PDEEPosController) -> None:
-        from simrecon_envs import chains
 
-        self._follow = chains.follow
+        self._follow = inverse_kinematics.follow
         self._share = share
         self._indices = controller.active_joint_indices.tolist()
         low, high = controller.action_space_low.numpy()[:3], controller.action_space_high.numpy()[:3]
@@ -343,7 +342,16 @@ class _Tip:
         chain = np.flatnonzero((screws != 0).any(axis=1) | free)  # not the fingers, nor the head
         screws, free = np.ascontiguousarray(screws[chain]), free[chain]
         known = kinematics.pmodel_active_joint_indices.numpy()[chain].astype(np.int64)
-        self._arm = (screws, chains.motions(screws), free, home, _PHASES, _OUT_OF_REACH, scale, known)
+        self._arm = (
+            screws,
+            inverse_kinematics.motions(screws),
+            free,
+            home,
+            _PHASES,
+            _OUT_OF_REACH,
+            scale,
+            known,
+        )
         self._angles = np.zeros(len(chain))
         self._found = [
             chain.tolist().index(number) for number in kinematics.pmodel_controlled_joint_indices.tolist()

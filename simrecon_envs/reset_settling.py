@@ -9,7 +9,7 @@ from typing import Any
 
 import sapien
 
-from simrecon_envs.forgetting import renew_physics
+from simrecon_envs.physics_reset import renew_physics
 
 # What stands hardly moves after a fifth of a second, and ever less; what still wobbles after half a second counts as
 # fallen. What begins to tip over is slow at first, but gets faster.

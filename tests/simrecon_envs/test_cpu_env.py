@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import simrecon_envs
-from simrecon_envs import chains, scene_env
-from simrecon_envs.direct import _PHASES, DirectDrive, DirectReads
+from simrecon_envs import inverse_kinematics, scene_env
+from simrecon_envs.cpu_env import _PHASES, DirectDrive, DirectReads
 from simrecon_envs.measures import Measures
 from simrecon_envs.oracle import CONTROL_MODE, Oracle
 from simrecon_envs.tasks.put import Put
@@ -245,7 +245,7 @@ def test_the_hand_gets_where_it_can_in_few_steps(scenes_root: Path) -> None:
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=0.05)
         moved.append(not np.array_equal(ours, here))
         few = [_PHASES * [[1], [1], [0]] if part is _PHASES else part for part in tip._arm]
-        found = chains.follow(*few, drive._robot.qpos, action[tip._share], np.zeros(7))
+        found = inverse_kinematics.follow(*few, drive._robot.qpos, action[tip._share], np.zeros(7))
         short += found == moved[-1]
         env.step(action)
     assert sum(moved) > 30
@@ -267,19 +267,19 @@ def test_arms_are_those_of_the_robots_model(scenes_root: Path, robot: str) -> No
     off = []
     for _ in range(50):
         qpos = here + generator.normal(0, 0.3, len(here))
-        chains.place(moving, qpos[known], base_from)
-        chains.product(base_from[-1], home, tips)
+        inverse_kinematics.place(moving, qpos[known], base_from)
+        inverse_kinematics.product(base_from[-1], home, tips)
         angles = qpos[kinematics.pmodel_active_joint_indices.numpy()]
         model.compute_forward_kinematics(angles)
         pose = model.get_link_pose(hand)
         np.testing.assert_allclose(tips, pose.to_transformation_matrix()[:3], rtol=0, atol=1e-6)
 
         matrix = np.empty((6, len(screws)))
-        chains.jacobian(screws, np.ones(len(screws), bool), base_from, tips, matrix)
+        inverse_kinematics.jacobian(screws, np.ones(len(screws), bool), base_from, tips, matrix)
         for joint in range(len(screws)):
             turned, after = qpos[known] + 1e-5 * (np.arange(len(screws)) == joint), np.empty((3, 4))
-            chains.place(moving, turned, base_from)
-            chains.product(base_from[-1], home, after)
+            inverse_kinematics.place(moving, turned, base_from)
+            inverse_kinematics.product(base_from[-1], home, after)
             np.testing.assert_allclose(matrix[:, joint], 1e5 * _screw(tips, after), rtol=0, atol=1e-4)
 
         # The same steps as the solver's that ManiSkill uses.
@@ -293,7 +293,7 @@ def test_arms_are_those_of_the_robots_model(scenes_root: Path, robot: str) -> No
                 hand, goal, initial_qpos=angles, active_qmask=mask, eps=1e-6, dt=share, max_iterations=steps
             )
             phases, ours = np.array([[share, steps, 1e-6], [share, 0, 0]]), np.empty(len(known))
-            same = chains.follow(
+            same = inverse_kinematics.follow(
                 screws, moving, free, home, phases, 0.0, scale, known, qpos.astype(np.float32), action, ours
             )
             assert same == found
@@ -319,11 +319,11 @@ def test_the_way_to_a_goal_leads_there() -> None:
         local[:3, :3], local[:3, 3] = np.cross(np.eye(3), screw[3:]), screw[:3]
         motion = scipy.linalg.expm(local)
         goal = np.column_stack([motion[:3, :3] @ here[:, :3], here[:, 3] + motion[:3, 3]])
-        size = chains.away(here, goal, way)
+        size = inverse_kinematics.away(here, goal, way)
         np.testing.assert_allclose(way, screw, rtol=0, atol=1e-8)
         assert size == pytest.approx(np.linalg.norm(screw), abs=1e-8)
     half = np.column_stack([np.diag([1.0, -1.0, -1.0]), np.zeros(3)])
-    assert chains.away(np.eye(4)[:3], half, way) == np.inf  # not taken for being there
+    assert inverse_kinematics.away(np.eye(4)[:3], half, way) == np.inf  # not taken for being there
 
 
 def _euler(turn: np.ndarray) -> np.ndarray:

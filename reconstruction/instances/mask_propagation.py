@@ -18,7 +18,7 @@ _SAME_M = 0.02  # frames that are nearer than this count alike
 _HIDDEN = 0.015  # of depth: what lies so far behind the surface drawn there is hidden
 
 
-class ToldMaps:
+class MaskPropagation:
     """Asks frames with masks what keyframes show."""
 
     def __init__(self, told: FrameMasks, surface: Surface) -> None:
