@@ -325,6 +325,8 @@ class _Tip:
 
     def __init__(self, share: slice, controller: PDEEPosController) -> None:
 
+        from simrecon_envs import inverse_kinematics
+
         self._follow = inverse_kinematics.follow
         self._share = share
         self._indices = controller.active_joint_indices.tolist()

@@ -1,9 +1,9 @@
 """Stage 6: cut the fused surface into floor, walls and separate things, by learned affinities or by masks."""
 
 from reconstruction.instances.config import INSTANCES_PRESETS, InstancesConfig
+from reconstruction.instances.external import backends, outside_inputs
 from reconstruction.instances.find import find_instances, make_instances
 from reconstruction.instances.naming import load_namer, name_instances
-from reconstruction.instances.outside_inputs import backends, outside_inputs
 
 __all__ = [
     "INSTANCES_PRESETS",
