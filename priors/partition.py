@@ -37,7 +37,7 @@ from priors.partition_figures import best_least, figures_of, proposal_figures
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, Example
 from priors.partition_targets import Targets
-from priors.partition_trees import PAIRS, PROPOSALS, fit_trees
+from priors.partition_trees import PAIRS, PROPOSALS, fit_trees, mean_of
 from priors.rooms import HELD_OUT
 from priors.samples import Room, open_rooms
 from reconstruction.instances.partition.boosting import Boosted
@@ -50,6 +50,7 @@ _KEPT_OUT = 5  # one training room of so many
 _FINER = -3.0  # log-odds added to borders of superpoints: clusters can still be joined, but not cut
 _THINGS = 0.5  # log-odds added to "thing": proposals can still be left out, but not made of base
 _ROUNDS = {"pairs": 300, "proposals": 400}
+_SEEDS = 5  # of the proposals' trees, whose mean is taken: one seed is worth two or three things either way
 _TOGETHER = [
     [k for k, name in enumerate(names) if name.startswith(("together", "pixel"))]
     for names in (NODE_FEATURES, EDGE_FEATURES)
@@ -173,7 +174,10 @@ def _fit_pairs(rooms: list[Clusters], rounds: int, seed: int) -> Boosted:
 
 def _fit_proposals(rooms: list[RoomProposals], rounds: int, seed: int) -> Boosted:
     rows, iou = np.concatenate([r.rows for r in rooms]), np.concatenate([r.best_iou for r in rooms])
-    return fit_trees(rows, iou, np.ones(len(iou)), PROPOSALS, rounds, seed)
+    # a room of many pieces has many proposals, and says hardly more than one of few
+    weight = np.concatenate([np.full(len(r.rows), len(r.rows) ** -0.5) for r in rooms if len(r.rows)])
+    weight /= weight.mean()
+    return mean_of([fit_trees(rows, iou, weight, PROPOSALS, rounds, seed + k) for k in range(_SEEDS)])
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -3,6 +3,7 @@
 They are fitted with LightGBM (`pip install "simrecon[training]"`) and kept as arrays.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ PAIRS = _COMMON | {
 }  # fmt: skip
 PROPOSALS = _COMMON | {
     "objective": "cross_entropy", "learning_rate": 0.04, "min_data_in_leaf": 60, "feature_fraction": 0.4,
-    "bagging_fraction": 0.6, "lambda_l2": 5.0,
+    "bagging_fraction": 0.6, "lambda_l2": 225.0,
 }  # fmt: skip
 LABELS = _COMMON | {
     "objective": "multiclass", "num_leaves": 12, "learning_rate": 0.06, "min_data_in_leaf": 12, "feature_fraction": 0.5,
@@ -50,6 +51,17 @@ def fit_classes(
     settings = settings | {"num_class": classes}
     info = _fitted(rows, target, np.ones(len(rows)), settings, rounds, seed)["tree_info"]
     return tuple(arrays_of(info[k::classes], rows.shape[1]) for k in range(classes))
+
+
+def mean_of(every: Sequence[Boosted]) -> Boosted:
+    """Return trees whose score is the mean of several trees' scores."""
+    nodes, leaves = np.cumsum([[0, 0], *([len(t.feature), len(t.value)] for t in every)], axis=0).T
+    return Boosted(
+        np.concatenate([[0], *(t.root[1:] + n for t, n in zip(every, nodes))]).astype(np.int32),
+        np.concatenate([t.first_leaf + n for t, n in zip(every, leaves)]).astype(np.int32),
+        *(np.concatenate([getattr(t, name) for t in every]) for name in ("feature", "threshold", "left", "right")),
+        np.concatenate([t.value / np.float32(len(every)) for t in every]), every[0].features,
+    )  # fmt: skip
 
 
 def _fitted(

@@ -12,7 +12,7 @@ from priors.partition_figures import area_under_curve, by_truth
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, example
 from priors.partition_ruler import Figures, compare
-from priors.partition_trees import LABELS, PAIRS, arrays_of, fit_classes
+from priors.partition_trees import LABELS, PAIRS, arrays_of, fit_classes, mean_of
 from priors.samples import open_rooms
 from reconstruction.instances.labels import CLASSES, LABEL_FEATURES, LabelModel, load_labels
 from reconstruction.instances.partition.model import FEATURES, TREES, load_models
@@ -146,6 +146,14 @@ def test_trees_say_what_lightgbm_says():
     np.testing.assert_allclose(constant(rows), alone.predict(rows, raw_score=True), atol=1e-6)
 
 
+def test_the_mean_of_trees_scores_the_mean():
+    rng = np.random.default_rng(3)
+    (first, _), (second, _) = stumps(9, rng), stumps(9, rng)
+    rows = rng.normal(size=(200, 9)).astype(np.float32)
+    both = mean_of([first, second, second])
+    np.testing.assert_allclose(both(rows), (first(rows) + 2 * second(rows)) / 3, atol=1e-6)
+
+
 def test_training_learns_writes_weights_and_says_figures(data, tmp_path):
     arguments = [str(data), "--out", str(tmp_path), "--cache", str(data / "cache"), "--rounds", "20"]
     assert partition.main([*arguments, "--steps", "1"]) == 0
@@ -160,7 +168,8 @@ def test_training_learns_writes_weights_and_says_figures(data, tmp_path):
     assert late["shapes, things"]["recall_25"] <= late["shapes, things"]["by_truth_recall_25"]
     models = load_models(tmp_path / "partition.safetensors")
     assert len(models.superpoints.members) > 1
-    assert len(models.pairs.first_leaf) == len(models.proposals.first_leaf) == 20
+    assert len(models.pairs.first_leaf) == 20
+    assert len(models.proposals.first_leaf) == partition._SEEDS * 20
     assert 0 < models.least_iou < 1
 
 
