@@ -22,10 +22,6 @@ PROPOSALS = _COMMON | {
     "objective": "cross_entropy", "learning_rate": 0.04, "min_data_in_leaf": 60, "feature_fraction": 0.4,
     "bagging_fraction": 0.6, "lambda_l2": 225.0,
 }  # fmt: skip
-LABELS = _COMMON | {
-    "objective": "multiclass", "num_leaves": 12, "learning_rate": 0.06, "min_data_in_leaf": 12, "feature_fraction": 0.5,
-    "bagging_fraction": 0.7, "lambda_l2": 3.0,
-}  # fmt: skip
 _LEAVES_OF_FEW_ROWS = 20  # at the most, where there are too few rows for leaves of the usual size
 
 
@@ -38,19 +34,6 @@ def fit_trees(
         EnvironmentMissing: LightGBM is not installed.
     """
     return arrays_of(_fitted(rows, target, weight, settings, rounds, seed)["tree_info"], rows.shape[1])
-
-
-def fit_classes(
-    rows: np.ndarray, target: np.ndarray, classes: int, settings: dict[str, Any], rounds: int, seed: int
-) -> tuple[Boosted, ...]:
-    """Fit trees to features float32 (m, F) and classes int (m,); one sum a class, whose softmax is its probability.
-
-    Raises:
-        EnvironmentMissing: LightGBM is not installed.
-    """
-    settings = settings | {"num_class": classes}
-    info = _fitted(rows, target, np.ones(len(rows)), settings, rounds, seed)["tree_info"]
-    return tuple(arrays_of(info[k::classes], rows.shape[1]) for k in range(classes))
 
 
 def mean_of(every: Sequence[Boosted]) -> Boosted:

@@ -9,7 +9,7 @@ from reconstruction.editing.anchors import Footage, Pointer
 from reconstruction.editing.clicked_split import grown_parts, split_maps
 from reconstruction.instances.base import BASE_LABELS
 from reconstruction.instances.boxes import UprightBox, upright_box
-from reconstruction.instances.labels import coarse_label, label_features
+from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.surface.base_planes import base_outline
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
@@ -184,7 +184,7 @@ def _renamed_by_shape(part: Instance, found: InstanceSet, graph: MeshGraph) -> I
     chosen = np.flatnonzero(found.vertex_instance == part.id)
     box = UprightBox(part.center, part.yaw_rad, part.extents_m)
     label, confidence = coarse_label(
-        label_features(graph, chosen, box, on_floor and not part.attached_hint, part.attached_hint, carries)
+        shape_facts(graph, chosen, box, on_floor and not part.attached_hint, part.attached_hint, carries)
     )
     return replace(part, label=label, label_confidence=confidence)
 

@@ -9,35 +9,25 @@ UNKNOWN = "unknown"
 MEANS: dict[str, frozenset[str]] = {
     label: frozenset(words.split(", "))
     for label, words in {
-        "table": "table, coffee table, side table, desk, bar table, nested tables, table with cloth",
-        "shelf": "shelf, bookshelf, wall shelf, rack, cubby",
-        "cabinet": "cabinet, wardrobe, dresser, chest of drawers, drawers, sideboard, counter, wall cabinet",
-        "seat": "chair, stool, bench, sofa, armchair, office chair, pouf",
+        "table": "table, coffee table, side table, desk",
+        "shelf": "shelf, bookshelf, wall shelf, rack",
+        "cabinet": "cabinet, wardrobe, dresser, chest of drawers",
+        "seat": "chair, stool, bench, sofa, armchair",
         "box": "box, cardboard box, open box, storage box, pudding box, sugar box, crate, package, carton, "
         "milk carton, block, cube, tin, book",
         "book": "book",
         "can": "can, soup can, tin, jar, candle",
-        "bottle": "bottle, sauce bottle, jar, vase, pitcher, flask",
-        "cup": "cup, mug, goblet, odd cup",
+        "bottle": "bottle, sauce bottle, jar, vase, pitcher",
+        "cup": "cup, mug",
         "bowl": "bowl, pot",
         "plate": "plate",
-        "tray": "tray, basket, open box, crate, dish rack, wire basket",
-        "picture": "picture, painting, poster, picture frame, calendar, whiteboard",
-        "plant": "plant, potted plant, cactus, bouquet, grass, tree",
+        "tray": "tray, basket, open box, crate, dish rack",
+        "picture": "picture, painting, poster, picture frame",
+        "plant": "plant, potted plant",
         "lamp": "lamp, desk lamp, floor lamp",
     }.items()
 }
-CHOSEN = {"tin": "can", "open box": "tray", "crate": "tray"}
-"""Of words that several labels may mean: the one that is right rather than the others."""
 BINS = (0.0, 0.3, 0.45, 0.6, 0.75, 1.0)
-
-
-def label_of(word: str) -> str:
-    """Return the coarse label of what a thing is truly called, "unknown" where none is right."""
-    word = word.lower().replace("_", " ")
-    if word in MEANS or word in CHOSEN:
-        return CHOSEN.get(word, word)
-    return next((label for label, words in MEANS.items() if word in words), UNKNOWN)
 
 
 @dataclass(frozen=True)

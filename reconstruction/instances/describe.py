@@ -1,13 +1,11 @@
 """Things become objects: numbered by size, with boxes that reach what carries them, hints and coarse labels."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from reconstruction.instances.boxes import UprightBox, quantiles, upright_box, with_bottom
 from reconstruction.instances.containment import is_inside
 from reconstruction.instances.cut import Thing
-from reconstruction.instances.labels import coarse_label, label_features
+from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.types import BaseEntity, Instance
 
@@ -19,48 +17,37 @@ _FLAT = 0.5  # height over width of what is flat
 _COVERED, _RIM_M = 0.7, 0.02  # share of what carries a thing, and how far that may reach beyond the outline
 
 
-@dataclass(frozen=True)
-class Placed:
-    """A thing with its box, and what its label is told from."""
-
-    thing: Thing
-    box: UprightBox
-    on_floor: bool
-    features: np.ndarray  # float32 (len(LABEL_FEATURES),)
-
-
-def place(graph: MeshGraph, things: list[Thing], base: tuple[BaseEntity, ...]) -> list[Placed]:
-    """Return the things by size, with boxes that reach what carries them."""
-    boxes = {id(t): upright_box(graph.points[t.vertices], graph.areas[t.vertices]) for t in things}
-    out = []
-    for thing in sorted(things, key=lambda t: (-float(np.prod(boxes[id(t)].extents_m)), int(t.vertices[0]))):
-        box = _box_on_support(graph, thing, boxes[id(thing)], base)
-        on_floor = not thing.attached and thing.rests_on is None and _stands_on_floor(graph, box)
-        carries = sum(1 for t in things if t.rests_on is thing)
-        features = label_features(graph, thing.vertices, box, on_floor, thing.attached, carries)
-        out.append(Placed(thing, box, on_floor, features))
-    return out
-
-
 def describe(
     graph: MeshGraph, things: list[Thing], base: tuple[BaseEntity, ...], vertex_instance: np.ndarray
 ) -> tuple[Instance, ...]:
     """Number things by size, write their ids into `vertex_instance` and describe them."""
-    placed = place(graph, things, base)
-    number = {id(p.thing): len(base) + 1 + i for i, p in enumerate(placed)}
+    boxes = {id(t): upright_box(graph.points[t.vertices], graph.areas[t.vertices]) for t in things}
+    order = sorted(things, key=lambda t: (-float(np.prod(boxes[id(t)].extents_m)), int(t.vertices[0])))
+    number = {id(t): len(base) + 1 + i for i, t in enumerate(order)}
     out = []
-    for item in placed:
-        thing, box = item.thing, item.box
+    for thing in order:
         vertex_instance[thing.vertices] = number[id(thing)]
-        hint = number[id(thing.rests_on)] if thing.rests_on is not None else int(item.on_floor)
+        box = _box_on_support(graph, thing, boxes[id(thing)], base)
+        carries = sum(1 for t in things if t.rests_on is thing)
+        on_floor = not thing.attached and thing.rests_on is None and _stands_on_floor(graph, box)
+        label, confidence = coarse_label(
+            shape_facts(graph, thing.vertices, box, on_floor, thing.attached, carries)
+        )
+        hint = number[id(thing.rests_on)] if thing.rests_on is not None else 1 if on_floor else 0
         if thing.attached:
             hint = _nearest_wall(graph, thing, base)
         out.append(
             Instance(
-                number[id(thing)], *coarse_label(item.features), box.center, box.yaw_rad, box.extents_m, hint,
+                number[id(thing)],
+                label,
+                confidence,
+                box.center,
+                box.yaw_rad,
+                box.extents_m,
+                hint,
                 thing.attached,
             )
-        )  # fmt: skip
+        )
     return tuple(out)
 
 

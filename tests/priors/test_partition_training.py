@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from priors import dataset, labels, partition
+from priors import dataset, partition
 from priors.partition_figures import area_under_curve, by_truth
 from priors.partition_network import Network
-from priors.partition_rooms import NEEDED, example
+from priors.partition_rooms import NEEDED, example, film_of
 from priors.partition_ruler import Figures, compare
-from priors.partition_trees import LABELS, PAIRS, arrays_of, fit_classes, mean_of
+from priors.partition_trees import PAIRS, arrays_of, mean_of
 from priors.samples import open_rooms
-from reconstruction.instances.labels import CLASSES, LABEL_FEATURES, LabelModel, load_labels
 from reconstruction.instances.partition.model import FEATURES, TREES, load_models
 
 FRAMES = 6
@@ -184,31 +183,6 @@ def test_noise_on_features_keeps_their_means(graph):
     assert 0.2 < np.isclose(blurred.edges, network.edge_mean.numpy()).mean() < 0.5
 
 
-def test_sums_of_classes_give_the_probabilities_that_lightgbm_gives():
-    rng = np.random.default_rng(2)
-    rows = rng.normal(size=(600, len(LABEL_FEATURES))).astype(np.float32)
-    classes = (rows[:, 0] > 0) + 2 * (rows[:, 1] > 0.5)
-    trees = fit_classes(rows, classes, 4, LABELS, 15, 0)
-    data = lightgbm.Dataset(rows, classes)
-    booster = lightgbm.train(LABELS | {"num_class": 4, "seed": 0}, data, 15)
-    np.testing.assert_allclose(LabelModel(trees, 1.0).probabilities(rows), booster.predict(rows), atol=1e-5)
-
-
-def test_names_are_learned_and_written(data, tmp_path):
-    arguments = [str(data), "--out", str(tmp_path), "--cache", str(data / "cache"), "--rounds", "30"]
-    assert labels.main(arguments) == 0
-    figures = json.loads((tmp_path / "figures.json").read_text())
-    assert set(figures) == {"train", "shapes"}
-    room = open_rooms(data / "train", NEEDED)[0]
-    rows = labels.rows_of((room, data / "cache", None))
-    true = ~rows.found
-    assert true.sum() >= 3
-    assert set(np.array(rows.names)[true]) <= {e.label for e in labels.film_of(room, None).room.entities}
-    said = load_labels(tmp_path / "labels.safetensors").probabilities(rows.features)
-    np.testing.assert_allclose(said.sum(axis=1), 1)
-    assert said[np.arange(len(said)), rows.classes].mean() > 1.5 / len(CLASSES)
-
-
 def test_rooms_of_other_code_are_refused(data, tmp_path):
     import shutil
 
@@ -221,4 +195,4 @@ def test_rooms_of_other_code_are_refused(data, tmp_path):
     about["film"]["fov_deg"] += 1
     (other / "room.json").write_text(json.dumps(about))
     with pytest.raises(UsageError, match="make it anew"):
-        labels.film_of(open_rooms(tmp_path / "train", NEEDED)[0], None)
+        film_of(open_rooms(tmp_path / "train", NEEDED)[0], None)

@@ -5,14 +5,13 @@ import pytest
 from surfaces import Patchwork, merged, sheet, solid_box, surface_from
 
 from benchmarks.labels import compared, table
-from reconstruction.evaluation.labels import MEANS, Guess, label_of, overconfidence, reliability
+from reconstruction.evaluation.labels import Guess, overconfidence, reliability
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.boxes import upright_box
-from reconstruction.instances.labels import CLASSES, LABEL_FEATURES, coarse_label, label_features, load_labels
+from reconstruction.instances.labels import ShapeFacts, coarse_label, shape_facts
 from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.surface.mesh_graph import MeshGraph
-from registry.errors import EnvironmentMissing
 
 GRAY = (128, 128, 128)
 
@@ -49,18 +48,10 @@ def cylinder(radius: float, low: float, high: float, lid: bool, inside: float | 
     )
 
 
-def features(
-    shape: Patchwork, on_floor: bool = False, attached: bool = False, carries: int = 0
-) -> np.ndarray:
+def facts(shape: Patchwork, on_floor: bool = False, attached: bool = False, carries: int = 0) -> ShapeFacts:
     graph = MeshGraph.from_surface(surface_from(shape))
     everything = np.arange(len(graph.points))
-    return label_features(
-        graph, everything, upright_box(graph.points, graph.areas), on_floor, attached, carries
-    )
-
-
-def facts(shape: Patchwork, **where) -> dict[str, float]:
-    return dict(zip(LABEL_FEATURES, features(shape, **where).tolist(), strict=True))
+    return shape_facts(graph, everything, upright_box(graph.points, graph.areas), on_floor, attached, carries)
 
 
 def table_of(width: float, depth: float, height: float) -> Patchwork:
@@ -78,69 +69,31 @@ def shelf_of(width: float, depth: float, height: float, boards: int) -> Patchwor
     return merged(*sides, *(solid_box((0, 0, z), (width, depth, z + 0.02), GRAY) for z in levels))
 
 
-def test_features_say_what_shapes_are():
-    box = facts(solid_box((0, 0, 0.5), (0.12, 0.1, 0.66), GRAY))
-    can = facts(cylinder(0.035, 0.5, 0.72, lid=True))
-    cup = facts(cylinder(0.05, 0.5, 0.58, lid=False, inside=0.51))
-    table = facts(table_of(1.2, 0.7, 0.72), on_floor=True, carries=2)
-    shelf = facts(shelf_of(0.8, 0.3, 1.5, 4), on_floor=True)
-    picture = facts(sheet((0, 0.02, 1.2), (0.6, 0, 0), (0, 0, 0.4), GRAY), attached=True)
-    assert box["squareness"] > 0.6 > 0.3 > can["squareness"]
-    assert box["outward"] > 0.5
-    assert can["outward"] > 0.9
-    assert cup["middle_below_top"] > 0.6 > 0.1 > abs(can["middle_below_top"])
-    assert table["flat_top"] > 0.55
-    assert table["carries"] == 2
-    assert table["on_floor"] == 1
-    assert (table["levels"], shelf["levels"]) == (1, 4)
-    assert picture["outline_fill"] > 0.95
-    assert picture["attached"] == 1
-    assert box["hull_fill"] == pytest.approx(1, abs=0.05)
-    assert table["hull_fill"] > 0.9  # the hull of a table is a block
-    assert table["area_of_hull"] < shelf["area_of_hull"]
-    assert box["height"] == pytest.approx(0.16, abs=0.01)
-    assert box["bottom"] == pytest.approx(0.5, abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("shape", "where", "label"),
     [
+        (solid_box((0, 0, 0.5), (0.12, 0.1, 0.66), GRAY), {}, "box"),
+        (solid_box((0, 0, 0.5), (0.24, 0.17, 0.54), GRAY), {}, "book"),
+        (cylinder(0.035, 0.5, 0.72, lid=True), {}, "bottle"),
+        (cylinder(0.05, 0.5, 0.58, lid=False, inside=0.51), {}, "cup"),
+        (cylinder(0.12, 0.5, 0.58, lid=False, inside=0.52), {}, "bowl"),
+        (cylinder(0.13, 0.5, 0.53, lid=True), {}, "plate"),
         (table_of(1.2, 0.7, 0.72), {"on_floor": True, "carries": 2}, "table"),
+        (table_of(1.1, 0.35, 0.45), {"on_floor": True}, "seat"),
+        (shelf_of(0.8, 0.3, 1.5, 4), {"on_floor": True}, "shelf"),
         (solid_box((0, 0, 0), (0.9, 0.45, 0.8), GRAY), {"on_floor": True}, "cabinet"),
+        (sheet((0, 0.02, 1.2), (0.6, 0, 0), (0, 0, 0.4), GRAY), {"attached": True}, "picture"),
     ],
 )
 def test_clear_shapes_have_their_names(shape, where, label):
-    found, confidence = coarse_label(features(shape, **where))
+    found, confidence = coarse_label(facts(shape, **where))
     assert found == label
-    assert 0.25 <= confidence < 1
+    assert 0.25 <= confidence <= 0.7  # believed, but never sure
 
 
 def test_a_sheet_that_is_not_a_picture_is_not_called_one():
     rail = sheet((0, 0.02, 1.2), (1.1, 0, 0), (0, 0, 0.12), GRAY)
-    assert coarse_label(features(rail, attached=True))[0] != "picture"
-
-
-def test_probabilities_are_of_all_classes_and_do_not_depend_on_neighbors():
-    rows = np.stack(
-        [features(table_of(1.2, 0.7, 0.72), on_floor=True), features(cylinder(0.035, 0.5, 0.72, True))]
-    )
-    both = load_labels().probabilities(rows)
-    assert both.shape == (2, len(CLASSES))
-    np.testing.assert_allclose(both.sum(axis=1), 1)
-    np.testing.assert_array_equal(both[1], load_labels().probabilities(rows[1:])[0])
-
-
-def test_broken_weights_are_told(tmp_path):
-    with pytest.raises(EnvironmentMissing, match="Install the package again"):
-        load_labels(tmp_path / "none.safetensors")
-
-
-def test_words_belong_to_one_label_each():
-    assert [label_of(w) for w in ("coffee table", "Open_Box", "tin", "book", "jar", "gear")] == [
-        "table", "tray", "can", "book", "can", "unknown",
-    ]  # fmt: skip
-    assert all(label_of(word) != "unknown" for words in MEANS.values() for word in words)
-    assert set(MEANS) | {"unknown"} == set(CLASSES)
+    assert coarse_label(facts(rail, attached=True)) == ("unknown", 0.0)
 
 
 def test_bins_count_what_was_said_and_what_is_right():
