@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--no-predictions",
         action="store_true",
-        help="no predicted depth: the learned cut needs none, a sixth faster",
+        help="no predicted depth, a sixth faster; what is fitted to it does not know prior=both",
     )
     parser.add_argument("--processes", type=int, default=2, help="rooms at once (default: %(default)s)")
     return parser

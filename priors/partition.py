@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
     cache = options.cache or options.out / "cache"
-    splits = split_rooms(options.data)
+    splits = _split_rooms(options.data)
     print({name: len(rooms) for name, rooms in splits.items()}, flush=True)
     scorers = (_shipped if options.proposals_only else _trained)(splits, cache, options)
     found = scorers.proposals
@@ -252,7 +252,7 @@ def _ensemble(networks: list[Network]) -> Ensemble:
     return Ensemble(tuple(Model({k: v.numpy() for k, v in n.state_dict().items()}) for n in networks))
 
 
-def split_rooms(data: Path) -> dict[str, list[Room]]:
+def _split_rooms(data: Path) -> dict[str, list[Room]]:
     """Return rooms by split: those trained on, those of the same families kept out, and other families."""
     rooms = open_rooms(data / "train", NEEDED)
     kept_out = [room for room in rooms if int(room.folder.name) % _KEPT_OUT == _KEPT_OUT - 1]

@@ -76,7 +76,7 @@ def examples_of(
     rooms: Sequence[Room], cache: Path, photographs: Path | None, processes: int
 ) -> list[Example]:
     """Return each room's graph of superpoints with its truth (`priors.partition_rooms.example`), cached."""
-    return each(_example, [(room, cache, photographs) for room in rooms], processes)
+    return _each(_example, [(room, cache, photographs) for room in rooms], processes)
 
 
 def _example(job: tuple[Room, Path, Path | None]) -> Example:
@@ -100,7 +100,7 @@ def clusters_of(
         cache: folder with the fused surfaces.
         processes: at work at once.
     """
-    found = each(_clusters, [(*job, cache) for job in zip(rooms, examples, models, strict=True)], processes)
+    found = _each(_clusters, [(*job, cache) for job in zip(rooms, examples, models, strict=True)], processes)
     return [Clusters(room, example, *values) for room, example, values in zip(rooms, examples, found)]
 
 
@@ -108,7 +108,7 @@ def proposals_of(
     found: Sequence[Clusters], trees: Sequence[Boosted], cache: Path, processes: int
 ) -> list[RoomProposals]:
     """Return the proposals of each room by trees for pairs that were not fitted to it."""
-    rows = each(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
+    rows = _each(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
     return [RoomProposals(*values, c.pieces.graph.region, c.example) for values, c in zip(rows, found)]
 
 
@@ -116,11 +116,10 @@ def shipped_proposals(
     rooms: Sequence[Room], cache: Path, photographs: Path | None, processes: int
 ) -> list[RoomProposals]:
     """Return the proposals of each room by the networks and trees for pairs that ship, cached."""
-    return each(shipped_proposals_of, [(room, cache, photographs) for room in rooms], processes)
+    return _each(_shipped_proposals_of, [(room, cache, photographs) for room in rooms], processes)
 
 
-def shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
-    """Return the proposals of a room, a folder for caches and one of photographs, by the weights that ship; cached."""
+def _shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
     room, cache, photographs = job
     models, known = load_models(), example(room, cache, photographs)
     digest = digest_of(["reconstruction.instances.partition.cut"])  # weights included
@@ -139,8 +138,7 @@ def shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
         return RoomProposals(members, stored["rows"], stored["best_iou"], stored["region"], known)
 
 
-def each(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
-    """Return what a function makes of every job, in order, by so many processes."""
+def _each(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
     if processes == 1:
         return [work(job) for job in jobs]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_alone) as pool:

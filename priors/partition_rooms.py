@@ -71,10 +71,11 @@ class Example:
 
 
 def cached(room: Room, cache: Path, kind: str) -> Path:
-    """Return where something of a room is kept, which follows from its depth as the shipped weights mend it."""
+    """Return where something of a room is kept, which follows from its arrays and the weights that mend its depth."""
     weights = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()[:12]
+    made = hashlib.sha256((room.folder / "room.json").read_bytes()).hexdigest()[:12]
     kind = f"{kind}-predicted" if _keeps_predictions(room) else kind
-    return cache / kind / weights / room.folder.parent.name / room.folder.name
+    return cache / kind / weights / room.folder.parent.name / f"{room.folder.name}-{made}"
 
 
 def _keeps_predictions(room: Room) -> bool:
@@ -105,9 +106,7 @@ def frames_and_depth(room: Room, cache: Path) -> tuple[PosedFrames, DepthMaps]:
 def _evidence(room: Room) -> tuple[PosedFrames, Evidence]:
     """Return the keyframes with true cameras, and their depth before it is mended."""
     a = room.arrays
-    left_out = np.asarray(a["origin"]) == PREDICTED
-    if _keeps_predictions(room):
-        left_out[:] = False
+    left_out = (np.asarray(a["origin"]) == PREDICTED) & (not _keeps_predictions(room))
     depth = np.where(left_out, 0, a["depth"]).astype(np.float32)
     height, width = depth.shape[1:]
     fx, fy = (float(f) for f in a["focal"])

@@ -33,7 +33,33 @@ def fit_trees(
     Raises:
         EnvironmentMissing: LightGBM is not installed.
     """
-    return arrays_of(_fitted(rows, target, weight, settings, rounds, seed)["tree_info"], rows.shape[1])
+    try:
+        import lightgbm
+    except ImportError as error:
+        raise EnvironmentMissing(
+            'Boosted trees are fitted with LightGBM: pip install "simrecon[training]"'
+        ) from error
+    data = lightgbm.Dataset(rows, target, weight=weight, free_raw_data=True)
+    least = min(settings["min_data_in_leaf"], len(rows) // _LEAVES_OF_FEW_ROWS)
+    settings = settings | {"seed": seed, "min_data_in_leaf": max(least, 1)}
+    return arrays_of(lightgbm.train(settings, data, rounds).dump_model())
+
+
+def arrays_of(dumped: dict[str, Any]) -> Boosted:
+    """Return the trees of LightGBM's `dump_model`."""
+    root, first_leaf, nodes, values = [0], [], [], []
+    for tree in dumped["tree_info"]:
+        own: list[tuple[int, float, int, int]] = []
+        first_leaf.append(len(values))
+        _walk(tree["tree_structure"], own, values, len(values))
+        nodes += own
+        root.append(len(nodes))
+    feature, threshold, left, right = zip(*nodes) if nodes else ((), (), (), ())
+    return Boosted(
+        np.array(root, np.int32), np.array(first_leaf, np.int32), np.array(feature, np.uint8),
+        _rounded_down(np.array(threshold, np.float64)), np.array(left, np.int8), np.array(right, np.int8),
+        np.array(values, np.float32), np.array(dumped["max_feature_idx"] + 1, np.int32),
+    )  # fmt: skip
 
 
 def mean_of(every: Sequence[Boosted]) -> Boosted:
@@ -44,38 +70,6 @@ def mean_of(every: Sequence[Boosted]) -> Boosted:
         np.concatenate([t.first_leaf + n for t, n in zip(every, leaves)]).astype(np.int32),
         *(np.concatenate([getattr(t, name) for t in every]) for name in ("feature", "threshold", "left", "right")),
         np.concatenate([t.value / np.float32(len(every)) for t in every]), every[0].features,
-    )  # fmt: skip
-
-
-def _fitted(
-    rows: np.ndarray, target: np.ndarray, weight: np.ndarray, settings: dict[str, Any], rounds: int, seed: int
-) -> dict[str, Any]:
-    try:
-        import lightgbm
-    except ImportError as error:
-        raise EnvironmentMissing(
-            'Boosted trees are fitted with LightGBM: pip install "simrecon[training]"'
-        ) from error
-    data = lightgbm.Dataset(rows, target, weight=weight, free_raw_data=True)
-    least = min(settings["min_data_in_leaf"], len(rows) // _LEAVES_OF_FEW_ROWS)
-    settings = settings | {"seed": seed, "min_data_in_leaf": max(least, 1)}
-    return lightgbm.train(settings, data, rounds).dump_model()
-
-
-def arrays_of(tree_info: list[dict[str, Any]], features: int) -> Boosted:
-    """Return the trees of LightGBM's `dump_model()["tree_info"]`, for rows of so many features."""
-    root, first_leaf, nodes, values = [0], [], [], []
-    for tree in tree_info:
-        own: list[tuple[int, float, int, int]] = []
-        first_leaf.append(len(values))
-        _walk(tree["tree_structure"], own, values, len(values))
-        nodes += own
-        root.append(len(nodes))
-    feature, threshold, left, right = zip(*nodes) if nodes else ((), (), (), ())
-    return Boosted(
-        np.array(root, np.int32), np.array(first_leaf, np.int32), np.array(feature, np.uint8),
-        _rounded_down(np.array(threshold, np.float64)), np.array(left, np.int8), np.array(right, np.int8),
-        np.array(values, np.float32), np.array(features, np.int32),
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from priors.partition_ruler import LEAST_SHARE
 from reconstruction.types import Camera
 from registry.errors import InputError
 from synthetic.camera_paths import phone_camera
@@ -38,7 +39,6 @@ _STEPS = (0.035, 0.07)  # between keyframes, as a share of the longer side; the 
 _WALKS_DRAWN = 4  # the one that shows the most things is taken
 _STARTS, _FEWEST_KEYFRAMES, _FEWEST_THINGS = 6, 8, 2.0  # things in view, mean over the keyframes
 _LOOKS = 16  # poses of a walk at which things in view are counted
-_IN_VIEW = 2000 / (640 * 480)  # of a frame
 _OBJECTS = (8, 26)  # things in a room
 _FRAMES_A_STEP = (
     8.0  # frames of a phone's film from keyframe to keyframe: the shutter is open for a share of one
@@ -170,7 +170,7 @@ class Film:
 def _things_in_view(ids: np.ndarray, base_entities: int) -> int:
     """Return how many things cover a little of a frame of ids (h, w)."""
     pixels = np.bincount(ids[ids > base_entities].astype(np.int64))
-    return int((pixels >= max(_IN_VIEW * ids.size, 2)).sum())
+    return int((pixels >= max(LEAST_SHARE * ids.size, 2)).sum())
 
 
 def _walk_past_things(

@@ -29,7 +29,8 @@ def code_digest(module: str, packages: tuple[str, ...] = PACKAGES) -> str:
         digest.update(f"{name}\0{_source(file, packages)[0]}\0".encode())
         folders.add(file.parent)
     for file in sorted({data for folder in folders for data in _data_files(folder)}):
-        digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+        stat = file.stat()
+        digest.update(file.name.encode() + b"\0" + _bytes_digest(file, stat.st_mtime_ns, stat.st_size))
     return digest.hexdigest()
 
 
@@ -66,7 +67,11 @@ def _parsed(file: Path, mtime_ns: int, size: int, packages: tuple[str, ...]) -> 
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             imported |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                raise ValueError(
+                    f"{file}:{node.lineno}: relative imports are not followed, write the whole name"
+                )
             inside = {f"{node.module}.{alias.name}" for alias in node.names}
             modules = {name for name in inside if name.split(".")[0] in packages and _exists(name)}
             imported |= modules if modules == inside else modules | {node.module}
@@ -111,8 +116,12 @@ def _root_of(package: str) -> Path:
     return file.parent if file.name == "__init__.py" else file.with_suffix("")
 
 
-@lru_cache(maxsize=1024)
-def _data_files(folder: Path) -> tuple[Path, ...]:
+@lru_cache(maxsize=256)
+def _bytes_digest(file: Path, mtime_ns: int, size: int) -> bytes:
+    return hashlib.sha256(file.read_bytes()).digest()
+
+
+def _data_files(folder: Path) -> list[Path]:
     """Return the data files in a folder and in those below it that hold no code."""
     out = []
     for item in sorted(folder.iterdir()):
@@ -120,4 +129,4 @@ def _data_files(folder: Path) -> tuple[Path, ...]:
             out.append(item)
         elif item.is_dir() and not any(item.glob("*.py")):
             out += _data_files(item)
-    return tuple(out)
+    return out

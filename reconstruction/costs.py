@@ -1,4 +1,4 @@
-"""What each step of a run cost: a bundle's report in, a table for people or for programs out."""
+"""Table of costs: the report of a bundle in, time and memory of each step out, as text or JSON."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ OTHER = "other"  # the rest of the run: digesting the input, saving and loading 
 
 @dataclass(frozen=True)
 class CostRow:
-    """What one step of a run cost; None where it was not measured."""
+    """Time and memory of one step of a run; None where not measured."""
 
     name: str
     wall_s: float

@@ -83,7 +83,7 @@ class Oracle:
         return [self.digest, code_digest(__name__)] if stage in self.stages else []
 
     def make(self, stage: str, call: "Call") -> Any:
-        """Return what the truth says in a stage's place."""
+        """Return the artifact of a stage, computed from the ground truth."""
         call.progress.note(f"{stage}: taken from the ground truth")
         if stage == "poses":
             return self.poses(call["frames"], call.options, work_dir=call.scratch, progress=call.progress)

@@ -49,7 +49,7 @@ from reconstruction.world import find_world
 
 @dataclass(frozen=True)
 class Call:
-    """What a stage gets: its options, the results that it declares, and folders."""
+    """Inputs of a stage: its options, the results that it declares, folders."""
 
     video: Path
     options: Any
@@ -184,6 +184,6 @@ def in_world(results: Mapping[str, Any]) -> tuple[PosedFrames, DepthMaps]:
 
 
 def view_scene(results: Mapping[str, Any]) -> ViewScene:
-    """Return what `reconstruction.avo.find_views` looks at, for views of any things or regions of them."""
+    """Return Gaussians, surface and things in world space, the input of `reconstruction.avo.find_views`."""
     gaussians = results["gaussians"].in_world(results["world"])
     return prepare_scene(gaussians, results["surface"], results["instances"], results["poses"].camera)

@@ -90,7 +90,7 @@ class Run:
         return in_world(self.results)
 
     def view_scene(self) -> "ViewScene":
-        """Return what `reconstruction.avo.find_views` looks at, for views of any things or regions of them."""
+        """Return Gaussians, surface and things in world space, the input of `reconstruction.avo.find_views`."""
         return view_scene(self.results)
 
     def lens(self) -> Lens:
@@ -98,7 +98,7 @@ class Run:
         return Lens.measure(self.results["frames"], self.results["poses"])
 
     def pointer(self, found: InstanceSet) -> Pointer:
-        """Return what addresses of the overrides are looked up in."""
+        """Return the lookup of addresses in the overrides: things, surface, keyframes."""
         posed, depth = self.in_world()
         surface = self.results["surface"]
         return Pointer(found, surface, Footage(posed, depth, surface, self.lens()))

@@ -1,4 +1,4 @@
-"""What a rasterizer for training does: render a view, and differentiate the loss of one."""
+"""Protocol of differentiable rasterizers: Gaussians and a camera in, a rendered view or a loss with derivatives out."""
 
 from dataclasses import dataclass
 from typing import Protocol

@@ -66,7 +66,7 @@ def find_instances(
     told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
     id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, told, progress=progress)
     found = InstanceSet(vertex_instance, shell.base, objects, id_maps)
-    if masks is not None and told is not None:
+    if told is not None:
         asked = masks.resized(told.camera.width, told.camera.height)
         found = add_outlined(found, asked, told, posed, depth, surface, config, progress)
     return without_unseen(found, config, progress)

@@ -1,4 +1,4 @@
-"""Masks carried over to keyframes that have none: each pixel asks the nearest frames with masks, where it lies.
+"""Mask propagation: masks of some frames in, ids of keyframes without masks out, by reprojection of their pixels.
 
 The id of a pixel drawn from the surface is as good as the surface; a mask follows the picture. Between frames that are
 near each other depth need not be exact to say which pixel of the one is which of the other.
@@ -19,7 +19,7 @@ _HIDDEN = 0.015  # of depth: what lies so far behind the surface drawn there is 
 
 
 class MaskPropagation:
-    """Asks frames with masks what keyframes show."""
+    """Propagates masks of some frames to keyframes, by reprojection."""
 
     def __init__(self, told: FrameMasks, surface: Surface) -> None:
         """Draw the surface into the frames of the masks.

@@ -80,12 +80,12 @@ def add_outlined(
         names = {s.name for s in group} - {0}
         own = next((k for k, o in enumerate(objects) if o.id in names), None)
         number = objects[own].id if own is not None else max([*(o.id for o in objects), len(found.base)]) + 1
-        made = instance_on_wall(number, box, wall, objects[own] if own is not None else None)
+        made = _instance_on_wall(number, box, wall, objects[own] if own is not None else None)
         if own is None:
             objects.append(made)
         else:
             objects[own] = made
-        draw_box(maps, number, box, wall, posed, depth, surface, found)
+        _draw_box(maps, number, box, wall, posed, depth, surface, found)
         count += 1
     if not count:
         return found
@@ -201,7 +201,7 @@ def _visible(box: WallBox, wall: Wall, told: FrameMasks, drawn: list[np.ndarray]
     return count
 
 
-def instance_on_wall(number: int, box: WallBox, wall: Wall, old: Instance | None) -> Instance:
+def _instance_on_wall(number: int, box: WallBox, wall: Wall, old: Instance | None) -> Instance:
     """Return a thing with this box on its wall: `old` with another box, or a new one."""
     along = (box.low[0] + box.high[0]) / 2
     center = np.array([*(along * wall.along + (0.5 * box.front - wall.offset) * wall.normal)[:2], 0.0])
@@ -214,7 +214,7 @@ def instance_on_wall(number: int, box: WallBox, wall: Wall, old: Instance | None
     return Instance(number, label, confidence, center, wall.yaw, extents, wall.id, True)
 
 
-def draw_box(
+def _draw_box(
     maps: np.ndarray, number: int, box: WallBox, wall: Wall, posed: PosedFrames, depth: DepthMaps, surface: Surface,
     found: InstanceSet,
 ) -> None:  # fmt: skip

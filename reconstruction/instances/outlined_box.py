@@ -120,7 +120,7 @@ class WallBox:
 def fit_box(wall: Wall, windows: list[Window]) -> WallBox:
     """Return the box that looks most like all outlines; where they do not tell, a flat one, or a bar if it is slim."""
     tried = [_box_at(windows, float(front)) for front in _FRONTS_M]
-    scores = [float(np.mean([agreement(box, wall, w) for w in windows])) for box in tried]
+    scores = [float(np.mean([_agreement(box, wall, w) for w in windows])) for box in tried]
     best = int(np.argmax(scores))
     if scores[best] > scores[0] + _GAIN:
         return tried[best]
@@ -153,7 +153,7 @@ def _box_at(windows: list[Window], front: float) -> WallBox:
     return WallBox(out[0], np.maximum(out[1], out[0] + 1e-3), front)
 
 
-def agreement(box: WallBox, wall: Wall, window: Window) -> float:
+def _agreement(box: WallBox, wall: Wall, window: Window) -> float:
     """Return the IoU of a box's silhouette with a mask's hull."""
     shape = silhouette(box, wall, window.camera, window.pose)
     if shape is None:

@@ -110,7 +110,7 @@ def stumps(features, rng):
     rows = rng.normal(size=(400, features)).astype(np.float32)
     target = (rows[:, 0] + rows[:, 1] * rows[:, 2] > 0).astype(float)
     booster = lightgbm.train(PAIRS | {"min_data_in_leaf": 5, "seed": 0}, lightgbm.Dataset(rows, target), 20)
-    return arrays_of(booster.dump_model()["tree_info"], features), booster
+    return arrays_of(booster.dump_model()), booster
 
 
 def test_numpy_says_what_pytorch_says(tmp_path):
@@ -141,7 +141,7 @@ def test_trees_say_what_lightgbm_says():
     with pytest.raises(ValueError, match="12 features got 11"):
         trees(rows[:, 1:])
     alone = lightgbm.train(PAIRS, lightgbm.Dataset(rows[:50], np.r_[np.zeros(25), np.ones(25)]), 3)
-    constant = arrays_of(alone.dump_model()["tree_info"], 12)  # too few rows for any node
+    constant = arrays_of(alone.dump_model())  # too few rows for any node
     np.testing.assert_allclose(constant(rows), alone.predict(rows, raw_score=True), atol=1e-6)
 
 

@@ -1,19 +1,20 @@
 """Films of generated rooms look at things, as people film."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from priors.partition_ruler import LEAST_SHARE
 from priors.rooms import draw_film
 from registry.errors import InputError
 from synthetic.film import render_truth
-
-LEAST = 2000 / (640 * 480)  # of a frame, for a thing to be in view
 
 
 def things_in_view(film, pose) -> int:
     _, ids = render_truth(film.film_set, film.camera(160, 120), pose)
     pixels = np.bincount(ids[ids > film.base_entities].astype(np.int64))
-    return int((pixels >= LEAST * ids.size).sum())
+    return int((pixels >= LEAST_SHARE * ids.size).sum())
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +35,6 @@ def test_the_same_number_is_the_same_film(film):
 
 
 def test_a_walk_that_sees_nothing_is_refused(film):
-    from dataclasses import replace
-
     up = film.walk.copy()
     up[:, :3, :3] = np.diag([1.0, -1.0, -1.0]) @ np.diag([1.0, -1.0, -1.0])  # OpenCV axes: straight up
     with pytest.raises(InputError, match="sees enough"):

@@ -29,15 +29,11 @@ def house(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     from reconstruction import code_digest as module
 
-    for cached in (module._root_of, module._data_files, module._parsed):
-        cached.cache_clear()
+    module._root_of.cache_clear()
     return tmp_path / "house"
 
 
 def digest() -> str:
-    from reconstruction import code_digest as module
-
-    module._data_files.cache_clear()
     return code_digest("house.stage", ("house",))
 
 
@@ -91,6 +87,12 @@ def test_modules_are_followed_and_other_packages_are_not(house):
     assert modules_behind("house.stage", ("house",)) == [
         "house.late", "house.shared", "house.stage", "house.stage.work",
     ]  # fmt: skip
+
+
+def test_a_relative_import_is_refused_and_not_left_out(house):
+    edit(house / "shared.py", "from . import elsewhere\n")
+    with pytest.raises(ValueError, match=r"shared\.py:1: relative imports"):
+        digest()
 
 
 def test_a_missing_package_is_an_error(house):

@@ -50,9 +50,9 @@ def test_a_region_is_proposed_with_all_that_is_below_it():
     """A top, a pedestal below it, a box on it, and a chair beside it."""
     low = np.array([[0, 0, 0.7], [0.4, 0.4, 0], [0.2, 0.2, 0.75], [1.5, 0, 0]])
     high = np.array([[1, 1, 0.75], [0.6, 0.6, 0.7], [0.3, 0.3, 0.9], [2.0, 0.5, 0.9]])
-    assert trees._with_all_below(frozenset({0}), low, high) == {0, 1}
-    assert trees._with_all_below(frozenset({0, 2}), low, high) == {0, 1, 2}
-    assert trees._with_all_below(frozenset({3}), low, high) == {3}
+    assert trees._with_all_below(frozenset({0}), low, high, 0.5 * (low + high)) == {0, 1}
+    assert trees._with_all_below(frozenset({0, 2}), low, high, 0.5 * (low + high)) == {0, 1, 2}
+    assert trees._with_all_below(frozenset({3}), low, high, 0.5 * (low + high)) == {3}
 
 
 def test_regions_that_hardly_grow_are_left_out():

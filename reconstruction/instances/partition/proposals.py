@@ -55,7 +55,8 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, region[inside], view.mesh.points[inside])
     np.maximum.at(high, region[inside], view.mesh.points[inside])
-    found |= {_with_all_below(members, low, high) for members in found}
+    middle = 0.5 * (low + high)
+    found |= {_with_all_below(members, low, high, middle) for members in found}
     regions = sorted(sorted(members) for members in found)
     members = members_of(regions, count)
     if not regions:
@@ -67,15 +68,18 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
     return Proposals(members[kept], low[kept], high[kept])
 
 
-def _with_all_below(members: frozenset[int], low: np.ndarray, high: np.ndarray) -> frozenset[int]:
+def _with_all_below(
+    members: frozenset[int], low: np.ndarray, high: np.ndarray, middle: np.ndarray
+) -> frozenset[int]:
     """Return a region with the clusters whose middle is below its foot and within its box in plan.
 
     Args:
         members: clusters of the region.
         low: float (n, 3) least coordinates of the clusters, metres.
         high: float (n, 3) greatest coordinates.
+        middle: float (n, 3) middles of their boxes.
     """
-    rows, middle = list(members), 0.5 * (low + high)
+    rows = list(members)
     least, most = low[rows].min(axis=0), high[rows].max(axis=0)
     within = ((middle[:, :2] > least[:2]) & (middle[:, :2] < most[:2])).all(axis=1)
     return members | frozenset(np.flatnonzero(within & (middle[:, 2] < least[2])).tolist())
