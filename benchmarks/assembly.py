@@ -27,7 +27,7 @@ from benchmarks.instances import stage_run, work_of
 from benchmarks.machine import ROOT, describe_code, describe_machine
 from benchmarks.table import DEFAULT_OUT
 from reconstruction.assembly import AssemblyConfig, assemble
-from reconstruction.types import AssembledScene, AssetSet, SceneGraph
+from reconstruction.core.types import AssembledScene, AssetSet, SceneGraph
 from registry.geometry import transform_points
 from registry.report_card import failures
 
@@ -132,9 +132,9 @@ def _true_centers(capture: Capture, run: Any, assets: AssetSet) -> tuple[dict[in
 
     And how many true metres a metre of it is: the evaluation aligns by a similarity, too.
     """
-    from reconstruction.evaluation.alignment import align
-    from reconstruction.evaluation.ground_truth import GroundTruth
-    from reconstruction.evaluation.matching import box_iou, match
+    from reconstruction.measure.alignment import align
+    from reconstruction.measure.ground_truth import GroundTruth
+    from reconstruction.measure.matching import box_iou, match
 
     truth = GroundTruth.load(capture.ground_truth)
     posed, _ = run.in_world()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction.types import AssetSet, SceneGraph
+from reconstruction.core.types import AssetSet, SceneGraph
 from registry.geometry import rigid
 from synthetic.procedural import RoomSpec, build_procedural_room
 from synthetic.true_assets import true_assets, true_edges

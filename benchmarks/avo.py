@@ -52,10 +52,10 @@ def measure_capture(
     Returns:
         `objects`: a record each; `pictures`: RGB rows for the page.
     """
-    from reconstruction.avo import AvoConfig, find_views, make_target, prepare_scene
-    from reconstruction.evaluation.alignment import align
-    from reconstruction.evaluation.ground_truth import GroundTruth
-    from reconstruction.evaluation.viewpoints import TrueViews
+    from reconstruction.measure.alignment import align
+    from reconstruction.measure.ground_truth import GroundTruth
+    from reconstruction.measure.viewpoints import TrueViews
+    from reconstruction.views import AvoConfig, find_views, make_target, prepare_scene
 
     run = stage_run(capture.source, work_of(out, capture), variant.arguments_for(capture))
     run.execute("instances")
@@ -120,7 +120,7 @@ def instance_of(truth: Any, alignment: Any, surface: Any, found: Any) -> dict[in
     """Return which instance shows most of each true thing, by true id."""
     from scipy.spatial import cKDTree
 
-    from reconstruction.evaluation.surfaces import sample
+    from reconstruction.measure.surfaces import sample
 
     samples = [sample(e.mesh.vertices, e.mesh.faces, 8000).points for e in truth.entities]
     owner = np.repeat([e.id for e in truth.entities], [len(points) for points in samples])
@@ -162,9 +162,9 @@ def _seeable(
     scene: Any, target: Any, points: np.ndarray, true_views: Any, alignment: Any, config: Any
 ) -> float:
     """Return the share of the true surface that cameras in free space all around the target see together."""
-    from reconstruction.avo.cameras import square_camera
-    from reconstruction.avo.initial_views import input_starts, starts_around
-    from reconstruction.evaluation.visibility import seen_points
+    from reconstruction.measure.visibility import seen_points
+    from reconstruction.views.cameras import square_camera
+    from reconstruction.views.initial_views import input_starts, starts_around
 
     poses = np.concatenate([starts_around(scene, target, config), input_starts(scene, target, config)[::4]])
     camera = square_camera(config.picture_side_px, config.fov_deg)
@@ -175,10 +175,10 @@ def _seeable(
 
 def gradient_error(scene: Any, target: Any, config: Any, steps: Sequence[float]) -> float:
     """Return the relative error of the pose gradient beside central differences, at the nearest input camera."""
-    from reconstruction.avo.cameras import look_at, square_camera
-    from reconstruction.avo.objective import Objective
-    from reconstruction.avo.scene import reach_of
     from reconstruction.gaussians.fit import exponential
+    from reconstruction.views.cameras import look_at, square_camera
+    from reconstruction.views.objective import Objective
+    from reconstruction.views.scene import reach_of
 
     packed = scene.packed.astype(np.float64)
     camera = square_camera(config.side_px, config.fov_deg)

@@ -22,9 +22,9 @@ from benchmarks.instances import stage_run, work_of
 from benchmarks.machine import ROOT, describe_code
 from benchmarks.spread import spread_tree
 from benchmarks.table import DEFAULT_OUT, table_lines
-from reconstruction.evaluation.ground_truth import GroundTruth
+from reconstruction.core.types import DepthMaps
+from reconstruction.measure.ground_truth import GroundTruth
 from reconstruction.runner import Run
-from reconstruction.types import DepthMaps
 from registry.errors import UsageError
 
 SCHEMA = "simrecon.depth-ruler/1"

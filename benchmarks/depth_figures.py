@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from reconstruction.evaluation.alignment import Alignment, align
-from reconstruction.evaluation.ground_truth import GroundTruth
-from reconstruction.evaluation.scene import joined
-from reconstruction.evaluation.stages import sensor_surface
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera, DepthMaps, PosedFrames
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
+from reconstruction.measure.alignment import Alignment, align
+from reconstruction.measure.ground_truth import GroundTruth
+from reconstruction.measure.scene import joined
+from reconstruction.measure.stages import sensor_surface
 from registry.geometry import transform_points, umeyama
 
 FAR_M = 5.0

@@ -53,11 +53,11 @@ def measure_capture(capture: Capture, out: Path, least_hidden: float, pictures: 
     from reconstruction.assets.build import gather_evidence, object_shape
     from reconstruction.assets.config import ASSETS_PRESETS
     from reconstruction.assets.generation.load import RECORDS_VARIABLE
-    from reconstruction.avo import AvoConfig, make_views
-    from reconstruction.evaluation.alignment import align
-    from reconstruction.evaluation.ground_truth import GroundTruth
-    from reconstruction.evaluation.viewpoints import TrueViews
-    from reconstruction.progress import NO_PROGRESS
+    from reconstruction.core.progress import NO_PROGRESS
+    from reconstruction.measure.alignment import align
+    from reconstruction.measure.ground_truth import GroundTruth
+    from reconstruction.measure.viewpoints import TrueViews
+    from reconstruction.views import AvoConfig, make_views
 
     (variant,) = choose_variants(["oracle-instances"], [])
     run = stage_run(capture.source, work_of(out, capture), variant.arguments_for(capture))
@@ -122,7 +122,7 @@ def _recorded(
     """Have the first view of every object completed and recorded; return what was sent, and the replayed meshes."""
     from reconstruction.assets.generation.fetch import fetch_meshes
     from reconstruction.assets.generation.pictures import encode_png, object_pictures
-    from reconstruction.progress import NO_PROGRESS
+    from reconstruction.core.progress import NO_PROGRESS
 
     sent = {}
     with OneViewServer() as server:
@@ -162,7 +162,7 @@ def _placed(shape: Any, alignment: Any) -> np.ndarray:
 
 
 def _score(entity: Any, shape: Any, alignment: Any) -> dict[str, Any]:
-    from reconstruction.evaluation.surfaces import compare, sample
+    from reconstruction.measure.surfaces import compare, sample
 
     true = sample(entity.mesh.vertices, entity.mesh.faces, _POINTS)
     score = compare(sample(_placed(shape, alignment), shape.body.faces, _POINTS), true, _BOUND_M)
@@ -174,7 +174,7 @@ def _row_picture(entity: Any, sent: dict[str, Any], shapes: dict[str, Any], alig
     """Return truth and embedded completion, then for each strategy what was sent and what was made of it."""
     import cv2
 
-    from reconstruction.report import drawing
+    from reconstruction.measure.report import drawing
 
     camera, pose = drawing.framing_camera(entity.mesh.vertices, 35.0, 25.0, _PICTURE_PX, _PICTURE_PX, 0.15)
 

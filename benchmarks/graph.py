@@ -19,6 +19,7 @@ from benchmarks.command import guarded
 from benchmarks.graph_page import GeometryResult, LyingResult, write_graph_page
 from benchmarks.lying import LyingRelations, TrueRelations
 from benchmarks.machine import ROOT
+from reconstruction.core.types import AssetSet
 from reconstruction.scene_graph import (
     MergedGraph,
     SceneGraphConfig,
@@ -26,7 +27,6 @@ from reconstruction.scene_graph import (
     region_questions,
     synthesize,
 )
-from reconstruction.types import AssetSet
 from registry.errors import UsageError
 from registry.geometry import rigid
 from synthetic.containers import CONTAINER_KINDS

@@ -52,7 +52,7 @@ class StageFigures:
     dirty: bool
     date: str
     machine: dict
-    figures: dict[str, Any]  # of reconstruction.evaluation.object_boxes
+    figures: dict[str, Any]  # of reconstruction.measure.object_boxes
     surface_points: int
     keyframes: int
     wall_s: float
@@ -77,9 +77,9 @@ def work_of(out: Path, capture: Capture) -> Path:
 
 def measure_stage(capture: Capture, variant: Variant, out: Path, inputs: str, code: dict) -> StageFigures:
     """Reconstruct up to the instances and measure their boxes; stages that are kept are not done again."""
-    from reconstruction.evaluation.alignment import align
-    from reconstruction.evaluation.ground_truth import GroundTruth
-    from reconstruction.evaluation.object_boxes import instance_box_figures
+    from reconstruction.measure.alignment import align
+    from reconstruction.measure.ground_truth import GroundTruth
+    from reconstruction.measure.object_boxes import instance_box_figures
 
     run = stage_run(capture.source, work_of(out, capture), variant.arguments_for(capture))
     run.execute("instances")
@@ -185,9 +185,9 @@ def _has_records(records: Sequence[dict[str, Any]]) -> bool:
 
 def _all_missed(capture: Capture) -> list[dict[str, Any]]:
     """Return the records of a scene that failed: leaving it out would make the others look better."""
-    from reconstruction.evaluation.ground_truth import GroundTruth
-    from reconstruction.evaluation.object_boxes import match_boxes, object_records
-    from reconstruction.evaluation.object_facts import object_facts
+    from reconstruction.measure.ground_truth import GroundTruth
+    from reconstruction.measure.object_boxes import match_boxes, object_records
+    from reconstruction.measure.object_facts import object_facts
 
     truth = GroundTruth.load(capture.ground_truth)
     nothing = match_boxes(truth.evaluated, np.zeros((0, 2, 3)))

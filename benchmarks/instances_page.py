@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.machine import machine_line
 from benchmarks.scaling import line_fit
 from benchmarks.table import table_lines
-from reconstruction.evaluation.breakdown import Share, breakdown
+from reconstruction.measure.breakdown import Share, breakdown
 
 GROWTH_FILE = "instances_growth.json"
 _BREAKDOWNS = {

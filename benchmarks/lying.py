@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from reconstruction.core.types import Edge
 from reconstruction.scene_graph import LocalGraph, Question, RelationBackend, SaidEdge
-from reconstruction.types import Edge
 
 
 class TrueRelations:

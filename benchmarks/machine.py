@@ -12,7 +12,7 @@ import psutil
 ROOT = Path(__file__).resolve().parent.parent
 _MEASURED = ("reconstruction", "registry")  # what a reconstruction and its evaluation run,
 _NOT_MEASURED = (
-    "reconstruction/report",
+    "reconstruction/measure/report",
     "synthetic",
     "reconstruction/doctor.py",
 )  # without these

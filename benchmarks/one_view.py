@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 from registry.geometry import GLTF_FROM_WORLD, invert_rigid, transform_points
 
 _CELLS = 56  # along the longest side

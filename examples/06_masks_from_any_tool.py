@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from skimage.segmentation import felzenszwalb
 
-from reconstruction.evaluation.stage_results import StageResults
 from reconstruction.instances.masks import flatten_masks
+from reconstruction.measure.stage_results import StageResults
 from registry import SceneRegistry
 
 

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from priors.rooms import SPLITS, Film, draw_film
+from reconstruction.core.types import DepthMaps, PosedFrames
 from reconstruction.depth import DepthConfig
-from reconstruction.types import DepthMaps, PosedFrames
 from registry.errors import InputError, UsageError
 from synthetic.capture import posed_capture
 from synthetic.film import film_room, render_truth
@@ -200,9 +200,9 @@ def _measure_depth(
     """Return the arrays at depth resolution, what the mending network sees and the truth; and the finished maps."""
     import cv2
 
+    from reconstruction.core.workers import Workers
     from reconstruction.depth.estimate import gather_evidence
     from reconstruction.depth.evidence import count_views
-    from reconstruction.depth.workers import Workers
 
     found = gather_evidence(posed, config, keep_agreed=True)
     camera, each = found.camera, Workers(1).each

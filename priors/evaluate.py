@@ -17,9 +17,9 @@ import numpy as np
 from benchmarks.depth_figures import TrueView, depth_figures
 from priors.dataset import film_frames
 from priors.rooms import SPLITS, Film, draw_film
+from reconstruction.core.types import PosedFrames
 from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.depth.images import sized_camera
-from reconstruction.types import PosedFrames
 from registry.errors import InputError, UsageError
 from synthetic.film import render_truth
 

@@ -13,7 +13,6 @@ from scipy.sparse import csr_matrix
 
 from priors.partition_rooms import TRIMMED, Example, cached, digest_of, example, room_view, write_arrays
 from priors.samples import Room
-from reconstruction.evaluation.matching import box_iou
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
 from reconstruction.instances.partition.features import View
@@ -22,6 +21,7 @@ from reconstruction.instances.partition.model import Ensemble, load_models
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposal_features import proposal_features
 from reconstruction.instances.partition.proposals import propose
+from reconstruction.measure.matching import box_iou
 
 _PURE = 0.6  # of a cluster's known surface must be of one entity
 _CRUMB_M2 = 1e-4  # clusters below this count less

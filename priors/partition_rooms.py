@@ -16,21 +16,21 @@ import numpy as np
 from priors.rooms import Film, draw_film
 from priors.samples import Room
 from priors.surfaces import true_ids
-from reconstruction import artifacts
 from reconstruction.code_digest import code_digest, tree_digest
+from reconstruction.core import artifacts
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, Surface
+from reconstruction.core.workers import Workers
 from reconstruction.depth import DepthConfig
 from reconstruction.depth.evidence import PREDICTED, Evidence
 from reconstruction.depth.mending import WEIGHTS, drop_unconfirmed, mend_depth
 from reconstruction.depth.views import plan_views
-from reconstruction.depth.workers import Workers
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition.cut import features
 from reconstruction.instances.partition.features import Shapes, View
 from reconstruction.instances.partition.graph import region_graph
 from reconstruction.instances.sightings import sightings
-from reconstruction.progress import NO_PROGRESS
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
 from registry.errors import UsageError
 from synthetic.capture import posed_capture
 
@@ -40,7 +40,7 @@ NEEDED = (
 _FEATURE_MODULES = tuple(
     f"reconstruction.instances.{name}" for name in ("cut", "superpoints", "sightings", "partition.features")
 )
-TRIMMED = 1.0  # percent of a thing's points at either side of its box, as in `reconstruction.evaluation`
+TRIMMED = 1.0  # percent of a thing's points at either side of its box, as in `reconstruction.measure`
 _STEP_PX = 4
 _LEAST_PURITY = 0.6  # of a superpoint's known surface must be of one entity
 

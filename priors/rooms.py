@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from priors.partition_ruler import LEAST_SHARE
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 from registry.errors import InputError
 from synthetic.camera_paths import phone_camera
 from synthetic.film import FilmSet, prepare, render_truth

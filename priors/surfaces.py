@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reconstruction.types import DepthMaps, PosedFrames
+from reconstruction.core.types import DepthMaps, PosedFrames
 from synthetic.film import FilmSet
 
 _SAMPLES = 2_000_000  # of the true surface
@@ -23,10 +23,10 @@ def measure_surface(
         maps: Their depth.
         mesh: Whether to fuse it.
     """
+    from reconstruction.core.mesh_graph import MeshGraph
     from reconstruction.gaussians import GaussiansConfig, make_gaussians
     from reconstruction.instances.superpoints import superpoints
     from reconstruction.surface import SurfaceConfig, fuse_surface
-    from reconstruction.surface.mesh_graph import MeshGraph
 
     scene = make_gaussians(posed, maps, GaussiansConfig())
     out = {"gaussians_depth": scene.depth.depth.astype(np.float16)}

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from reconstruction import artifacts
+from reconstruction.core import artifacts
 from registry.errors import EnvironmentMissing
 
 logger = logging.getLogger(__name__)

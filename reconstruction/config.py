@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 from reconstruction.assembly import ASSEMBLY_PRESETS, AssemblyConfig
 from reconstruction.assets import ASSETS_PRESETS, AssetsConfig
-from reconstruction.avo.config import AVO_PRESETS, AvoConfig
 from reconstruction.depth import DEPTH_PRESETS, DepthConfig
 from reconstruction.frames import FRAMES_PRESETS, FramesConfig
 from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig
@@ -23,6 +22,7 @@ from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig
 from reconstruction.poses import POSES_PRESETS, PosesConfig
 from reconstruction.scene_graph import SCENE_GRAPH_PRESETS, SceneGraphConfig
 from reconstruction.surface import SURFACE_PRESETS, SurfaceConfig
+from reconstruction.views.config import AVO_PRESETS, AvoConfig
 from reconstruction.world import WORLD_PRESETS, WorldConfig
 from registry.errors import UsageError
 

@@ -8,7 +8,7 @@ from reconstruction.depth.config import DepthConfig
 from reconstruction.doctor import Check
 from reconstruction.instances.masks.load import DEFAULT_MODELS
 from reconstruction.instances.naming.load import DEFAULT_CLIP_MODEL
-from reconstruction.learned import EXTRA
+from reconstruction.learned.models import EXTRA
 from reconstruction.world.config import WorldConfig
 
 _WEIGHTS = ("*.safetensors", "*.bin")

@@ -3,10 +3,10 @@
     frames -> poses -> depth -> world -> gaussians -> surface
     -> instances (-> views) -> assets -> scene_graph -> assembly -> publish
 
-Each stage is a function from artifacts (`reconstruction.types`) to an artifact, with options of its own. Depth comes
-before the world frame because the normals of depth maps tell gravity. Gaussians are fitted in the space of the poses,
-so that another scale needs no other fit; they correct the depth maps. From `surface` on everything is in metres, +z
-up, floor at z = 0. `views` is done only where a stage or a command asks for it.
+Each stage is a function from artifacts (`reconstruction.core.types`) to an artifact, with options of its own. Depth
+comes before the world frame, because the normals of depth maps tell gravity. Gaussians are fitted in the space of the
+poses, so that another scale needs no other fit; they correct the depth maps. From `surface` on everything is in
+metres, +z up, floor at z = 0. `views` is done only where a stage or a command asks for it.
 
 `runner.Run` runs the stages: it keeps results, measures, corrects. `video_to_scene.reconstruct` is the whole way, from
 the video to the registry.
@@ -21,20 +21,8 @@ from reconstruction.assembly import assemble
 from reconstruction.assets import build_assets
 from reconstruction.assets import outside_inputs as outside_assets
 from reconstruction.assets import wants_views as assets_want_views
-from reconstruction.avo import SceneViews, ViewScene, make_views, prepare_scene
-from reconstruction.depth import estimate_depth
-from reconstruction.frames import load_frames
-from reconstruction.gaussians import GaussianScene, make_gaussians
-from reconstruction.instances import make_instances
-from reconstruction.instances import outside_inputs as outside_instances
-from reconstruction.poses import estimate_poses
-from reconstruction.poses import outside_inputs as outside_poses
-from reconstruction.progress import Progress
-from reconstruction.scene_graph import RECORDS, MergedGraph, infer_scene_graph
-from reconstruction.scene_graph import outside_inputs as outside_scene_graph
-from reconstruction.scene_graph import wants_views as graph_wants_views
-from reconstruction.surface import fuse_surface
-from reconstruction.types import (
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import (
     AssembledScene,
     AssetSet,
     DepthMaps,
@@ -44,6 +32,18 @@ from reconstruction.types import (
     Surface,
     WorldFrame,
 )
+from reconstruction.depth import estimate_depth
+from reconstruction.frames import load_frames
+from reconstruction.gaussians import GaussianScene, make_gaussians
+from reconstruction.instances import make_instances
+from reconstruction.instances import outside_inputs as outside_instances
+from reconstruction.poses import estimate_poses
+from reconstruction.poses import outside_inputs as outside_poses
+from reconstruction.scene_graph import RECORDS, MergedGraph, infer_scene_graph
+from reconstruction.scene_graph import outside_inputs as outside_scene_graph
+from reconstruction.scene_graph import wants_views as graph_wants_views
+from reconstruction.surface import fuse_surface
+from reconstruction.views import SceneViews, ViewScene, make_views, prepare_scene
 from reconstruction.world import find_world
 
 
@@ -162,7 +162,7 @@ STAGES: tuple[Stage, ...] = (
         "instances", _instances, "reconstruction.instances", InstanceSet, (*_METRIC, "surface"),
         outside=outside_instances,
     ),
-    Stage("views", _views, "reconstruction.avo", SceneViews, _SEEN, options="avo", on_demand=True),
+    Stage("views", _views, "reconstruction.views", SceneViews, _SEEN, options="avo", on_demand=True),
     Stage(
         "assets", _assets, "reconstruction.assets", AssetSet, _SEEN, needs_also=_views_of_assets,
         outside=outside_assets,
@@ -184,6 +184,6 @@ def in_world(results: Mapping[str, Any]) -> tuple[PosedFrames, DepthMaps]:
 
 
 def view_scene(results: Mapping[str, Any]) -> ViewScene:
-    """Return Gaussians, surface and things in world space, the input of `reconstruction.avo.find_views`."""
+    """Return Gaussians, surface and things in world space, the input of `reconstruction.views.find_views`."""
     gaussians = results["gaussians"].in_world(results["world"])
     return prepare_scene(gaussians, results["surface"], results["instances"], results["poses"].camera)

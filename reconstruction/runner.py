@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 from reconstruction.cache import StageStore, digest_input, fingerprint
 from reconstruction.code_digest import code_digest, tree_digest
-from reconstruction.compiling import compilation_shown
 from reconstruction.config import PipelineConfig
+from reconstruction.core.compiling import compilation_shown
+from reconstruction.core.profiling import Usage, UsageMeter
+from reconstruction.core.progress import NO_PROGRESS, Progress, StageListener
+from reconstruction.core.types import DepthMaps, InstanceSet, PosedFrames
 from reconstruction.editing.anchors import Footage, Pointer
 from reconstruction.editing.overrides import Overrides
 from reconstruction.pipeline import STAGE_NAMES, STAGES, Call, Stage, in_world, view_scene
 from reconstruction.poses.lens import Lens
-from reconstruction.profiling import Usage, UsageMeter
-from reconstruction.progress import NO_PROGRESS, Progress, StageListener
-from reconstruction.types import DepthMaps, InstanceSet, PosedFrames
 
 if TYPE_CHECKING:
-    from reconstruction.avo import ViewScene
-    from reconstruction.oracle import Oracle
+    from reconstruction.measure.oracle import Oracle
+    from reconstruction.views import ViewScene
 
 logger = logging.getLogger(__name__)
 _PIPELINE = Path(__file__).with_name("pipeline.py")
@@ -90,7 +90,7 @@ class Run:
         return in_world(self.results)
 
     def view_scene(self) -> "ViewScene":
-        """Return Gaussians, surface and things in world space, the input of `reconstruction.avo.find_views`."""
+        """Return Gaussians, surface and things in world space, the input of `reconstruction.views.find_views`."""
         return view_scene(self.results)
 
     def lens(self) -> Lens:
@@ -131,7 +131,11 @@ class Run:
         upstream = tuple(self.keys[name] for name in self.needs_of(stage)) or (self.input_digest,)
         options = self.options_of(stage)
         said_by_truth = self.oracle.of_stage(stage.name) if self.oracle is not None else []
-        code = [tree_digest(_PIPELINE), code_digest(stage.package), code_digest("reconstruction.artifacts")]
+        code = [
+            tree_digest(_PIPELINE),
+            code_digest(stage.package),
+            code_digest("reconstruction.core.artifacts"),
+        ]
         if corrections:
             code.append(code_digest(_EDITING))
         inputs = (options, corrections, stage.outside(options), said_by_truth)

@@ -9,16 +9,16 @@ import numpy as np
 
 from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input
 from reconstruction.config import PipelineConfig
+from reconstruction.core.progress import NO_PROGRESS, StageListener
+from reconstruction.core.types import ObjectAsset
 from reconstruction.editing.overrides import Overrides
-from reconstruction.progress import NO_PROGRESS, StageListener
 from reconstruction.publish import publish_scene
 from reconstruction.runner import Run
-from reconstruction.types import ObjectAsset
 from registry import SceneRecord, SceneRegistry
 from registry.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.oracle import Oracle
+    from reconstruction.measure.oracle import Oracle
 
 _OBJECT_SCALE_PASSES = 3
 _OBJECT_SCALE_TOLERANCE = 0.015  # half of what the scale is said to be sure to

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 from registry.errors import UsageError
 from synthetic.camera_paths import phone_camera
 from synthetic.capture import write_ground_truth

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 
 
 def look_at(position: np.ndarray, target: np.ndarray, roll_rad: float = 0.0) -> np.ndarray:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.types import Camera, DepthMaps, FrameSet, PosedFrames, VideoSource
+from reconstruction.core.types import Camera, DepthMaps, FrameSet, PosedFrames, VideoSource
 from registry.geometry import split_similarity, transform_points
 from synthetic.camera_paths import handheld_path, phone_camera
 from synthetic.film import FilmSet, film_room, prepare, render_truth

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera
 from registry.geometry import invert_rigid
 from synthetic.lighting import Light, bake_light, mirrored_lamps, mirrored_windows, usual_lamps
 from synthetic.materials import Finish

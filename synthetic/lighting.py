@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit, prange
 
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera
 from synthetic.camera_paths import look_at
 
 _LAMP_HEIGHT_M = 2.45

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import njit, prange
 
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 
 _BANDS = 6  # of a rolling shutter
 

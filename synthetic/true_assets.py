@@ -5,7 +5,7 @@ of its own primitives, no hints, no textures.
 import numpy as np
 
 from reconstruction.assembly.base import convex_part
-from reconstruction.types import (
+from reconstruction.core.types import (
     AssetProvenance,
     AssetSet,
     BaseAsset,

@@ -19,12 +19,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # runs from a checkout that 
 
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
+from reconstruction.core.types import InstanceSet
 from reconstruction.editing.overrides import Overrides
-from reconstruction.instance_views import write_views
-from reconstruction.report.contact_page import save_picture
-from reconstruction.report.contact_sheet import ContactSheet, crops_sheet, frame_picture
+from reconstruction.measure.report.contact_page import save_picture
+from reconstruction.measure.report.contact_sheet import ContactSheet, crops_sheet, frame_picture
+from reconstruction.publish.instance_views import write_views
 from reconstruction.runner import Run
-from reconstruction.types import InstanceSet
 
 WIDTH_PX, GAP_PX, MAX_BYTES = 1320, 8, 250_000
 

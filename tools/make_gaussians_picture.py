@@ -21,8 +21,8 @@ _GAP = 4
 
 def main() -> None:
     """Load, draw, write."""
-    from reconstruction.evaluation.stage_results import StageResults
-    from reconstruction.report.pictures import draw_gaussians
+    from reconstruction.measure.report.pictures import draw_gaussians
+    from reconstruction.measure.stage_results import StageResults
     from registry import SceneRegistry
 
     parser = argparse.ArgumentParser(

@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--scene", default="demo_room")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "demo.png")
     arguments = parser.parse_args()
-    from reconstruction.preview import best_view, render_textured, scene_meshes
+    from reconstruction.publish.preview import best_view, render_textured, scene_meshes
     from reconstruction.video_to_scene import reconstruct
 
     run = reconstruct(arguments.video, scene_id=arguments.scene).run

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
-from reconstruction.types import Camera, DepthMaps
+from reconstruction.core.types import Camera, DepthMaps
 from registry.geometry import rigid
 from registry.simulation import BodySpec
 

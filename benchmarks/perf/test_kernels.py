@@ -10,7 +10,7 @@ pytestmark = pytest.mark.benchmark(timer=timer)
 
 
 def test_rasterizer(measure):
-    from reconstruction.rasterize import rasterize_mesh
+    from reconstruction.core.rasterize import rasterize_mesh
 
     vertices, faces = inputs.bumpy_mesh()
     camera, pose = inputs.camera(640, 480), inputs.looking_down(1.5)

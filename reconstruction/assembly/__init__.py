@@ -16,9 +16,9 @@ from reconstruction.assembly.config import ASSEMBLY_PRESETS, AssemblyConfig
 from reconstruction.assembly.place import Placer
 from reconstruction.assembly.placement import Placement, base_specs
 from reconstruction.assembly.workbench import object_spec
-from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import AssembledScene, AssetSet, Edge, PlacedObject, SceneGraph
 from reconstruction.scene_graph.merge import breadth_first
-from reconstruction.types import AssembledScene, AssetSet, Edge, PlacedObject, SceneGraph
 from registry.errors import SimReconError
 from registry.report_card import (
     MOST_PENETRATION_MM,

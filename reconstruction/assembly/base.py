@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from reconstruction.types import BaseAsset, ConvexPart
+from reconstruction.core.types import BaseAsset, ConvexPart
 
 SLAB_THICKNESS_M = 0.2
 FLOOR_MARGIN_M = 4.0  # beyond what was seen, so that nothing falls off the world

@@ -12,8 +12,8 @@ import numpy as np
 from reconstruction.assembly.config import AssemblyConfig
 from reconstruction.assembly.placement import Placement, base_specs, moves_by_rule
 from reconstruction.assembly.workbench import Workbench, object_spec
-from reconstruction.progress import Progress
-from reconstruction.types import AssetSet, Edge
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import AssetSet, Edge
 from registry.geometry import matrix_from_quat
 from registry.simulation import Contact, pose_change
 

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import QhullError
 
 from reconstruction.assembly.base import convex_part
-from reconstruction.types import ConvexPart
+from reconstruction.core.types import ConvexPart
 
 _MIN_THICKNESS_M = 5e-4
 _LEG_M = 0.008

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from reconstruction.assembly.collision import cut
-from reconstruction.types import ConvexPart
+from reconstruction.core.types import ConvexPart
 from registry.geometry import transform_points
 
 _STEEPEST = 0.5  # z of a normal that is still sideways

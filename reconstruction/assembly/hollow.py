@@ -13,7 +13,7 @@ from reconstruction.assembly.collision import cut
 from reconstruction.assembly.collision_trimming import in_world, overlap_of
 from reconstruction.assembly.placement import Placement
 from reconstruction.assets.solid import Solid, manifold_of
-from reconstruction.types import ConvexPart
+from reconstruction.core.types import ConvexPart
 from registry.geometry import transform_points
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from reconstruction.assembly.placement import (
 from reconstruction.assembly.settle import Settler
 from reconstruction.assembly.tops import level_tops
 from reconstruction.assembly.workbench import object_spec
+from reconstruction.core.types import AssetSet, Edge, ObjectAsset
 from reconstruction.scene_graph.surfaces import sample_object
-from reconstruction.types import AssetSet, Edge, ObjectAsset
 from registry.report_card import MOST_GAP_MM
 
 _FIXED_SHIFT_M = 0.01  # of what is not let go, out of its neighbors; what is in them deeper is cut

@@ -8,7 +8,7 @@ from reconstruction.assembly.base import base_slabs
 from reconstruction.assembly.collision import flatten_foot, with_legs
 from reconstruction.assembly.config import AssemblyConfig
 from reconstruction.assets.gltf import written_corners
-from reconstruction.types import AssetSet, BaseAsset, ConvexPart, Edge, ObjectAsset
+from reconstruction.core.types import AssetSet, BaseAsset, ConvexPart, Edge, ObjectAsset
 from registry.geometry import rigid, transform_points
 from registry.simulation import BASE_FRICTION, BASE_RESTITUTION, BodySpec
 

@@ -18,7 +18,7 @@ from reconstruction.assembly.placement import (
 from reconstruction.assembly.surroundings import Surroundings
 from reconstruction.assembly.tops import seat
 from reconstruction.assembly.workbench import Settled, object_spec, support_margin
-from reconstruction.types import AssetSet, Edge, ObjectAsset
+from reconstruction.core.types import AssetSet, Edge, ObjectAsset
 from registry.geometry import transform_points
 from registry.simulation import pose_change
 

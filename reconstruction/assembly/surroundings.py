@@ -21,7 +21,7 @@ from reconstruction.assembly.placement import (
     world_points,
 )
 from reconstruction.assembly.workbench import STANDING, Workbench, object_spec
-from reconstruction.types import AssetSet, BaseAsset
+from reconstruction.core.types import AssetSet, BaseAsset
 from registry.simulation import pose_change
 
 _MAX_CUTS = 6

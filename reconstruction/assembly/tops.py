@@ -10,8 +10,8 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from reconstruction.assembly.base import convex_part
 from reconstruction.assembly.collision import cut
+from reconstruction.core.types import ConvexPart
 from reconstruction.scene_graph.surfaces import SampledObject
-from reconstruction.types import ConvexPart
 
 _REACH_M = 0.04  # how far a child's underside may be from the surface that carries it
 _MIN_OVERSHOOT_M = 0.002

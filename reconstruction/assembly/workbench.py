@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from reconstruction.assets.gltf import written_corners
-from reconstruction.types import ConvexPart, ObjectAsset
+from reconstruction.core.types import ConvexPart, ObjectAsset
 from registry.simulation import TIMESTEP_S, BodySpec, Contact, Physics, pose_change
 
 STANDING = 0.7  # of the upward part of a contact's normal

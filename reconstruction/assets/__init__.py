@@ -4,9 +4,9 @@ from pathlib import Path
 
 from reconstruction.assets.config import ASSETS_PRESETS, AssetsConfig
 from reconstruction.assets.physics.load import outside_inputs
-from reconstruction.avo import SceneViews
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, Surface
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import AssetSet, DepthMaps, InstanceSet, PosedFrames, Surface
+from reconstruction.views import SceneViews
 
 __all__ = ("ASSETS_PRESETS", "AssetsConfig", "build_assets", "outside_inputs", "wants_views")
 

@@ -6,7 +6,7 @@ import numpy as np
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.texture import Texels, collect_colors, prepare_looks, push_pull, textured
 from reconstruction.assets.views import ScenePixels
-from reconstruction.types import BaseAsset, BaseEntity, DepthMaps, InstanceSet, ObjectAsset, PosedFrames
+from reconstruction.core.types import BaseAsset, BaseEntity, DepthMaps, InstanceSet, ObjectAsset, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _MARGIN_M = 0.05

@@ -25,9 +25,8 @@ from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, frame_object, fuse_volume
-from reconstruction.avo import SceneViews
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import (
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import (
     AssetProvenance,
     AssetSet,
     ConvexPart,
@@ -39,6 +38,7 @@ from reconstruction.types import (
     Surface,
     TexturedMesh,
 )
+from reconstruction.views import SceneViews
 from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
 

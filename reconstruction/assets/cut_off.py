@@ -15,7 +15,7 @@ import numpy as np
 from reconstruction.assets.solid import Solid, box_solid
 from reconstruction.assets.views import SeenPoints
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
-from reconstruction.types import Camera, InstanceSet, PosedFrames, Surface
+from reconstruction.core.types import Camera, InstanceSet, PosedFrames, Surface
 from registry.geometry import invert_rigid, transform_points
 
 _OUTER_PERCENT = 97.0  # what lies beyond is the outermost of a side

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from reconstruction.assets.views import ScenePixels
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.types import Camera, InstanceSet, PosedFrames, Surface
+from reconstruction.core.types import Camera, InstanceSet, PosedFrames, Surface
 from registry.geometry import invert_rigid, transform_points
 
 _CELL_M, _MAX_CELLS = 0.006, 6_000_000

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.types import ConvexPart, TexturedMesh
+from reconstruction.core.types import ConvexPart, TexturedMesh
 from registry.errors import BundleError
 from registry.geometry import GLTF_FROM_WORLD, WORLD_FROM_GLTF
 

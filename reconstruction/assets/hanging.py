@@ -13,7 +13,7 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.hanging_front import front_of
 from reconstruction.assets.solid import Solid, box_solid
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.types import Camera, Instance, InstanceSet, PosedFrames
+from reconstruction.core.types import Camera, Instance, InstanceSet, PosedFrames
 from registry.geometry import rigid, transform_points
 
 _MAX_THICKNESS_M = 0.10

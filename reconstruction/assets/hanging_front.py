@@ -8,7 +8,7 @@ agree, and onto any other one do not.
 import cv2
 import numpy as np
 
-from reconstruction.types import Camera, InstanceSet, PosedFrames
+from reconstruction.core.types import Camera, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _CELL_M, _MAX_CELLS = 0.005, 160

@@ -11,7 +11,7 @@ from reconstruction.assets.loaded import colors_of, load_mesh, picture_of, uprig
 from reconstruction.assets.physics.mass import physical_attributes
 from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.solid import Solid, hull_solid, to_manifold
-from reconstruction.types import ObjectAsset, TexturedMesh
+from reconstruction.core.types import ObjectAsset, TexturedMesh
 from registry.errors import UsageError
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from reconstruction.assets.support import support_height
 from reconstruction.assets.views import ScenePixels, SeenPoints, lift_object, within_outlines
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, without_outliers
-from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
+from reconstruction.core.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _SAME_LEVEL_M = 0.015

@@ -3,7 +3,7 @@
 import numpy as np
 
 from reconstruction.assets.views import SeenPoints
-from reconstruction.types import Instance, InstanceSet
+from reconstruction.core.types import Instance, InstanceSet
 
 _SMEAR_M = (0.025, 0.06)  # smeared depth ends before, and what lies farther off says little
 _SMEAR_HEIGHT_M = 0.03

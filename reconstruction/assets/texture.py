@@ -13,8 +13,8 @@ import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.views import ScenePixels
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera, PosedFrames, TexturedMesh
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, PosedFrames, TexturedMesh
 from registry.geometry import invert_rigid
 
 if TYPE_CHECKING:
@@ -315,7 +315,7 @@ def push_pull(picture: np.ndarray, filled: np.ndarray) -> np.ndarray:
 
 
 def textured(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, texture: np.ndarray) -> TexturedMesh:
-    """Assemble the mesh type of `reconstruction.types`."""
+    """Assemble the mesh type of `reconstruction.core.types`."""
     return TexturedMesh(
         np.ascontiguousarray(vertices, np.float32),
         np.ascontiguousarray(faces, np.int32),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.types import DepthMaps, PosedFrames
+from reconstruction.core.types import DepthMaps, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
 _OUTLINE_PX = 3  # so far inside its outline a thing's pixels are surely its own

@@ -11,7 +11,7 @@ import numpy as np
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.rim_artifacts import away_directions, behind_rims
 from reconstruction.assets.views import ScenePixels, SeenPoints
-from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames
+from reconstruction.core.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, rigid, transform_points
 
 _MIN_CONFIRMED = 0.7  # of a thing's points, or its volume is too poor to judge them

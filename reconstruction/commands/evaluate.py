@@ -59,8 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate, print the table, write the file."""
     from reconstruction.commands.reporting import make_listener
     from reconstruction.commands.truth import split_truth
-    from reconstruction.evaluation import StageResults, evaluate_scene
-    from reconstruction.evaluation.table import as_table
+    from reconstruction.measure import StageResults, evaluate_scene
+    from reconstruction.measure.table import as_table
     from registry import SceneRegistry
 
     to_stdout = str(arguments.json) == "-"

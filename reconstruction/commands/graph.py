@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from reconstruction.evaluation.stage_results import StageResults
-from reconstruction.report.graph_sheet import write_graph_steps
+from reconstruction.measure.report.graph_sheet import write_graph_steps
+from reconstruction.measure.stage_results import StageResults
 from registry import SceneBundle
 from registry.errors import EnvironmentMissing, UsageError
 
@@ -55,9 +55,9 @@ def step_views(bundle: SceneBundle, results: StageResults) -> tuple[list[np.ndar
 
     They are drawn now, from the work folder, where no model was shown a picture.
     """
-    from reconstruction.avo import prepare_scene
     from reconstruction.scene_graph import Question, SceneGraphConfig
     from reconstruction.scene_graph.looking import RegionViewer
+    from reconstruction.views import prepare_scene
 
     steps = bundle.scene["graph"]["steps"]
     kept = [_kept_picture(bundle, step) for step in steps]

@@ -148,7 +148,7 @@ def oracle_of(arguments: argparse.Namespace) -> object | None:
                 "--ground-truth is read by --oracle only; to measure a scene use: simrecon evaluate"
             )
         return None
-    from reconstruction.oracle import Oracle
+    from reconstruction.measure.oracle import Oracle
 
     stages = [name.strip() for name in arguments.oracle.split(",") if name.strip()]
     return Oracle.load(stages, arguments.ground_truth)

@@ -44,9 +44,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the page."""
     from reconstruction.commands.reporting import make_listener
     from reconstruction.commands.truth import split_truth
-    from reconstruction.evaluation.stage_results import StageResults
-    from reconstruction.report.collect import by_reason
-    from reconstruction.report.page import build_page, read_evaluation
+    from reconstruction.measure.report.collect import by_reason
+    from reconstruction.measure.report.page import build_page, read_evaluation
+    from reconstruction.measure.stage_results import StageResults
     from registry import SceneRegistry
     from registry.errors import UsageError
 

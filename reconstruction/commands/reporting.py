@@ -5,8 +5,8 @@ import time
 
 from tqdm import tqdm
 
-from reconstruction.profiling import Usage
-from reconstruction.progress import NoProgress
+from reconstruction.core.profiling import Usage
+from reconstruction.core.progress import NoProgress
 
 _LINE_EVERY_S = 15.0
 

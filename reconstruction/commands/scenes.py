@@ -133,8 +133,8 @@ def run_show(arguments: argparse.Namespace) -> int:
 
 def _show_instances(arguments: argparse.Namespace, bundle: SceneBundle) -> int:
     """Write contact sheets and print every thing with its anchor."""
-    from reconstruction.report.contact_page import overrides_template, write_contact_sheets
-    from reconstruction.report.contact_sheet import ContactSheet, anchor_text
+    from reconstruction.measure.report.contact_page import overrides_template, write_contact_sheets
+    from reconstruction.measure.report.contact_sheet import ContactSheet, anchor_text
 
     sheet = ContactSheet.of(bundle)
     folder = arguments.out or Path(f"{arguments.scene}_instances")

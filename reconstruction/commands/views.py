@@ -8,9 +8,9 @@ from pathlib import Path
 from reconstruction.cache import StageStore
 from reconstruction.commands.reporting import make_listener
 from reconstruction.config import PipelineConfig
-from reconstruction.evaluation.stage_results import StageResults
+from reconstruction.measure.report.view_sheet import write_view_sheets
+from reconstruction.measure.stage_results import StageResults
 from reconstruction.pipeline import STAGES
-from reconstruction.report.view_sheet import write_view_sheets
 from reconstruction.runner import Run
 from registry import SceneBundle
 from registry.errors import EnvironmentMissing, UsageError
@@ -18,7 +18,7 @@ from registry.errors import EnvironmentMissing, UsageError
 
 def show_views(arguments: argparse.Namespace, bundle: SceneBundle, registry_root: Path) -> int:
     """Choose views of every thing of a scene, or take them from the work folder, and write their sheets."""
-    from reconstruction.avo import AvoConfig
+    from reconstruction.views import AvoConfig
 
     results = StageResults.find(bundle, registry_root, arguments.work_dir)
     stage = next(s for s in STAGES if s.name == "views")

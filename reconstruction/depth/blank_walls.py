@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.types import Camera, PosedFrames
 from reconstruction.depth.planes import plane_extents
 from reconstruction.depth.views import ViewPlan
-from reconstruction.types import Camera, PosedFrames
 
 _MIN_REGION = 0.012  # of the image
 _MIN_SHADING = 4.0  # gray levels

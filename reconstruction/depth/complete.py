@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Camera, PosedFrames
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.views import ViewPlan
-from reconstruction.progress import Progress
-from reconstruction.types import Camera, PosedFrames
 from registry.geometry import invert_rigid
 
 _MAX_LABELS = 20

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
+from reconstruction.core.workers import Workers
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.evidence import PREDICTED, Evidence, count_views, inverse
 from reconstruction.depth.images import gray_images, sized_camera, small_color
 from reconstruction.depth.monocular import MonocularBackend, fill_from_predictions, load_monocular
 from reconstruction.depth.perturb import perturbed
 from reconstruction.depth.views import ViewPlan, plan_views
-from reconstruction.depth.workers import Workers
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import Camera, DepthMaps, PosedFrames
 from registry.errors import InputError
 from registry.geometry import invert_rigid
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import Camera, DepthMaps, PosedFrames
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
 from registry.geometry import invert_rigid
 
 COMPLETED, MEASURED, PREDICTED = 1, 2, 3

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 
 
 def sized_camera(camera: Camera, side: int) -> Camera:

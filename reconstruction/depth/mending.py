@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import PosedFrames
 from reconstruction.depth.candidates import candidate_depths, choose_candidates
 from reconstruction.depth.channels import AFFINITIES, FEATURES
 from reconstruction.depth.evidence import COMPLETED, MEASURED, PREDICTED, Evidence, count_views, inverse
 from reconstruction.depth.images import small_color
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import PosedFrames
 
 WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
 _AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against

@@ -13,10 +13,10 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Camera, PosedFrames
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.views import ViewPlan
-from reconstruction.progress import Progress
-from reconstruction.types import Camera, PosedFrames
 from registry.geometry import invert_rigid
 
 _BATCH = 4
@@ -44,7 +44,7 @@ class TransformersMonocular:
 
     def __init__(self, model: str) -> None:
         """Load the model."""
-        from reconstruction.depth_model import DepthModel
+        from reconstruction.learned.depth_model import DepthModel
 
         self._model = DepthModel(model, asked_by="depth.monocular")
         self.name = model

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 
 _STRIDE = 6
 _EXTENT_SIDES = 16

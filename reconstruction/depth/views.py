@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reconstruction.core.types import Camera, PosedFrames
 from reconstruction.depth.config import DepthConfig
-from reconstruction.types import Camera, PosedFrames
 from registry.errors import InputError
 from registry.geometry import invert_rigid
 

@@ -5,10 +5,10 @@ from functools import cached_property
 
 import numpy as np
 
+from reconstruction.core.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 from reconstruction.editing.addresses import Address
 from reconstruction.instances.id_maps import seen_vertices
 from reconstruction.poses.lens import Lens
-from reconstruction.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 from registry.errors import UsageError
 
 NEAR_M = 0.3  # how far `near` may be from a thing's box

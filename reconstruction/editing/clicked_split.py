@@ -8,8 +8,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import Surface
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.types import Surface
 
 _COLOR_STEP, _FOLD_RAD = 5.0, 0.10  # CIELAB and inward angle across an edge that double its length
 _FLAT_RAD = 0.08  # smaller folds are noise

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from reconstruction.assembly import assemble
+from reconstruction.core.progress import Progress
 from reconstruction.editing.anchors import Pointer
 from reconstruction.editing.overrides import Overrides
-from reconstruction.progress import Progress
 
 
 def corrected(

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from reconstruction.editing.addresses import KINDS, parse_address, parse_addresses, parse_parts, vector
 from reconstruction.editing.anchors import Footage, Pointer
 from reconstruction.editing.clicked_split import grown_parts, split_maps
@@ -11,8 +13,6 @@ from reconstruction.instances.base import BASE_LABELS
 from reconstruction.instances.boxes import UprightBox, upright_box
 from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.surface.base_planes import base_outline
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.errors import UsageError
 
 _STEP_M = 0.03  # a part this much higher than the lowest may rest on it

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.editing.anchors import Pointer
-    from reconstruction.types import (
+    from reconstruction.core.types import (
         AssetSet,
         InstanceSet,
         ObjectAsset,
         SceneGraph,
     )
+    from reconstruction.editing.anchors import Pointer
 
 # What an entry may do, by the stage that does it.
 ACTIONS: dict[str, tuple[str, ...]] = {
@@ -191,7 +191,7 @@ def _with_physics(item: "ObjectAsset", entry: dict) -> "ObjectAsset":
     physics = item.physics
     if "material" in entry:
         from reconstruction.assets.physics.materials import MATERIALS
-        from reconstruction.types import PhysicalRanges
+        from reconstruction.core.types import PhysicalRanges
 
         if entry["material"] not in MATERIALS:
             raise UsageError(

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.assets.gltf import read_glb, vertex_normals
+from reconstruction.core.types import ConvexPart, TexturedMesh
 from reconstruction.exports.scene import ExportBody
-from reconstruction.types import ConvexPart, TexturedMesh
 from registry.errors import SimReconError
 
 FOLDER = "meshes"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.types import ConvexPart
+from reconstruction.core.types import ConvexPart
 from registry import SceneBundle
 from registry.errors import BundleError
 from registry.primitives import Primitive

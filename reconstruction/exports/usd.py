@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from reconstruction.assets.gltf import read_glb, vertex_normals
+from reconstruction.core.types import ConvexPart, TexturedMesh
 from reconstruction.exports.meshes import texture_png, write_texture
 from reconstruction.exports.scene import ExportBody, ExportScene
-from reconstruction.types import ConvexPart, TexturedMesh
 from registry.errors import EnvironmentMissing
 from registry.geometry import invert_rigid, quat_from_matrix
 from registry.primitives import Primitive

@@ -5,10 +5,10 @@ from typing import Protocol
 
 import numpy as np
 
+from reconstruction.core.types import Camera
 from reconstruction.gaussians.losses import FrameTarget, LossWeights
 from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.rendering import Render
-from reconstruction.types import Camera
 
 
 @dataclass(frozen=True)

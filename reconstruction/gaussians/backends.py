@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from reconstruction.core.types import Camera
 from reconstruction.gaussians.backend import Backend, StepResult
 from reconstruction.gaussians.losses import FrameTarget, LossWeights, image_loss
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize, rasterize_backward
 from reconstruction.gaussians.rendering import Render
 from reconstruction.gaussians.scratch import Scratch
-from reconstruction.types import Camera
 from registry.errors import UsageError
 
 

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import DepthMaps, PosedFrames
 from reconstruction.depth import DepthConfig
 from reconstruction.depth.views import plan_views
 from reconstruction.gaussians.backend import Backend
@@ -11,8 +13,6 @@ from reconstruction.gaussians.config import GaussiansConfig
 from reconstruction.gaussians.model import Gaussians
 from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.rendering import Render
-from reconstruction.progress import Progress
-from reconstruction.types import DepthMaps, PosedFrames
 from registry.geometry import invert_rigid
 
 _SOLID = 0.5  # opacity from which a pixel shows a surface

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.types import PosedFrames
 from reconstruction.gaussians.losses import ssim
 from reconstruction.gaussians.model import Gaussians
 from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.views import render_gaussians
-from reconstruction.types import PosedFrames
 
 
 @dataclass(frozen=True)

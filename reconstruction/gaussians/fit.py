@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import DepthMaps, PosedFrames
 from reconstruction.gaussians.backend import Backend
 from reconstruction.gaussians.backends import load_backend
 from reconstruction.gaussians.config import GaussiansConfig
@@ -19,8 +21,6 @@ from reconstruction.gaussians.model import Gaussians, from_packed
 from reconstruction.gaussians.optimizer import Adam, SplatState, prune, rates_of, split
 from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.seeding import seed_from_depth
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import DepthMaps, PosedFrames
 from registry.errors import InputError
 
 _REPORT_EVERY = 10

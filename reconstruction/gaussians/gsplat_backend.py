@@ -6,12 +6,12 @@ blended depth, and the distortion is its L1 form. Cut-offs are gsplat's own; of 
 
 import numpy as np
 
+from reconstruction.core.types import Camera
 from reconstruction.gaussians.backend import StepResult
 from reconstruction.gaussians.losses import FrameTarget, LossWeights
 from reconstruction.gaussians.model import SH_C0
 from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.rendering import Render
-from reconstruction.types import Camera
 from registry.errors import EnvironmentMissing
 from registry.geometry import invert_rigid
 

@@ -15,11 +15,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from reconstruction.core.types import Camera
 from reconstruction.gaussians.config import GaussiansConfig
 from reconstruction.gaussians.scratch import Scratch
 from reconstruction.gaussians.seeding import rays_of
 from reconstruction.gaussians.threads import run_over
-from reconstruction.types import Camera
 
 _WINDOW, _WINDOW_SIGMA = 11, 1.5
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reconstruction.core.types import Camera
 from reconstruction.gaussians.scratch import Scratch
 from reconstruction.gaussians.threads import run_over
-from reconstruction.types import Camera
 from registry.geometry import invert_rigid
 
 

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
 from reconstruction.gaussians.model import N_PARAMETERS, SH_C0
-from reconstruction.types import Camera, DepthMaps, PosedFrames
 from registry.errors import InputError
 from registry.geometry import quat_from_matrix
 

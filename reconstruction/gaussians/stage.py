@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import DepthMaps, PosedFrames, WorldFrame
 from reconstruction.gaussians.backends import load_backend
 from reconstruction.gaussians.config import GaussiansConfig
 from reconstruction.gaussians.depth_maps import rendered_depth_maps
 from reconstruction.gaussians.fit import fit_gaussians, median_depth_of, settings_of
 from reconstruction.gaussians.model import Gaussians, moved
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import DepthMaps, PosedFrames, WorldFrame
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from reconstruction.core.types import Camera
 from reconstruction.gaussians.backends import load_backend
 from reconstruction.gaussians.model import Gaussians
 from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.rendering import Render
-from reconstruction.types import Camera
 
 
 def render_gaussians(

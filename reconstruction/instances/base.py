@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from reconstruction.progress import Progress
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import BaseEntity, Plane, Surface
 from reconstruction.surface.base_planes import FittedPlane
-from reconstruction.types import BaseEntity, Plane, Surface
 
 BASE_LABELS = ("floor", "wall", "ceiling")
 

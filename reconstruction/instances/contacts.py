@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.core.mesh_graph import MeshGraph
 
 _REACH_M, _FAR_REACH_M = 0.05, 0.3  # around the foot, in plan
 _RISE_M, _DROP_M = 0.03, 0.06  # the carrier's surface may lie this far above and below the foot

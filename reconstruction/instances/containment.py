@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.surface.mesh_graph import MeshGraph
+from reconstruction.core.mesh_graph import MeshGraph
 
 _ENCLOSED = 0.9  # share of a piece that is within an outline
 _SLACK_M = 0.005

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import BaseEntity, Surface
 from reconstruction.instances.base import base_entities, base_planes
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.progress import Progress
 from reconstruction.surface.base_planes import FittedPlane, base_owner, behind_base
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import BaseEntity, Surface
 
 
 @dataclass(frozen=True)

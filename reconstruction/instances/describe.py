@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.types import BaseEntity, Instance
 from reconstruction.instances.boxes import UprightBox, quantiles, upright_box, with_bottom
 from reconstruction.instances.containment import is_inside
 from reconstruction.instances.cut import Thing
 from reconstruction.instances.labels import coarse_label, shape_facts
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import BaseEntity, Instance
 
 _FLAT_SPREAD_M, _FLAT_REACH_M = 0.015, 0.03  # of a flat thing's surface: its noise, and the far end of that
 _LEAST_FRONT_M = 0.02

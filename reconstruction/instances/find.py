@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import DepthMaps, InstanceSet, PosedFrames, Surface
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
@@ -15,8 +17,6 @@ from reconstruction.instances.naming import load_namer, name_instances
 from reconstruction.instances.outlined import add_outlined
 from reconstruction.instances.partition import cut_by_partition
 from reconstruction.instances.sightings import sightings
-from reconstruction.progress import Progress
-from reconstruction.types import DepthMaps, InstanceSet, PosedFrames, Surface
 
 
 def make_instances(

@@ -6,13 +6,13 @@ from functools import partial
 import cv2
 import numpy as np
 
+from reconstruction.core.mesh_graph import lab_from_rgb
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Camera, DepthMaps, InstanceSet, PosedFrames, Surface
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.mask_propagation import MaskPropagation
 from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.poses.parallel import ordered_map
-from reconstruction.progress import Progress
-from reconstruction.surface.mesh_graph import lab_from_rgb
-from reconstruction.types import Camera, DepthMaps, InstanceSet, PosedFrames, Surface
 
 
 def render_id_maps(
@@ -43,7 +43,7 @@ def seen_vertices(
     surface: Surface, camera: Camera, world_from_camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the surface vertex that each pixel shows, int32 (h, w), -1 = none, and its z-depth, float32 (h, w)."""
-    from reconstruction.rasterize import rasterize_mesh
+    from reconstruction.core.rasterize import rasterize_mesh
 
     raster = rasterize_mesh(surface.vertices, surface.faces, camera, world_from_camera)
     out = np.full(raster.face.shape, -1, np.int32)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.instances.boxes import UprightBox
-from reconstruction.surface.mesh_graph import MeshGraph
 
 UNKNOWN = ("unknown", 0.0)
 

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import DepthMaps, PosedFrames, Surface
 from reconstruction.instances.lifting_graph import cluster_masks
 from reconstruction.instances.lifting_views import MaskViews, view_masks
 from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.superpoints import superpoints
-from reconstruction.progress import Progress
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import DepthMaps, PosedFrames, Surface
 
 _MIN_VOTES_SHARE = 0.34  # of the frames that see a vertex must put it into the cluster that it goes to
 

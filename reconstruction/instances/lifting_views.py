@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.progress import Progress
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import DepthMaps, PosedFrames, Surface
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.progress import Progress
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import DepthMaps, PosedFrames, Surface
 from registry.geometry import invert_rigid
 
 UNSEEN = -1

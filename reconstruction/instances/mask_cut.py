@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.core.mesh_graph import MeshGraph, pieces
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import DepthMaps, PosedFrames, Surface
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.lifting import Lifted, lift_masks
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.progress import Progress
-from reconstruction.surface.mesh_graph import MeshGraph, pieces
-from reconstruction.types import DepthMaps, PosedFrames, Surface
 
 # Of the frames that see a vertex, so many must see one thing there: skirts and floaters are seen against this or that.
 _SURE_SHARE = 0.65

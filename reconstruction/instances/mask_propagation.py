@@ -7,10 +7,10 @@ near each other depth need not be exact to say which pixel of the one is which o
 import numpy as np
 from numba import njit, prange
 
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, Surface
 from reconstruction.instances.lifting_views import nearest_views, project
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
 from registry.geometry import invert_rigid
 
 _ASKED = 4  # frames with masks

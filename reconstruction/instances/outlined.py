@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from reconstruction.core.mesh_graph import lab_from_rgb
+from reconstruction.core.progress import Progress
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.outlined_box import MIN_FRONT_M, Wall, WallBox, Window, fit_box, silhouette
-from reconstruction.progress import Progress
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.surface.mesh_graph import lab_from_rgb
-from reconstruction.types import DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 
 _LEAST_SHARE, _MOST_SHARE = 1e-3, 0.2  # of the image, for a mask to be looked at
 _RING_PX, _ON_WALL = 4, 0.6  # of a ring around its mask must be that wall

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.types import BaseEntity, Camera
+from reconstruction.core.types import BaseEntity, Camera
 from registry.geometry import invert_rigid, transform_points
 
 MIN_FRONT_M = 0.025  # of a framed picture

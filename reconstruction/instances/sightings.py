@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.mesh_graph import lab_from_rgb
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, Surface
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.poses.parallel import ordered_map
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.surface.mesh_graph import lab_from_rgb
-from reconstruction.types import Camera, DepthMaps, PosedFrames, Surface
 from registry.geometry import invert_rigid
 
 _MAX_FRAMES = 36

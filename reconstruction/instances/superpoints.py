@@ -9,8 +9,8 @@ edges.
 import numpy as np
 from numba import njit
 
+from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
-from reconstruction.surface.mesh_graph import MeshGraph
 
 MAX_SIZE_M = 0.06  # diagonal of a patch's box
 _STRONG_ANGLE_DEG, _STRONG_COLOR = 35.0, 14.0  # between neighbors: never joined

@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
+from reconstruction.core.types import FrameSet
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
-from reconstruction.types import FrameSet
 from registry.errors import InputError
 
 MIN_FRAMES = 8

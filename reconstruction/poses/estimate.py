@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import FrameSet, PosedFrames
 from reconstruction.poses import diagnose, importers, mapping
 from reconstruction.poses.backends import PoseBackend, load_pose_backend
 from reconstruction.poses.components import label_parts
@@ -19,8 +21,6 @@ from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import matched_database
 from reconstruction.poses.refine import refine_model
 from reconstruction.poses.undistort import undistort
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import FrameSet, PosedFrames
 
 _PLAUSIBLE_FOCAL = (0.35, 4.0)  # of the longer side; metadata beyond is wrong
 _DEFAULT_FOCAL_SHARE = 1.0  # of the longer side, where the metadata says nothing

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.progress import Progress
 from reconstruction.poses.parallel import ordered_map
-from reconstruction.progress import Progress
 
 _DESCRIPTOR_SCALE = 512.0
 _MAX_RATIO = 0.8  # Lowe's ratio, of angles

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from reconstruction.core.progress import Progress
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
 from reconstruction.poses.parallel import ordered_map
-from reconstruction.progress import Progress
 
 _NEIGHBORS = 8
 _MAX_ERROR_PX = 3.0

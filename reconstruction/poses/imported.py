@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import FrameSet
 from reconstruction.poses import diagnose, importers, mapping
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
@@ -12,8 +14,6 @@ from reconstruction.poses.importers import ImportedPoses
 from reconstruction.poses.matching import matched_database
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.refine import bundle_adjust, filter_points, refine_model
-from reconstruction.progress import Progress
-from reconstruction.types import FrameSet
 from registry.errors import UsageError
 from registry.geometry import split_similarity, umeyama
 

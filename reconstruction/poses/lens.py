@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from reconstruction.types import FrameSet, PosedFrames
+from reconstruction.core.types import FrameSet, PosedFrames
 from registry.errors import InputError
 
 _FRAMES, _CORNERS, _FEWEST = 10, 400, 60

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.core.progress import Progress
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
-from reconstruction.progress import Progress
 
 # With more threads Ceres adds in an order that changes from run to run, and the last bits of poses with it.
 MAPPER_THREADS = 1

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import FrameSet
 from reconstruction.poses import mapping
 from reconstruction.poses.components import label_parts, propose_bridges
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.consistency import reject_look_alikes
 from reconstruction.poses.features import Features, overlap_scores
 from reconstruction.poses.pairs import VerifiedPair, choose_pairs, verify_pairs
-from reconstruction.progress import Progress
-from reconstruction.types import FrameSet
 
 _NOTED_SHARE = 0.02  # of the pairs; fewer look-alikes are everywhere
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.progress import Progress
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
 from reconstruction.poses.parallel import ordered_map
-from reconstruction.progress import Progress
 
 _MIN_OVERLAP_SCORE = (
     6  # mutual matches among the largest features; below it full matching finds next to nothing

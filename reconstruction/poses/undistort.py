@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
 
 _NEGLIGIBLE_PX = 0.3  # a smaller displacement everywhere is not worth the blur of resampling
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import AssetSet
 from reconstruction.scene_graph.base import (
     LocalGraph,
     MergedGraph,
@@ -22,11 +23,10 @@ from reconstruction.scene_graph.load import RECORDS, backend_name, load_relation
 from reconstruction.scene_graph.regions import find_regions
 from reconstruction.scene_graph.relations import GeometryRelations
 from reconstruction.scene_graph.synthesis import synthesize
-from reconstruction.types import AssetSet
 from registry.errors import InputError
 
 if TYPE_CHECKING:
-    from reconstruction.avo import ViewScene
+    from reconstruction.views import ViewScene
 
 
 def infer_scene_graph(

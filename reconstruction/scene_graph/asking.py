@@ -5,12 +5,12 @@ from typing import Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
-from reconstruction.conversation import Conversation, VlmError, VlmUnavailable
+from reconstruction.core.types import AssetSet
+from reconstruction.learned.conversation import Conversation, VlmError, VlmUnavailable
 from reconstruction.scene_graph.base import LocalGraph, Question, SaidEdge
 from reconstruction.scene_graph.checking import Findings, Triple, examine
 from reconstruction.scene_graph.looking import RegionPicture
 from reconstruction.scene_graph.relations import GeometryRelations
-from reconstruction.types import AssetSet
 
 # How sure an edge of a model is, by what geometry says of it.
 _AGREED, _POSSIBLE, _UNLIKELY = 0.9, 0.6, 0.4

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from reconstruction.types import Edge, SceneGraph
+from reconstruction.core.types import Edge, SceneGraph
 
 RELATIONS = ("supported_by", "attached_to")
 

@@ -6,16 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reconstruction.conversation import Conversation
-from reconstruction.learned import ModelRequest
+from reconstruction.core.types import AssetSet
+from reconstruction.learned.conversation import Conversation
+from reconstruction.learned.models import ModelRequest
 from reconstruction.scene_graph.base import RelationBackend
 from reconstruction.scene_graph.config import SceneGraphConfig
 from reconstruction.scene_graph.relations import GeometryRelations
-from reconstruction.types import AssetSet
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.avo import ViewScene
+    from reconstruction.views import ViewScene
 
 DEFAULT_QWEN = "Qwen/Qwen2.5-VL-7B-Instruct"
 RECORDS = "graph_questions"
@@ -60,11 +60,11 @@ def load_model(config: SceneGraphConfig, records: Path | None = None) -> Convers
     named = os.environ.get("SIMRECON_VLM_RECORDS", "")
     records = Path(named) if named else records
     if config.backend == "vlm":
-        from reconstruction.vlm import Endpoint, VlmClient
+        from reconstruction.learned.vlm import Endpoint, VlmClient
 
         endpoint = Endpoint.from_environment("scene_graph.backend", config.model)
         return VlmClient(replace(endpoint, records=records))
-    from reconstruction.qwen import QwenModel
+    from reconstruction.learned.qwen import QwenModel
 
     request = ModelRequest(
         config.model or DEFAULT_QWEN, "scene_graph.backend", "scene_graph.model", config.device
@@ -79,7 +79,7 @@ def check_backend(config: SceneGraphConfig) -> None:
         EnvironmentMissing: no endpoint or no model is named, transformers is missing or too old.
     """
     if config.backend == "qwen2.5-vl":
-        from reconstruction.learned import transformers_class
+        from reconstruction.learned.models import transformers_class
 
         transformers_class("Qwen2_5_VLForConditionalGeneration", "scene_graph.backend")
     elif config.backend == "vlm":

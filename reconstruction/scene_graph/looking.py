@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction.avo import AvoConfig, ViewScene, load_strategy, make_target
+from reconstruction.core.types import AssetSet
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize
 from reconstruction.scene_graph.base import Question
 from reconstruction.scene_graph.set_of_marks import id_map, number_things
-from reconstruction.types import AssetSet
+from reconstruction.views import AvoConfig, ViewScene, load_strategy, make_target
 
 _SETTINGS = RasterSettings(near=0.02)
 _LEAST_BASE_SHARE = 0.01  # of the picture: less of a floor or wall gets no number

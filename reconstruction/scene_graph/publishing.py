@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 
+from reconstruction.core.types import Edge
 from reconstruction.scene_graph.base import MergedGraph, MergeStep, SaidEdge
-from reconstruction.types import Edge
 
 FOLDER = "graph"
 

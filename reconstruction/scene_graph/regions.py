@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.types import ObjectAsset
+from reconstruction.core.types import ObjectAsset
 
 
 def dbscan(points: np.ndarray, radius: float, min_points: int) -> np.ndarray:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from reconstruction.core.types import AssetSet
 from reconstruction.scene_graph.base import LocalGraph, Question, SaidEdge
 from reconstruction.scene_graph.surfaces import SampledBase, SampledObject, sample_assets
-from reconstruction.types import AssetSet
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import AssetSet, Camera
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import AssetSet, Camera
 from registry.geometry import transform_points
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX

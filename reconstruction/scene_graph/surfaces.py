@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.types import AssetSet, BaseAsset, ObjectAsset
+from reconstruction.core.types import AssetSet, BaseAsset, ObjectAsset
 
 _SPACING_M = 0.005
 _MIN_SAMPLES, _MAX_SAMPLES = 2_000, 25_000

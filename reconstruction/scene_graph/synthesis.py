@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.scene_graph.base import (
     LocalGraph,
     MergedGraph,

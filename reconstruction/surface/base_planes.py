@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.surface.config import SurfaceConfig
-from reconstruction.surface.mesh_graph import MeshGraph
 
 _MAX_WALLS = 8
 

@@ -5,9 +5,9 @@ import math
 import numba
 import numpy as np
 
+from reconstruction.core.types import SpaceGrid
 from reconstruction.surface.pixels import FusionViews
 from reconstruction.surface.tsdf import block_visible
-from reconstruction.types import SpaceGrid
 
 _CHUNK = 8
 UNKNOWN, FREE, SURFACE = 0, 1, 2

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reconstruction.progress import NO_PROGRESS, Progress
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, SpaceGrid, Surface
 from reconstruction.surface.config import SurfaceConfig
-from reconstruction.types import Camera, DepthMaps, PosedFrames, SpaceGrid, Surface
 from registry.errors import InputError
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruction.surface.mesh_graph import MeshGraph, pieces
+from reconstruction.core.mesh_graph import MeshGraph, pieces
 
 
 def horizontal_levels(graph: MeshGraph, chosen: np.ndarray, min_area_m2: float) -> list[np.ndarray]:

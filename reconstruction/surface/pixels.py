@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from reconstruction.types import Camera, DepthMaps
+from reconstruction.core.types import Camera, DepthMaps
 from registry.geometry import invert_rigid
 
 TILE_PX = 8

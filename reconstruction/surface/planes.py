@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.types import Plane, Surface, SurfacePlane
 from reconstruction.surface.base_planes import base_outline, base_owner, behind_base, fit_base
 from reconstruction.surface.config import SurfaceConfig
-from reconstruction.surface.mesh_graph import MeshGraph
 from reconstruction.surface.support_planes import find_support_planes
-from reconstruction.types import Plane, Surface, SurfacePlane
 
 
 def find_planes(surface: Surface, config: SurfaceConfig) -> tuple[SurfacePlane, ...]:

@@ -11,7 +11,7 @@ from itertools import chain
 
 import numpy as np
 
-from reconstruction.progress import Progress
+from reconstruction.core.progress import Progress
 from reconstruction.surface.config import SurfaceConfig
 from reconstruction.surface.extract import RawMesh, extract_mesh
 from reconstruction.surface.pixels import FusionViews

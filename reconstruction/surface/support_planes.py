@@ -6,10 +6,10 @@ from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected_cells
 from scipy.spatial import cKDTree
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.types import Plane, SpaceGrid, SurfacePlane
 from reconstruction.surface.base_planes import FittedPlane, base_outline, on_plane, plane_axes
 from reconstruction.surface.levels import horizontal_levels, joined_levels
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import Plane, SpaceGrid, SurfacePlane
 
 _STEP_M = 0.012  # pieces whose heights differ by less are of one plane
 _ADJACENT_M = 0.06  # and touch, if they are closer than this

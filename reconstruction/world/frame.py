@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import DepthMaps, PosedFrames, ScaleEstimate, WorldFrame
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import DepthMaps, PosedFrames, ScaleEstimate, WorldFrame
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.floor import Floor, find_floor
 from reconstruction.world.gravity import find_gravity

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.types import PosedFrames
+from reconstruction.core.types import PosedFrames
 from reconstruction.world.planes import FittedPlane, fit_planes
 from reconstruction.world.samples import SurfaceSamples
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reconstruction.types import PosedFrames
+from reconstruction.core.types import PosedFrames
 
 _TEXELS = 16  # of the drawn pattern, per cell
 _MARGIN_CELLS = 0.5  # of the white around the square that is compared, too

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.types import PosedFrames
+from reconstruction.core.types import PosedFrames
 from reconstruction.world.marker_fit import Square, fit_square
 from registry.errors import UsageError
 from registry.geometry import invert_rigid

@@ -5,8 +5,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from reconstruction.depth_model import DepthModel
-from reconstruction.types import Camera, DepthMaps, PosedFrames
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
+from reconstruction.learned.depth_model import DepthModel
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.samples import choose_frames
 from registry.errors import InputError, UsageError

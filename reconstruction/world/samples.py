@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.types import Camera, DepthMaps, PosedFrames
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
 from reconstruction.world.config import WorldConfig
 from registry.errors import InputError
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.progress import Progress
-from reconstruction.types import Camera, DepthMaps, PosedFrames, ScaleEstimate
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, ScaleEstimate
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.floor import Floor
 from reconstruction.world.markers import detect_markers, measure_markers

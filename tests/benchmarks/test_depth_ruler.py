@@ -5,8 +5,8 @@ import pytest
 
 from benchmarks.depth import main, report_lines
 from benchmarks.depth_figures import TrueView, depth_figures, laid_onto, ring_counts
+from reconstruction.core.types import Camera, DepthMaps
 from reconstruction.depth.perturb import perturbed
-from reconstruction.types import Camera, DepthMaps
 from registry.geometry import rigid, transform_points
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 160.0, 120.0)

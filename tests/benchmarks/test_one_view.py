@@ -11,8 +11,8 @@ from reconstruction.assets.generation.base import GenerationError, Job, ObjectPi
 from reconstruction.assets.generation.hunyuan import Hunyuan3D
 from reconstruction.assets.generation.pictures import encode_png
 from reconstruction.assets.generation.service import ServiceLimits
-from reconstruction.avo.cameras import look_at, square_camera
-from reconstruction.rasterize import rasterize_mesh
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.views.cameras import look_at, square_camera
 from registry.geometry import GLTF_FROM_WORLD
 
 SIZE = np.array([0.4, 0.2, 0.3])

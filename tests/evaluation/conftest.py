@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from truth_bundle import Change, Truth, write_bundle, write_truth
 
-from reconstruction.evaluation import Evaluation, evaluate_scene
+from reconstruction.measure import Evaluation, evaluate_scene
 
 POINTS = 40_000
 

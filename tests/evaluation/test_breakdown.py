@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.evaluation.breakdown import SIZE_EDGES_CM, breakdown, wilson
-from reconstruction.evaluation.ground_truth import GroundTruth
-from reconstruction.evaluation.object_boxes import instance_boxes, match_boxes, object_records
-from reconstruction.evaluation.object_facts import longest_side, object_facts
+from reconstruction.measure.breakdown import SIZE_EDGES_CM, breakdown, wilson
+from reconstruction.measure.ground_truth import GroundTruth
+from reconstruction.measure.object_boxes import instance_boxes, match_boxes, object_records
+from reconstruction.measure.object_facts import longest_side, object_facts
 
 # name -> (relation, parent, size, center)
 THINGS = {
@@ -206,8 +206,8 @@ def test_wilson_agrees_with_published_numbers():
 
 
 def test_boxes_of_the_stage_are_in_the_true_world_and_reach_their_support(truth):
-    from reconstruction.evaluation.alignment import align
-    from reconstruction.types import Instance, InstanceSet
+    from reconstruction.core.types import Instance, InstanceSet
+    from reconstruction.measure.alignment import align
 
     rng = np.random.default_rng(0)
     poses = {}
@@ -238,8 +238,8 @@ def test_boxes_of_the_stage_are_in_the_true_world_and_reach_their_support(truth)
 
 def test_a_picture_is_as_thick_as_the_stage_says_and_its_back_is_on_the_wall():
     """Its surface is a cloud from 1 to 5 cm before the wall at x = 0; the stage says 2 cm."""
-    from reconstruction.evaluation.alignment import Alignment
-    from reconstruction.types import Instance, InstanceSet
+    from reconstruction.core.types import Instance, InstanceSet
+    from reconstruction.measure.alignment import Alignment
 
     rng = np.random.default_rng(0)
     points = np.column_stack(

@@ -6,7 +6,7 @@ import pytest
 from truth_bundle import write_bundle
 
 from reconstruction.cli import main
-from reconstruction.evaluation import GroundTruth
+from reconstruction.measure import GroundTruth
 from registry import SceneRegistry
 from registry.errors import UsageError
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from truth_bundle import FIXED, KINDS, Change
 
-from reconstruction.evaluation import evaluate_scene
-from reconstruction.evaluation.matching import box_iou, graph_f1, match
+from reconstruction.measure import evaluate_scene
+from reconstruction.measure.matching import box_iou, graph_f1, match
 from registry.errors import UsageError
 from registry.geometry import rigid
 

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
-from reconstruction.evaluation.surfaces import compare, sample_seen
-from reconstruction.evaluation.visibility import seen_points
+from reconstruction.measure.surfaces import compare, sample_seen
+from reconstruction.measure.visibility import seen_points
 from registry.geometry import rigid
 
 pytest.importorskip("embreex", reason="the reference casts exact rays with embreex (pip install embreex)")

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruction.evaluation import GroundTruth
-from reconstruction.evaluation import stages as figures
-from reconstruction.evaluation.alignment import align
-from reconstruction.evaluation.planes import planes_figures
-from reconstruction.evaluation.surfaces import sample_seen
-from reconstruction.oracle import Oracle
+from reconstruction.core.types import DepthMaps, Plane
+from reconstruction.measure import GroundTruth
+from reconstruction.measure import stages as figures
+from reconstruction.measure.alignment import align
+from reconstruction.measure.oracle import Oracle
+from reconstruction.measure.planes import planes_figures
+from reconstruction.measure.surfaces import sample_seen
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.types import DepthMaps, Plane
 from registry.errors import UsageError
 from registry.geometry import rigid, split_similarity
 from synthetic.capture import SyntheticCapture, make_test_capture, write_ground_truth
@@ -98,7 +98,7 @@ def test_focal_error(capture, truth):
 def test_surface_of_true_depth_is_good_and_a_shifted_one_is_not(capture, truth, surface):
     alignment = aligned(capture.posed, truth)
     meshes = [e.mesh for e in truth.entities]
-    from reconstruction.evaluation.scene import joined
+    from reconstruction.measure.scene import joined
 
     poses = list(truth.world_from_camera.values())
     seen = sample_seen(*joined(meshes), truth.camera, poses, 200_000)

@@ -13,12 +13,12 @@ from truth_bundle import Change, write_bundle
 
 from reconstruction.cli import main
 from reconstruction.commands.truth import split_truth
-from reconstruction.evaluation import evaluate_scene
-from reconstruction.evaluation.outlines import measure_outlines
-from reconstruction.evaluation.scene import placed_meshes
-from reconstruction.evaluation.stage_results import StageResults
-from reconstruction.report.collect import gather
-from reconstruction.report.outline_section import outline_section
+from reconstruction.measure import evaluate_scene
+from reconstruction.measure.outlines import measure_outlines
+from reconstruction.measure.report.collect import gather
+from reconstruction.measure.report.outline_section import outline_section
+from reconstruction.measure.scene import placed_meshes
+from reconstruction.measure.stage_results import StageResults
 from registry import SceneRegistry
 from registry.errors import UsageError
 

@@ -8,7 +8,7 @@ import pytest
 from outline_drawing import draw
 from truth_bundle import write_bundle
 
-from reconstruction.evaluation import load_outlines, score_outlines
+from reconstruction.measure import load_outlines, score_outlines
 from registry.errors import UsageError
 
 SQUARE = [[2, 2], [9, 2], [9, 9], [2, 9]]

@@ -7,9 +7,9 @@ import pytest
 from outline_drawing import FRAMES, draw, pieces, true_ids
 from truth_bundle import KINDS, Change, write_bundle
 
-from reconstruction.evaluation import LabelledFrame, Outline, load_outlines, score_outlines
-from reconstruction.evaluation.outline_labels import filled
-from reconstruction.evaluation.scene import placed_meshes
+from reconstruction.measure import LabelledFrame, Outline, load_outlines, score_outlines
+from reconstruction.measure.outline_labels import filled
+from reconstruction.measure.scene import placed_meshes
 from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
 from registry.geometry import rigid

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.avo.cameras import look_at
-from reconstruction.evaluation.ground_truth import GroundTruth, TrueEntity
-from reconstruction.evaluation.viewpoints import TrueViews, winding_number
-from reconstruction.types import Camera
+from reconstruction.core.types import Camera
+from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
+from reconstruction.measure.viewpoints import TrueViews, winding_number
+from reconstruction.views.cameras import look_at
 
 CAMERA = Camera(320, 240, 280.0, 280.0, 160.0, 120.0)
 FRONT, SIDE = np.array([0.0, -2.0, 0.2]), np.array([2.0, 0.0, 0.2])

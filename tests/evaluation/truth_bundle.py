@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from reconstruction.assets.gltf import write_glb, write_obj
-from reconstruction.preview import render_textured
-from reconstruction.types import Camera, ConvexPart, TexturedMesh
+from reconstruction.core.types import Camera, ConvexPart, TexturedMesh
+from reconstruction.publish.preview import render_textured
 from registry import SceneBundle, seal_bundle
 from registry.geometry import invert_rigid, rigid, split_similarity, transform_points
 from synthetic.camera_paths import handheld_path, phone_camera

@@ -182,7 +182,7 @@ def test_some_rooms_lack_walls_and_what_hangs_there(open_film):
 
 
 def test_a_film_of_a_held_out_room_becomes_a_capture(open_film, tmp_path):
-    from reconstruction.evaluation.ground_truth import GroundTruth
+    from reconstruction.measure.ground_truth import GroundTruth
 
     captures.write_film(open_film, tmp_path / "room", 3)
     assert (tmp_path / "room" / "video.mp4").stat().st_size > 1000

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from reconstruction.avo import prepare_scene
-from reconstruction.avo.cameras import look_at
+from reconstruction.core.types import BaseEntity, Camera, InstanceSet, Plane, SpaceGrid, Surface
 from reconstruction.gaussians.model import from_packed
-from reconstruction.types import BaseEntity, Camera, InstanceSet, Plane, SpaceGrid, Surface
+from reconstruction.views import prepare_scene
+from reconstruction.views.cameras import look_at
 from registry.geometry import quat_from_matrix
 
 FLOOR, BOX, PANEL, BALL = 1, 2, 3, 4

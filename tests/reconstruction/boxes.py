@@ -3,7 +3,7 @@
 import numpy as np
 
 from reconstruction.assembly.base import convex_part
-from reconstruction.types import (
+from reconstruction.core.types import (
     AssetProvenance,
     AssetSet,
     BaseAsset,

@@ -7,8 +7,8 @@ import trimesh
 from masses import mass_entry
 
 from reconstruction.assets.gltf import read_glb, write_glb, write_obj
+from reconstruction.core.types import ConvexPart, TexturedMesh
 from reconstruction.exports.scene import ExportBody, ExportScene, closed_part, safe_name, uniform_inertia
-from reconstruction.types import ConvexPart, TexturedMesh
 from registry import SceneBundle, seal_bundle
 from registry.geometry import matrix_from_quat, rigid, transform_points
 from registry.simulation import read_obj_points, standing_primitive

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reconstruction.types import Camera, PosedFrames, VideoSource
+from reconstruction.core.types import Camera, PosedFrames, VideoSource
 from registry.geometry import rigid
 
 CAMERA = Camera(320, 240, 280.0, 280.0, 160.0, 120.0)

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 from surfaces import Patchwork, surface_from
 
-from reconstruction.types import Surface
+from reconstruction.core.types import Surface
 
 Solid = tuple[Callable[[np.ndarray], np.ndarray], tuple[int, int, int]]
 

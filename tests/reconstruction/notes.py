@@ -1,6 +1,6 @@
 """A watcher that keeps what stages say."""
 
-from reconstruction.progress import NoProgress
+from reconstruction.core.progress import NoProgress
 
 
 class Notes(NoProgress):

@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reconstruction.rasterize import rasterize_mesh
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, SpaceGrid, Surface, VideoSource
 from reconstruction.surface import SurfaceConfig
 from reconstruction.surface.planes import find_planes
-from reconstruction.types import Camera, DepthMaps, PosedFrames, SpaceGrid, Surface, VideoSource
 
 STEP_M = 0.01
 

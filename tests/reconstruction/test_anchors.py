@@ -9,18 +9,18 @@ import pytest
 
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import ScaleEstimate, WorldFrame
 from reconstruction.editing.addresses import Address, parse_address
 from reconstruction.editing.anchors import Footage, Pointer
 from reconstruction.editing.overrides import Overrides
 from reconstruction.gaussians import Gaussians, GaussianScene
-from reconstruction.instance_views import choose_views
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.pipeline import STAGES
 from reconstruction.poses.lens import Lens
-from reconstruction.progress import NO_PROGRESS
+from reconstruction.publish.instance_views import choose_views
 from reconstruction.runner import Run
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.types import ScaleEstimate, WorldFrame
 from registry.errors import UsageError
 
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from reconstruction import artifacts
-from reconstruction.types import (
+from reconstruction.core import artifacts
+from reconstruction.core.types import (
     AssembledScene,
     Camera,
     DepthMaps,

@@ -11,10 +11,10 @@ from reconstruction.assembly.base import convex_part
 from reconstruction.assembly.baselines import in_situ
 from reconstruction.assembly.collision import cut, flatten_foot
 from reconstruction.assembly.placement import base_specs
+from reconstruction.core.types import AssembledScene, AssetSet, Edge, Instance, InstanceSet, SceneGraph
 from reconstruction.editing.anchors import Pointer
 from reconstruction.editing.overrides import Overrides
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
-from reconstruction.types import AssembledScene, AssetSet, Edge, Instance, InstanceSet, SceneGraph
 from registry.errors import SimReconError, UsageError
 from registry.geometry import rigid, transform_points
 from registry.simulation import build_physics, pose_change

@@ -13,8 +13,8 @@ from reconstruction.assembly.hollow import fills_air, hollowed, volume
 from reconstruction.assembly.place import Placer
 from reconstruction.assembly.placement import Placement, base_specs
 from reconstruction.assembly.workbench import object_spec
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.types import AssembledScene, AssetSet, Edge, ObjectAsset, SceneGraph
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import AssembledScene, AssetSet, Edge, ObjectAsset, SceneGraph
 from registry.geometry import rigid, transform_points
 from registry.report_card import physics_report
 

@@ -13,7 +13,7 @@ from reconstruction.assembly.placement import base_specs
 from reconstruction.assembly.tops import seat
 from reconstruction.assembly.workbench import Workbench, object_spec, support_margin
 from reconstruction.assets.gltf import read_obj, write_obj
-from reconstruction.types import AssetSet, Edge, SceneGraph
+from reconstruction.core.types import AssetSet, Edge, SceneGraph
 from registry.geometry import rigid
 from registry.report_card import physics_report
 from registry.simulation import read_obj_points

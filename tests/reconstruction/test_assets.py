@@ -10,7 +10,7 @@ from notes import Notes
 from reconstruction.assets import AssetsConfig, build_assets
 from reconstruction.assets.gltf import write_glb
 from reconstruction.assets.solid import Solid, to_manifold
-from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
+from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.geometry import transform_points
 
 CONFIG = AssetsConfig(

@@ -9,7 +9,7 @@ from facing import CAMERA, frames
 from reconstruction.assets.cut_off import Room, continued, cut_off_sides, lone_front, with_copies
 from reconstruction.assets.views import SeenPoints
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
-from reconstruction.types import (
+from reconstruction.core.types import (
     BaseEntity,
     InstanceSet,
     Plane,

@@ -12,8 +12,8 @@ from reconstruction.assets.fused import fused_points, sample_surface, without_st
 from reconstruction.assets.hanging_relief import mound, relief
 from reconstruction.assets.views import prepare_pixels
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.types import Instance, InstanceSet
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import Instance, InstanceSet
 
 RED = (200, 40, 40)
 BOX = Instance(2, "box", 0.5, np.array([0, 0, 0.1]), 0.0, np.array([0.3, 0.3, 0.2]), 1, False)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruction.assets.gltf import read_glb, read_obj, write_glb, write_obj
-from reconstruction.types import ConvexPart, TexturedMesh
+from reconstruction.core.types import ConvexPart, TexturedMesh
 from registry.errors import BundleError
 from registry.meshfiles import check_mesh_file
 

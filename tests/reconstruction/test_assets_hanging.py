@@ -8,7 +8,7 @@ from reconstruction.assets import AssetsConfig
 from reconstruction.assets.hanging import hanging_slab, is_outlined, outlined_slab
 from reconstruction.assets.hanging_front import _first_minimum, front_of
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, PosedFrames
+from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, PosedFrames
 from registry.geometry import rigid, transform_points
 
 TWICE = ((0.0, 0.0, 1.3), (0.1, 0.0, 1.3))

@@ -17,7 +17,7 @@ from reconstruction.assets.standing import (
 from reconstruction.assets.support import support_height
 from reconstruction.assets.views import SeenPoints
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
-from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane
+from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane
 from registry.geometry import rigid
 
 PLATE = Instance(5, "plate", 0.5, np.array([0, 0, 0.415]), 0.0, np.array([0.22, 0.22, 0.02]), 4, False)

@@ -10,8 +10,8 @@ from reconstruction.assets.rim_artifacts import away_directions, behind_rims, wi
 from reconstruction.assets.solid import box_solid
 from reconstruction.assets.views import lift_object, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, fuse_volume
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import DepthMaps
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import DepthMaps
 from registry.geometry import invert_rigid, rigid
 from tests.reconstruction.facing import CAMERA, frames
 

@@ -10,19 +10,19 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 import avo_room as room
 
-from reconstruction.avo import AvoConfig, find_views, load_inpainter, load_strategy, make_target
-from reconstruction.avo.cameras import look_at, moved, square_camera, step_gradient, upright
-from reconstruction.avo.clearance import measure_clearance
-from reconstruction.avo.coverage import Coverage
-from reconstruction.avo.initial_views import starts_below
-from reconstruction.avo.objective import Objective
-from reconstruction.avo.scene import reach_of, thinned
-from reconstruction.avo.search import Search
-from reconstruction.avo.strategies import STRATEGIES
+from reconstruction.core.types import SpaceGrid
 from reconstruction.gaussians.fit import exponential
 from reconstruction.gaussians.model import SH_C0
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize
-from reconstruction.types import SpaceGrid
+from reconstruction.views import AvoConfig, find_views, load_inpainter, load_strategy, make_target
+from reconstruction.views.cameras import look_at, moved, square_camera, step_gradient, upright
+from reconstruction.views.clearance import measure_clearance
+from reconstruction.views.coverage import Coverage
+from reconstruction.views.initial_views import starts_below
+from reconstruction.views.objective import Objective
+from reconstruction.views.scene import reach_of, thinned
+from reconstruction.views.search import Search
+from reconstruction.views.strategies import STRATEGIES
 from registry.errors import UsageError
 
 QUICK = AvoConfig(

@@ -10,10 +10,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 import avo_room as room
 
-from reconstruction.avo import AvoConfig, make_target
-from reconstruction.avo.cameras import look_at, square_camera
-from reconstruction.avo.closure import close_shape
-from reconstruction.avo.coverage import Coverage, Unseen
+from reconstruction.views import AvoConfig, make_target
+from reconstruction.views.cameras import look_at, square_camera
+from reconstruction.views.closure import close_shape
+from reconstruction.views.coverage import Coverage, Unseen
 
 CAMERA = square_camera(64, 50.0)
 FRONT, BEHIND = (room.BOX_CENTER + np.array([0.0, side * 0.9, 0.4]) for side in (-1, 1))

@@ -14,7 +14,7 @@ from reconstruction.cache import (
     digest_input,
     fingerprint,
 )
-from reconstruction.types import Edge, SceneGraph
+from reconstruction.core.types import Edge, SceneGraph
 from registry.errors import EnvironmentMissing
 
 GRAPH = SceneGraph(edges=(Edge(1, "supported_by", 0, 1.0, ""),))

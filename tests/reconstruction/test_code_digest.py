@@ -103,18 +103,18 @@ def test_a_missing_package_is_an_error(house):
 def test_leaves_of_the_project_count_for_the_stages_that_use_them():
     behind = {stage.name: modules_behind(stage.package) for stage in STAGES}
     for stage, leaf in (
-        ("frames", "reconstruction.keyframes"),
-        ("frames", "reconstruction.decoding"),
+        ("frames", "reconstruction.frames.keyframes"),
+        ("frames", "reconstruction.frames.decoding"),
         ("depth", "reconstruction.depth.sgm"),
         ("assembly", "registry.simulation"),
         ("assembly", "registry.report_card"),
-        ("instances", "reconstruction.learned"),
-        ("assets", "reconstruction.vlm"),
+        ("instances", "reconstruction.learned.models"),
+        ("assets", "reconstruction.learned.vlm"),
     ):
         assert leaf in behind[stage], (stage, leaf)
     for stage, modules in behind.items():
         assert not [
-            m for m in modules if m.startswith(("reconstruction.commands", "reconstruction.report."))
+            m for m in modules if m.startswith(("reconstruction.commands", "reconstruction.measure.report."))
         ], stage
     assert "reconstruction.assets.build" not in behind["surface"]
 

@@ -16,7 +16,7 @@ from reconstruction.assets.collision.rings import find_hole
 from reconstruction.assets.collision.slicing import own_levels
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.solid import Solid, box_solid, from_manifold
-from reconstruction.progress import NO_PROGRESS
+from reconstruction.core.progress import NO_PROGRESS
 from registry.errors import EnvironmentMissing
 from registry.primitives import primitive_of
 from registry.simulation import BodySpec, Physics

@@ -2,7 +2,7 @@
 
 import numba
 
-from reconstruction.compiling import compilation_shown
+from reconstruction.core.compiling import compilation_shown
 
 
 class Recorder:

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, PosedFrames, VideoSource
 from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.depth.views import depth_ranges, frame_parts, plan_views
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera, PosedFrames, VideoSource
 from registry.errors import InputError
 
 CAMERA = Camera(240, 180, 210.0, 210.0, 120.0, 90.0)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_depth import CAMERA, CONFIG, look_at, make_posed, quad
 
+from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.depth.blank_walls import fill_walls
 from reconstruction.depth.views import plan_views
-from reconstruction.rasterize import rasterize_mesh
 
 FLOOR = np.array([0.0, 0.0, 1.0, 0.0])
 NORTH = np.array([0.0, -1.0, 0.0, 1.0])

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from reconstruction.core.types import Camera
 from reconstruction.depth.estimate import _warps, sweep_frame
 from reconstruction.depth.refine import fit_slopes, refine
 from reconstruction.depth.sweep import sweep_costs
 from reconstruction.depth.views import ViewPlan, frame_parts
 from reconstruction.depth.windows import make_correlate, offsets, project, source_maps
-from reconstruction.types import Camera
 
 H, W = 30, 41
 K = np.array([[40.0, 0, W / 2], [0, 40.0, H / 2], [0, 0, 1]])

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.depth_figures import ring_counts
+from reconstruction.core.workers import Workers
 from reconstruction.depth import DepthConfig, estimate_depth, mending
 from reconstruction.depth.candidates import OFFSETS, candidate_depths, choose_candidates
 from reconstruction.depth.channels import OFFSETS_PX
 from reconstruction.depth.estimate import gather_evidence
 from reconstruction.depth.mending import candidate_shares, mending_features
 from reconstruction.depth.weights import load_network
-from reconstruction.depth.workers import Workers
 from synthetic.capture import make_test_capture
 
 

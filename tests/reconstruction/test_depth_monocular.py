@@ -7,11 +7,11 @@ import pytest
 from notes import Notes
 from test_depth import CAMERA, CONFIG, make_posed
 
+from reconstruction.core.workers import Workers
 from reconstruction.depth import estimate_depth
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.monocular import fill_from_predictions, fit_affine
 from reconstruction.depth.views import plan_views
-from reconstruction.depth.workers import Workers
 from registry.errors import EnvironmentMissing, UsageError
 
 HOLE = (slice(20, 110), slice(60, 180))  # over the wall and the box: no plane fills it
@@ -176,7 +176,7 @@ def test_a_model_saved_in_a_folder_is_loaded_and_predicts_batches(tmp_path) -> N
 
 def test_metric_models_are_turned_into_inverse_depth_and_serve_the_scale(tmp_path) -> None:
     from reconstruction.depth.monocular import load_monocular
-    from reconstruction.depth_model import DepthModel
+    from reconstruction.learned.depth_model import DepthModel
     from reconstruction.world.config import WorldConfig
     from reconstruction.world.metric_depth import load_backend
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, PosedFrames, VideoSource
 from reconstruction.depth import DepthConfig, estimate_depth
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera, PosedFrames, VideoSource
 
 CAMERA = Camera(240, 180, 210.0, 210.0, 120.0, 90.0)
 CONFIG = DepthConfig(depth_side_px=240, sweep_side_px=160, planes=64, min_speckle_px=20, prior="none")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
 
+from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.editing.anchors import Footage
 from reconstruction.editing.instances import apply_overrides
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.poses.lens import Lens
-from reconstruction.progress import NO_PROGRESS
 from registry.errors import UsageError
 
 

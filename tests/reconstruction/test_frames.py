@@ -9,7 +9,7 @@ from notes import Notes
 from PIL import Image
 
 from reconstruction.frames import FRAMES_PRESETS, FramesConfig, load_frames
-from reconstruction.keyframes import FrameStats, MotionMeter, Spacing, choose_keyframes
+from reconstruction.frames.keyframes import FrameStats, MotionMeter, Spacing, choose_keyframes
 from registry.errors import InputError, UsageError
 from synthetic.videos import (
     BAD_VIDEOS,

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from reconstruction.core.types import DepthMaps
 from reconstruction.gaussians import GAUSSIANS_PRESETS, GaussiansConfig, evaluate_gaussians, fit_gaussians
 from reconstruction.gaussians.backends import load_backend
 from reconstruction.gaussians.fit import exponential, make_target, median_depth_of, settings_of
@@ -12,7 +13,6 @@ from reconstruction.gaussians.losses import weights_of
 from reconstruction.gaussians.model import from_packed
 from reconstruction.gaussians.optimizer import SplatState, prune, split
 from reconstruction.gaussians.seeding import seed_from_depth
-from reconstruction.types import DepthMaps
 from registry.errors import InputError
 
 SMALL = GaussiansConfig(

@@ -10,11 +10,11 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 import gaussians_reference as reference
 
+from reconstruction.core.types import Camera
 from reconstruction.gaussians.fit import exponential
 from reconstruction.gaussians.losses import FrameTarget, LossWeights, image_loss, ssim
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize, rasterize_backward
 from reconstruction.gaussians.torch_losses import TorchImage, TorchTarget, torch_loss
-from reconstruction.types import Camera
 
 CAMERA = Camera(36, 28, 40.0, 41.0, 18.3, 13.2)
 UNCUT = RasterSettings(

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from reconstruction import artifacts
+from reconstruction.core import artifacts
+from reconstruction.core.types import Camera
 from reconstruction.gaussians import (
     Gaussians,
     RasterSettings,
@@ -15,7 +16,6 @@ from reconstruction.gaussians import (
 from reconstruction.gaussians.backends import load_backend
 from reconstruction.gaussians.model import from_packed
 from reconstruction.gaussians.seeding import disks
-from reconstruction.types import Camera
 from registry.errors import BundleError, EnvironmentMissing, UsageError
 from registry.geometry import matrix_from_quat
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from reconstruction.core.types import DepthMaps
 from reconstruction.gaussians import (
     GaussiansConfig,
     make_gaussians,
@@ -14,7 +15,6 @@ from reconstruction.gaussians import (
     write_ply,
 )
 from reconstruction.pipeline import STAGES
-from reconstruction.types import DepthMaps
 from registry.geometry import matrix_from_quat
 
 CONFIG = GaussiansConfig(

@@ -19,8 +19,8 @@ from reconstruction.assets.generation.solidify import closed_solid
 from reconstruction.assets.solid import to_manifold
 from reconstruction.assets.views import lift_object, prepare_pixels
 from reconstruction.config import PipelineConfig
-from reconstruction.publish import _completion
-from reconstruction.types import BaseEntity, Instance, InstanceSet, Plane, Surface
+from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, Surface
+from reconstruction.publish.write import _completion
 from registry.geometry import transform_points
 from synthetic.containers import make_bowl, make_mug
 from synthetic.furnishing import make_chair

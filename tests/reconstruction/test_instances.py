@@ -7,9 +7,9 @@ import pytest
 from notes import Notes
 from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from, with_planes
 
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import InstanceSet, Surface
 from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig, find_instances
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.types import InstanceSet, Surface
 
 
 def run(surface: Surface, progress=NO_PROGRESS) -> InstanceSet:

@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial import cKDTree
 from surfaces import floor_sheet, merged, sheet, solid_box, surface_from
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.instances.base import base_entities
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Thing
 from reconstruction.instances.describe import describe
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.surface.mesh_graph import MeshGraph
 
 BROWN = (120, 80, 50)
 TABLE = solid_box((-0.5, -0.4, 0.0), (0.5, 0.4, 0.4), BROWN)

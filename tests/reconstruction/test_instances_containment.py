@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from fused_surfaces import box, can, fused, tray
 
+from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.instances.containment import inset, is_inside
-from reconstruction.surface.mesh_graph import MeshGraph
 
 WOOD, RED = (205, 170, 115), (190, 30, 30)
 TABLE = box((-0.4, -0.35, 0.0), (0.4, 0.35, 0.4), (120, 80, 50))

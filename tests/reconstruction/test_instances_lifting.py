@@ -11,6 +11,10 @@ from scipy.spatial import cKDTree
 from surfaces import floor_sheet, frames_of, looking_at, merged, sheet, solid_box, surface_from
 
 from reconstruction.config import PipelineConfig
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, DepthMaps
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.id_maps import render_id_maps
@@ -18,10 +22,6 @@ from reconstruction.instances.lifting import lift_masks
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import FrameMasks
 from reconstruction.instances.superpoints import superpoints
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import Camera, DepthMaps
 from reconstruction.video_to_scene import reconstruct
 from registry.errors import UsageError
 

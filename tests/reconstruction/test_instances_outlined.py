@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from surfaces import floor_sheet, frames_of, looking_at, merged, sheet, solid_box, surface_from
 
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import BaseEntity, Camera, DepthMaps, Plane
 from reconstruction.editing.instances import apply_overrides
-from reconstruction.evaluation.alignment import Alignment
-from reconstruction.evaluation.object_boxes import instance_boxes
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.outlined_box import Wall, WallBox, Window, fit_box, silhouette
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import BaseEntity, Camera, DepthMaps, Plane
+from reconstruction.measure.alignment import Alignment
+from reconstruction.measure.object_boxes import instance_boxes
 from registry.errors import UsageError
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)

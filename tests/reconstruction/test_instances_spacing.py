@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import surfaces
 
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import Instance
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.types import Instance
 
 WOOD = (120, 80, 50)
 

@@ -5,13 +5,13 @@ import pytest
 from surfaces import Patchwork, merged, sheet, solid_box, surface_from
 
 from benchmarks.labels import compared, table
-from reconstruction.evaluation.labels import Guess, overconfidence, reliability
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.boxes import upright_box
 from reconstruction.instances.labels import ShapeFacts, coarse_label, shape_facts
-from reconstruction.progress import NO_PROGRESS
+from reconstruction.measure.labels import Guess, overconfidence, reliability
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.surface.mesh_graph import MeshGraph
 
 GRAY = (128, 128, 128)
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import tiny_models
 
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, VideoSource
 from reconstruction.instances import InstancesConfig
 from reconstruction.instances.masks import KeyframeMasks, flatten_masks, load_mask_backend, mask2former, sam
-from reconstruction.learned import ModelRequest, transformers_class
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.types import Camera, DepthMaps, PosedFrames, VideoSource
+from reconstruction.learned.models import ModelRequest, transformers_class
 from registry.errors import EnvironmentMissing
 
 pytest.importorskip("transformers")

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.rasterize import rasterize_mesh
+from reconstruction.core.rasterize import rasterize_mesh
 from synthetic.camera_paths import phone_camera
 from synthetic.film import iterate_film, prepare, render_color
 from synthetic.lighting import Light, draw_light

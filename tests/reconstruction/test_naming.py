@@ -9,6 +9,8 @@ from chat_server import Server, chat
 from notes import Notes
 from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
 
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import Camera, Instance, InstanceSet, PosedFrames, VideoSource
 from reconstruction.instances import (
     InstancesConfig,
     backends,
@@ -20,9 +22,7 @@ from reconstruction.instances import (
 from reconstruction.instances.naming import Name, apply_names, best_views, collage
 from reconstruction.instances.naming.clip import choose, read_vocabulary
 from reconstruction.instances.naming.vlm import VlmNamer
-from reconstruction.progress import NO_PROGRESS
-from reconstruction.types import Camera, Instance, InstanceSet, PosedFrames, VideoSource
-from reconstruction.vlm import Endpoint, VlmClient
+from reconstruction.learned.vlm import Endpoint, VlmClient
 from registry.errors import EnvironmentMissing, UsageError
 
 HEIGHT, WIDTH = 60, 80

@@ -8,6 +8,7 @@ import pytest
 from fused_surfaces import box, fused
 from surfaces import frames_of, with_planes
 
+from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.depth.channels import AFFINITIES, OFFSETS_PX
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.cut import Shell
@@ -24,7 +25,6 @@ from reconstruction.instances.partition.features import (
 from reconstruction.instances.partition.graph import LABELS, graph_of_links, region_graph
 from reconstruction.instances.partition.model import load_models
 from reconstruction.instances.sightings import sightings
-from reconstruction.progress import NO_PROGRESS
 from registry.errors import EnvironmentMissing
 
 TABLE = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.3), (120, 80, 50))

@@ -7,6 +7,7 @@ import pytest
 from fused_surfaces import box, fused
 from surfaces import frames_of, with_planes
 
+from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition import clusters
 from reconstruction.instances.partition.clusters import (
@@ -23,7 +24,6 @@ from reconstruction.instances.partition.model import load_models
 from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES, proposal_features
 from reconstruction.instances.partition.proposals import propose
 from reconstruction.instances.sightings import sightings
-from reconstruction.progress import NO_PROGRESS
 
 THING, BASE = LABELS.index("thing"), LABELS.index("base")
 LEFT = box((-0.45, -0.1, 0.3), (-0.30, 0.1, 0.4), (150, 60, 40))

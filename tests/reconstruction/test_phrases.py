@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.phrases import Described, color_name, phrases, shape_noun
-from reconstruction.types import TexturedMesh
+from reconstruction.core.types import TexturedMesh
+from reconstruction.publish.phrases import Described, color_name, phrases, shape_noun
 
 FLOOR, SHELF, TABLE = 1, 2, 3
 

@@ -12,9 +12,9 @@ from exports_room import BOOK, HANDLE, KNOB, MUG, PICTURE, TABLE
 from reconstruction.assembly import AssemblyConfig, assemble
 from reconstruction.cli import main
 from reconstruction.commands.scenes import describe_physics
+from reconstruction.core.types import Edge, SceneGraph
 from reconstruction.exports import export_scene
-from reconstruction.publish import _object, publish_scene
-from reconstruction.types import Edge, SceneGraph
+from reconstruction.publish.write import _object, publish_scene
 from registry import SceneRegistry, seal_bundle
 from registry.errors import SimReconError
 

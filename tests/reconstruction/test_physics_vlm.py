@@ -11,8 +11,8 @@ from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
 
 from reconstruction.assets import AssetsConfig, build_assets, outside_inputs
 from reconstruction.assets.physics.load import load_physicist
+from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.instances import InstancesConfig, make_instances
-from reconstruction.progress import NO_PROGRESS
 from registry.errors import EnvironmentMissing
 
 ID = 2  # of the crate: the floor is 1

@@ -7,9 +7,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from reconstruction.core.types import FrameSet, PosedFrames
 from reconstruction.poses import POSES_PRESETS, PosesConfig, estimate_poses
 from reconstruction.poses.undistort import undistort
-from reconstruction.types import FrameSet, PosedFrames
 from registry.errors import InputError
 from registry.geometry import split_similarity, umeyama
 from synthetic.camera_paths import pan_path

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from reconstruction.core.types import PosedFrames
 from reconstruction.poses import PosesConfig, estimate_poses
 from reconstruction.poses.backends import PredictedPoses, load_pose_backend
-from reconstruction.types import PosedFrames
 from registry.errors import EnvironmentMissing
 from registry.geometry import transform_points, umeyama
 

@@ -11,9 +11,9 @@ from notes import Notes
 from scipy.spatial.transform import Rotation
 
 from reconstruction.cache import digest_input
+from reconstruction.core.types import PosedFrames
 from reconstruction.frames import FramesConfig, load_frames
 from reconstruction.poses import PosesConfig, estimate_poses
-from reconstruction.types import PosedFrames
 from registry.errors import InputError
 
 # ARKit's world has +y up.

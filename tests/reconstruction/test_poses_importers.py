@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from reconstruction.core.types import PosedFrames
 from reconstruction.poses import PosesConfig, estimate_poses
-from reconstruction.types import PosedFrames
 from registry.errors import UsageError
 from registry.geometry import invert_rigid
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reconstruction.core.profiling import UsageMeter
 from reconstruction.costs import cost_rows, costs_json, describe_costs
-from reconstruction.profiling import UsageMeter
 
 ROOT = Path(__file__).resolve().parents[2]
 _MB = 2**20
@@ -38,7 +38,7 @@ def test_memory_of_this_process_is_seen_even_between_two_samples():
     # In a new process, whose high-water mark no earlier test has raised; the memory is freed within milliseconds.
     code = """
 import mmap, psutil
-from reconstruction.profiling import UsageMeter
+from reconstruction.core.profiling import UsageMeter
 before = psutil.Process().memory_info().rss
 with UsageMeter() as meter:
     held = mmap.mmap(-1, 300 * 2**20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | mmap.MAP_POPULATE)

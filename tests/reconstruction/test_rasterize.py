@@ -3,8 +3,8 @@
 import numpy as np
 import trimesh
 
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 25.0)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from boxes import box, floor, room, tilt, tray, wall
 
+from reconstruction.core.types import AssetSet
 from reconstruction.scene_graph import SCENE_GRAPH_PRESETS, SceneGraphConfig, infer_scene_graph
 from reconstruction.scene_graph.regions import dbscan, find_regions
-from reconstruction.types import AssetSet
 from registry.errors import InputError
 
 

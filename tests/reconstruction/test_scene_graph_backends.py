@@ -12,8 +12,9 @@ from chat_server import Server, chat
 from notes import Notes
 from tiny_models import one_thread, save_qwen
 
-from reconstruction.learned import ModelRequest
-from reconstruction.qwen import QwenModel
+from reconstruction.core.types import AssetSet
+from reconstruction.learned.models import ModelRequest
+from reconstruction.learned.qwen import QwenModel
 from reconstruction.scene_graph import Question, SceneGraphConfig, infer_scene_graph, outside_inputs
 from reconstruction.scene_graph.asking import PictureRelations
 from reconstruction.scene_graph.base import RELATIONS
@@ -21,7 +22,6 @@ from reconstruction.scene_graph.checking import examine
 from reconstruction.scene_graph.load import check_backend, load_relations
 from reconstruction.scene_graph.looking import RegionViewer
 from reconstruction.scene_graph.relations import GeometryRelations
-from reconstruction.types import AssetSet
 from registry.errors import EnvironmentMissing
 
 THINGS = (BOX, PANEL, BALL)

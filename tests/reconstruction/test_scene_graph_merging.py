@@ -8,6 +8,7 @@ from boxes import box, room
 from graph_backends import FLOOR, Oracle, forest_problem, said, small_room
 
 from benchmarks.lying import LyingRelations, TrueRelations
+from reconstruction.core.types import Camera
 from reconstruction.scene_graph import (
     LocalGraph,
     Question,
@@ -18,7 +19,6 @@ from reconstruction.scene_graph import (
 )
 from reconstruction.scene_graph.merge import GraphMerge
 from reconstruction.scene_graph.set_of_marks import id_map, number_things
-from reconstruction.types import Camera
 from synthetic.true_assets import true_assets, true_edges
 
 TRUTH = {10: FLOOR, 11: 10, 12: 11, 13: 10, 14: 13}

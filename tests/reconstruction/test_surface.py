@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from notes import Notes
 
-from reconstruction.evaluation.surfaces import sample
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, VideoSource
+from reconstruction.measure.surfaces import sample
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.types import Camera, DepthMaps, PosedFrames, VideoSource
 from registry.errors import InputError
 
 CENTER, RADIUS = np.array([0.0, 0.0, 0.15]), 0.15

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from surfaces import floor_sheet, merged, sheet, solid_box, surface_from
 
-from reconstruction import artifacts
-from reconstruction.evaluation.scene import joined
-from reconstruction.evaluation.surfaces import sample_seen
+from reconstruction.core import artifacts
+from reconstruction.core.types import SpaceGrid, Surface, SurfacePlane
+from reconstruction.measure.scene import joined
+from reconstruction.measure.surfaces import sample_seen
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from reconstruction.surface.base_planes import plane_axes
 from reconstruction.surface.planes import find_planes
-from reconstruction.types import SpaceGrid, Surface, SurfacePlane
 from synthetic.capture import SyntheticCapture, make_test_capture
 
 GRAY, BROWN, BLUE = (200, 200, 190), (120, 80, 50), (30, 60, 200)

@@ -10,17 +10,17 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 import avo_room as room
 
-from reconstruction import artifacts
 from reconstruction.assets.generation.pictures import object_pictures
 from reconstruction.assets.physics.vlm import shown_pictures
-from reconstruction.avo import AvoConfig, SceneViews, find_views, make_views
-from reconstruction.avo.pictures import _hidden_holes
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
+from reconstruction.core import artifacts
+from reconstruction.core.types import Instance, InstanceSet, PosedFrames
 from reconstruction.instances.naming.views import ObjectView
 from reconstruction.pipeline import DEFAULT_STAGE_NAMES, STAGE_NAMES, STAGES
 from reconstruction.runner import Run
-from reconstruction.types import Instance, InstanceSet, PosedFrames
+from reconstruction.views import AvoConfig, SceneViews, find_views, make_views
+from reconstruction.views.pictures import _hidden_holes
 from registry.errors import UsageError
 
 QUICK = AvoConfig(

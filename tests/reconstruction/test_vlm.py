@@ -7,7 +7,7 @@ import pytest
 from chat_server import Server, chat
 from pydantic import BaseModel, ConfigDict
 
-from reconstruction.vlm import Endpoint, VlmClient, VlmError, VlmUnavailable, json_part
+from reconstruction.learned.vlm import Endpoint, VlmClient, VlmError, VlmUnavailable, json_part
 from registry.errors import EnvironmentMissing
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from notes import Notes
 
-from reconstruction.rasterize import rasterize_mesh
-from reconstruction.types import Camera, DepthMaps, PosedFrames, VideoSource, WorldFrame
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames, VideoSource, WorldFrame
 from reconstruction.world import WorldConfig, find_world, rescale_for_object
 from registry.errors import InputError, UsageError
 from registry.geometry import matrix_from_quat, rigid, split_similarity

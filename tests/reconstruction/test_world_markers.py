@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reconstruction.cli import main
-from reconstruction.types import Camera, PosedFrames, VideoSource
+from reconstruction.core.types import Camera, PosedFrames, VideoSource
 from reconstruction.world.marker_print import MarkerSheet, write_marker
 from reconstruction.world.markers import measure_markers, printed_cells
 from registry.errors import UsageError

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruction.types import Camera, DepthMaps
+from reconstruction.core.types import Camera, DepthMaps
 from reconstruction.world import WorldConfig, parse_scale, settle_object_height
 from reconstruction.world.markers import measure_markers
 from reconstruction.world.metric_depth import load_backend, metres_per_unit
@@ -96,7 +96,7 @@ def _film_marker(dictionary: str, marker_id: int, side: float, count: int, make_
 @pytest.fixture
 def make_frames():
     """Return a function that makes PosedFrames of images and cameras."""
-    from reconstruction.types import PosedFrames, VideoSource
+    from reconstruction.core.types import PosedFrames, VideoSource
 
     def make(images: np.ndarray, poses: np.ndarray) -> PosedFrames:
         n, z = len(images), np.zeros

@@ -12,19 +12,19 @@ from reconstruction.assembly import AssemblyConfig, assemble
 from reconstruction.assets import AssetsConfig, build_assets
 from reconstruction.cache import StageStore
 from reconstruction.config import PipelineConfig
-from reconstruction.evaluation.evaluate import evaluate_scene
-from reconstruction.evaluation.stage_results import StageResults
+from reconstruction.core.profiling import Usage
+from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.types import ScaleEstimate, WorldFrame
 from reconstruction.gaussians import GaussiansConfig, make_gaussians
 from reconstruction.instances import InstancesConfig, find_instances
+from reconstruction.measure.evaluate import evaluate_scene
+from reconstruction.measure.report.page import build_page
+from reconstruction.measure.stage_results import StageResults
 from reconstruction.pipeline import STAGES
-from reconstruction.profiling import Usage
-from reconstruction.progress import NO_PROGRESS
 from reconstruction.publish import publish_scene
-from reconstruction.report.page import build_page
 from reconstruction.runner import Run
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
 from reconstruction.surface import SurfaceConfig, fuse_surface
-from reconstruction.types import ScaleEstimate, WorldFrame
 from registry import SceneBundle, SceneRegistry
 from synthetic.capture import make_test_capture
 

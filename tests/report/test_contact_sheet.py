@@ -13,9 +13,9 @@ from reconstruction.cli import main
 from reconstruction.editing.addresses import parse_address
 from reconstruction.editing.anchors import Footage, Pointer
 from reconstruction.editing.overrides import Overrides
+from reconstruction.measure.report.contact_page import overrides_template, write_contact_sheets
+from reconstruction.measure.report.contact_sheet import ContactSheet, anchor_text, frame_sheet
 from reconstruction.poses.lens import Lens
-from reconstruction.report.contact_page import overrides_template, write_contact_sheets
-from reconstruction.report.contact_sheet import ContactSheet, anchor_text, frame_sheet
 from registry.errors import UsageError
 
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from reconstruction.cli import main
-from reconstruction.evaluation.evaluate import evaluate_scene
-from reconstruction.evaluation.ground_truth import GroundTruth
-from reconstruction.evaluation.outlines import measure_outlines
-from reconstruction.evaluation.stage_results import StageResults
-from reconstruction.report import pictures
-from reconstruction.report.collect import gather
-from reconstruction.report.outline_section import outline_section
-from reconstruction.report.page import build_page
-from reconstruction.report.truth import Truth
+from reconstruction.measure.evaluate import evaluate_scene
+from reconstruction.measure.ground_truth import GroundTruth
+from reconstruction.measure.outlines import measure_outlines
+from reconstruction.measure.report import pictures
+from reconstruction.measure.report.collect import gather
+from reconstruction.measure.report.outline_section import outline_section
+from reconstruction.measure.report.page import build_page
+from reconstruction.measure.report.truth import Truth
+from reconstruction.measure.stage_results import StageResults
 
 SECTIONS = [
     "cameras",

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.avo import gradient_error
-from reconstruction.avo import AvoConfig, make_target, prepare_scene
 from reconstruction.cli import main
+from reconstruction.views import AvoConfig, make_target, prepare_scene
 
 QUICK = [
     "--set",

@@ -11,8 +11,8 @@ from reconstruction.assets.collision.rings import find_hole, ring_pieces
 from reconstruction.assets.collision.slicing import sliced
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid, box_solid, hull_solid
-from reconstruction.progress import NO_PROGRESS, Progress
-from reconstruction.types import ConvexPart
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import ConvexPart
 
 _WASTE_SHARE = 0.01  # of the whole's hull: a hull that takes so little empty space is good enough
 _ODD_SECTORS = 2  # of a ring

@@ -14,9 +14,9 @@ from reconstruction.assets.collision.build import collision_parts
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid
 from reconstruction.code_digest import code_digest
-from reconstruction.progress import NoProgress, Progress
-from reconstruction.requesting import write_whole
-from reconstruction.types import ConvexPart
+from reconstruction.core.progress import NoProgress, Progress
+from reconstruction.core.types import ConvexPart
+from reconstruction.learned.requesting import write_whole
 
 _MOST_KEPT = 400  # files; those that were not used longest go first
 _ELSEWHERE = ("texture_", "base_", "generator", "physics")  # options that no collision shape depends on

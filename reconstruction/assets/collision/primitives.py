@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from reconstruction.assets.solid import Solid, hull_solid
-from reconstruction.types import ConvexPart
+from reconstruction.core.types import ConvexPart
 from registry.primitives import FLAT, Primitive, Shape, corners_of
 
 BOUND_M = 0.002

@@ -13,7 +13,7 @@ from reconstruction.assets.generation.solidify import closed_solid
 from reconstruction.assets.registration import FreeDepth, Registration, SeenSurface, register
 from reconstruction.assets.solid import Solid, manifold_of
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
-from reconstruction.types import SpaceGrid
+from reconstruction.core.types import SpaceGrid
 from registry.geometry import transform_points
 
 _BELIEVED_SHARE = 0.3  # of the points; if fewer are kept, all count

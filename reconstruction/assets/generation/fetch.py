@@ -14,9 +14,9 @@ from reconstruction.assets.generation.load import load_generator, records_folder
 from reconstruction.assets.generation.pictures import object_pictures
 from reconstruction.assets.generation.records import Records
 from reconstruction.assets.views import SeenPoints
-from reconstruction.avo import SceneViews
-from reconstruction.progress import Progress
-from reconstruction.types import InstanceSet, PosedFrames
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import InstanceSet, PosedFrames
+from reconstruction.views import SceneViews
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from reconstruction.assets.generation.base import ObjectPictures, Picture
-from reconstruction.avo import SceneViews, View
-from reconstruction.types import Instance, InstanceSet, PosedFrames
+from reconstruction.core.types import Instance, InstanceSet, PosedFrames
+from reconstruction.views import SceneViews, View
 
 _LABEL_BELIEVED = 0.5
 _LEAST_FRONTS = 0.6  # of what a view shows; of the inside of a shell no generator is to be told

@@ -12,7 +12,7 @@ from typing import Any
 
 from reconstruction.assets.generation.base import GenerationBackend, GenerationError, Job, ObjectPictures
 from reconstruction.assets.generation.pictures import encode_png, pixel_digest
-from reconstruction.requesting import write_whole
+from reconstruction.learned.requesting import write_whole
 
 
 class Records:

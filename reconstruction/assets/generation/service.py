@@ -10,7 +10,7 @@ import requests
 from pydantic import BaseModel, ValidationError
 
 from reconstruction.assets.generation.base import GenerationError, GeneratorUnavailable, Job, RequestRefused
-from reconstruction.requesting import asked_pause, excerpt
+from reconstruction.learned.requesting import asked_pause, excerpt
 
 _TRIES = 5
 _LONGEST_PAUSE_S = 60.0

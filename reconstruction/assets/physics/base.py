@@ -5,9 +5,9 @@ from typing import Protocol
 import numpy as np
 
 from reconstruction.assets.physics.materials import MaterialChoice, choose_material
-from reconstruction.avo import SceneViews
-from reconstruction.progress import Progress
-from reconstruction.types import Instance, InstanceSet, PosedFrames
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Instance, InstanceSet, PosedFrames
+from reconstruction.views import SceneViews
 
 
 class Physicist(Protocol):

@@ -15,7 +15,7 @@ def load_physicist(config: AssetsConfig) -> Physicist | None:
     if config.physics == "table":
         return None
     from reconstruction.assets.physics.vlm import VlmPhysicist
-    from reconstruction.vlm import Endpoint, VlmClient
+    from reconstruction.learned.vlm import Endpoint, VlmClient
 
     return VlmPhysicist(VlmClient(Endpoint.from_environment("assets.physics", config.physics_model)))
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.solid import Solid
-from reconstruction.types import PhysicalAttributes, PhysicalRanges
+from reconstruction.core.types import PhysicalAttributes, PhysicalRanges
 
 _MIN_KG, _MAX_KG = 0.005, 250.0
 

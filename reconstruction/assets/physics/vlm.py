@@ -7,11 +7,11 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from reconstruction.assets.physics.materials import MATERIALS, MaterialChoice
-from reconstruction.avo import SceneViews, View
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Instance, InstanceSet, PosedFrames
 from reconstruction.instances.naming.views import ObjectView, best_views, collage
-from reconstruction.progress import Progress
-from reconstruction.types import Instance, InstanceSet, PosedFrames
-from reconstruction.vlm import VlmClient, VlmError, VlmUnavailable
+from reconstruction.learned.vlm import VlmClient, VlmError, VlmUnavailable
+from reconstruction.views import SceneViews, View
 
 _HEAVIEST_KG_M3 = 8000.0  # a block of steel that fills the box
 _LIGHTEST_KG_M3 = 2.0  # a wire basket

@@ -9,8 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from reconstruction.progress import Progress
-from reconstruction.types import Camera, DepthMaps, PosedFrames
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
 
 
 @dataclass(frozen=True)

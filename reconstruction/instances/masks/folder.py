@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from reconstruction.decoding import ImageFolder
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
+from reconstruction.frames.decoding import ImageFolder
 from reconstruction.instances.masks.base import FrameMasks
-from reconstruction.progress import Progress
-from reconstruction.types import Camera, DepthMaps, PosedFrames
 from registry.errors import UsageError
 
 _ASPECT_TOLERANCE = 0.01

@@ -5,7 +5,7 @@ from pathlib import Path
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.masks.base import ImageSegmenter, KeyframeMasks, MaskBackend
 from reconstruction.instances.masks.folder import FolderMasks
-from reconstruction.learned import ModelRequest
+from reconstruction.learned.models import ModelRequest
 
 # Where the option names none. Licenses: docs/masks.md.
 DEFAULT_MODELS = {

@@ -3,7 +3,7 @@
 import numpy as np
 
 from reconstruction.instances.masks.base import flatten_masks
-from reconstruction.learned import ModelRequest, load_model, load_part, masks_of
+from reconstruction.learned.models import ModelRequest, load_model, load_part, masks_of
 
 _MIN_SCORE = 0.5
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from reconstruction.instances.masks.base import flatten_masks
-from reconstruction.learned import ModelRequest, SquareImages, load_model, load_part, masks_of
+from reconstruction.learned.models import ModelRequest, SquareImages, load_model, load_part, masks_of
 
 _POINTS_A_BATCH = 64
 _MIN_TRUST = 0.8  # IoU that the model expects of its mask with the truth

@@ -4,8 +4,8 @@ import re
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from reconstruction.progress import Progress
-from reconstruction.types import InstanceSet, PosedFrames
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import InstanceSet, PosedFrames
 
 MAX_CONFIDENCE = 0.9  # a picture never proves what a thing is
 _WORD = re.compile(r"[a-z0-9][a-z0-9 \-]{0,39}")

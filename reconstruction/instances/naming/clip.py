@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import InstanceSet, PosedFrames
 from reconstruction.instances.naming.base import Name, is_label
 from reconstruction.instances.naming.views import best_views
-from reconstruction.learned import ModelRequest, load_model, load_part
-from reconstruction.progress import Progress
-from reconstruction.types import InstanceSet, PosedFrames
+from reconstruction.learned.models import ModelRequest, load_model, load_part
 from registry.errors import UsageError
 
 # An object that looks more like one of these is not named.

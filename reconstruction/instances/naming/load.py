@@ -1,10 +1,10 @@
 """Which backend names things: what the config asks for, loaded and applied."""
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import InstanceSet, PosedFrames
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.naming.base import Namer, apply_names
-from reconstruction.learned import ModelRequest
-from reconstruction.progress import Progress
-from reconstruction.types import InstanceSet, PosedFrames
+from reconstruction.learned.models import ModelRequest
 
 DEFAULT_CLIP_MODEL = "openai/clip-vit-base-patch32"
 
@@ -24,7 +24,7 @@ def load_namer(config: InstancesConfig) -> Namer | None:
         return ClipNamer(request, read_vocabulary(config.labels_vocabulary))
     if config.labels == "vlm":
         from reconstruction.instances.naming.vlm import VlmNamer
-        from reconstruction.vlm import Endpoint, VlmClient
+        from reconstruction.learned.vlm import Endpoint, VlmClient
 
         return VlmNamer(VlmClient(Endpoint.from_environment("instances.labels", config.labels_model)))
     return None

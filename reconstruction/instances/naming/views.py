@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from reconstruction.types import InstanceSet, PosedFrames
+from reconstruction.core.types import InstanceSet, PosedFrames
 
 _MIN_PIXELS = 30  # at id-map resolution; less shows nothing
 _MARGIN = 0.25  # of the object's box, on each side

@@ -5,11 +5,11 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Instance, InstanceSet, PosedFrames
 from reconstruction.instances.naming.base import Name, is_label
 from reconstruction.instances.naming.views import ObjectView, best_views, collage
-from reconstruction.progress import Progress
-from reconstruction.types import Instance, InstanceSet, PosedFrames
-from reconstruction.vlm import VlmClient, VlmError, VlmUnavailable
+from reconstruction.learned.vlm import VlmClient, VlmError, VlmUnavailable
 
 # What models say of their own certainty is optimistic; "unsure" ones do not replace anything.
 _CONFIDENCE = {"certain": 0.8, "likely": 0.5}

@@ -4,6 +4,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.special import expit
 
+from reconstruction.core.progress import Progress
+from reconstruction.core.types import Surface
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell, Thing
@@ -16,8 +18,6 @@ from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposal_features import proposal_features
 from reconstruction.instances.partition.proposals import best_disjoint, propose
 from reconstruction.instances.sightings import Sighting
-from reconstruction.progress import Progress
-from reconstruction.types import Surface
 
 _THING, _BASE = LABELS.index("thing"), LABELS.index("base")
 

@@ -10,14 +10,14 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.types import Surface
 from reconstruction.depth.channels import OFFSETS_PX
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.partition.evidence import FrameLook, VertexEvidence, gather, look
 from reconstruction.instances.partition.graph import RegionGraph
 from reconstruction.instances.sightings import Sighting
 from reconstruction.poses.parallel import ordered_map
-from reconstruction.surface.mesh_graph import MeshGraph
-from reconstruction.types import Surface
 
 NODE_FEATURES = (
     "log_area", "length", "width", "thickness", "flatness", "coherence", "normal_z", "height", "height_of_foot",

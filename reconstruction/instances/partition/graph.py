@@ -6,8 +6,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.instances.superpoints import superpoints
-from reconstruction.surface.mesh_graph import MeshGraph
 
 GAP_M = 0.03  # superpoints this near to each other are joined across a gap
 LABELS = ("thing", "base", "artifact")

@@ -8,7 +8,8 @@ is the number of the video frame, from 0.
 import re
 from pathlib import Path
 
-from reconstruction.decoding import ImageFolder
+from reconstruction.core.types import FrameSet
+from reconstruction.frames.decoding import ImageFolder
 from reconstruction.phone_exports.exports import find_export, turned_camera
 from reconstruction.phone_exports.named_poses import ImportedPoses, NamedPoses
 from reconstruction.phone_exports.polycam import read_polycam
@@ -16,7 +17,6 @@ from reconstruction.phone_exports.record3d import read_record3d
 from reconstruction.poses.importers.colmap import read_colmap
 from reconstruction.poses.importers.model import check_consistency, model_from_poses
 from reconstruction.poses.importers.nerfstudio import read_transforms
-from reconstruction.types import FrameSet
 from registry.errors import UsageError
 
 __all__ = [

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from reconstruction.core.types import FrameSet
 from reconstruction.phone_exports.named_poses import ImportedPoses
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
 from reconstruction.poses.refine import drop_weak_frames, filter_points
-from reconstruction.types import FrameSet
 from registry.errors import UsageError
 
 

@@ -1,0 +1,1 @@
+"""What every stage needs: artifact types, cameras, progress, compiled kernels, mesh graphs, the mesh rasterizer."""

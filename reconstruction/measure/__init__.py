@@ -1,0 +1,22 @@
+"""The ruler: a scene bundle and the truth in, the metrics of CONTRACT sections 4 and 5 out, per stage where kept."""
+
+from reconstruction.measure.evaluate import Evaluation, evaluate_scene
+from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
+from reconstruction.measure.outline_files import load_outlines
+from reconstruction.measure.outline_labels import LabelledFrame, Outline, OutlineLabels
+from reconstruction.measure.outline_scores import OutlineScores, score_outlines
+from reconstruction.measure.stage_results import StageResults
+
+__all__ = [
+    "Evaluation",
+    "GroundTruth",
+    "LabelledFrame",
+    "Outline",
+    "OutlineLabels",
+    "OutlineScores",
+    "StageResults",
+    "TrueEntity",
+    "evaluate_scene",
+    "load_outlines",
+    "score_outlines",
+]

@@ -1,0 +1,90 @@
+"""The assembled scene drawn at the cameras of kept-out frames, against those frames."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.core.types import Camera, TexturedMesh
+from reconstruction.publish.preview import render_textured
+
+_SSIM_SIGMA = 1.5
+
+
+@dataclass(frozen=True)
+class RenderScore:
+    """Agreement of pictures over the pixels that the scene covers; means over frames."""
+
+    psnr_db: float
+    ssim: float
+    coverage: float  # share of the pixels that the scene covers
+    frames: int
+
+
+def score_pictures(
+    rendered: list[np.ndarray], covered: list[np.ndarray], true: list[np.ndarray]
+) -> RenderScore | None:
+    """Compare pictures uint8 (h, w, 3) where `covered` (h, w) holds; frames with nothing covered count as coverage 0.
+
+    PSNR of a frame is 10 log10(255^2 / MSE over its covered pixels and channels). SSIM is Wang's, Gaussian window of
+    sigma 1.5, mean of the map over the covered pixels.
+    """
+    from skimage.metrics import structural_similarity
+
+    psnr, ssim, coverage = [], [], []
+    for picture, mask, truth in zip(rendered, covered, true):
+        coverage.append(float(mask.mean()))
+        if not mask.any():
+            continue
+        error = (picture.astype(np.float64) - truth.astype(np.float64))[mask]
+        psnr.append(10 * np.log10(255.0**2 / max(float((error**2).mean()), 1e-10)))
+        # Outside the covered part both pictures are made equal, so that the window does not see the background.
+        filled = np.where(mask[..., None], picture, truth)
+        _, full = structural_similarity(
+            truth,
+            filled,
+            channel_axis=2,
+            data_range=255,
+            gaussian_weights=True,
+            sigma=_SSIM_SIGMA,
+            use_sample_covariance=False,
+            full=True,
+        )
+        ssim.append(float(full[mask].mean()))
+    if not psnr:
+        return None
+    return RenderScore(float(np.mean(psnr)), float(np.mean(ssim)), float(np.mean(coverage)), len(coverage))
+
+
+def render_views(
+    meshes: list[tuple[TexturedMesh, np.ndarray]], camera: Camera, poses: list[np.ndarray]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Draw textured meshes, each with its `world_from_mesh`; return pictures and which pixels they cover."""
+    pictures, covered = [], []
+    for pose in poses:
+        picture, depth = render_textured(meshes, camera, pose)
+        pictures.append(picture)
+        covered.append(depth > 0)
+    return pictures, covered
+
+
+def video_frames(video: Path, indices: list[int], camera: Camera) -> dict[int, np.ndarray]:
+    """Decode some frames of a video (or read some images of a folder) at the size of a camera, as decoded."""
+    import cv2
+
+    from reconstruction.frames.decoding import ImageFolder, VideoReader
+
+    side = max(camera.width, camera.height)
+    found = {}
+    if video.is_dir():
+        folder = ImageFolder(video)
+        found = {i: folder.load_rgb(i, side) for i in indices if i < len(folder.files)}
+    else:
+        reader = VideoReader(video)
+        for number, _, _, frame in reader.frames():
+            if number in set(indices):
+                found[number] = reader.to_rgb(frame, side)
+            if number >= max(indices, default=-1):
+                break
+    size = (camera.width, camera.height)
+    return {i: cv2.resize(x, size, interpolation=cv2.INTER_AREA) for i, x in found.items() if x is not None}

@@ -1,0 +1,104 @@
+"""From a scene to its page: gather, draw, render the template."""
+
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.measure.ground_truth import GroundTruth
+from reconstruction.measure.report import pictures, sections
+from reconstruction.measure.report.collect import Gathered, by_reason, gather
+from reconstruction.measure.scene import placed_meshes
+from reconstruction.measure.stage_results import StageResults
+from registry import SceneBundle
+from registry.errors import EnvironmentMissing, UsageError
+
+_SOURCES = ("template.html.j2", "style.css", "script.js")
+
+
+def build_page(
+    bundle: SceneBundle,
+    stages: StageResults,
+    ground_truth: Path | None = None,
+    evaluation: dict[str, Any] | None = None,
+    *,
+    labels: Path | None = None,
+    progress: Progress = NO_PROGRESS,
+) -> str:
+    """Return the report of a scene as one self-contained HTML page.
+
+    Args:
+        bundle: the scene.
+        stages: what its stages made, as far as that is kept; what is missing is left out and said so.
+        ground_truth: folder of CONTRACT section 3; None: there are no error maps.
+        evaluation: what `Evaluation.to_json` gave for this scene; None: measured here where there is a truth.
+        labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); None: there is no such section.
+        progress: told of each part.
+
+    Raises:
+        UsageError: the truth or the labels are malformed, or not of this video.
+    """
+    truth = None
+    if ground_truth is not None:
+        from reconstruction.measure.evaluate import evaluate_scene
+        from reconstruction.measure.report.truth import Truth
+
+        truth = Truth.of(bundle, GroundTruth.load(ground_truth))
+        if evaluation is None:
+            evaluation = evaluate_scene(bundle, ground_truth, stages=stages, progress=progress).to_json()
+    outlines = None
+    if labels is not None:
+        from reconstruction.measure.outlines import measure_outlines
+
+        outlines = measure_outlines(bundle, placed_meshes(bundle), labels, stages)
+    return render(gather(bundle, stages, truth, evaluation, outlines))
+
+
+def read_evaluation(path: Path, bundle: SceneBundle) -> dict[str, Any]:
+    """Read what `simrecon evaluate --json` wrote about this scene.
+
+    Raises:
+        UsageError: it cannot be read, is something else, or is about another scene or revision.
+    """
+    from reconstruction.measure.evaluate import SCHEMA
+
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--evaluation {path}: cannot be read ({error})") from error
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        raise UsageError(f"--evaluation {path}: is not what `simrecon evaluate --json` writes ({SCHEMA})")
+    if found.get("revision") != bundle.revision:
+        raise UsageError(
+            f"--evaluation {path}: is about revision {found.get('revision')} of {found.get('scene')}, this is "
+            f"{bundle.revision} of {bundle.scene['id']}; evaluate it again"
+        )
+    return found
+
+
+def render(g: Gathered) -> str:
+    """Render the page of what was gathered."""
+    try:
+        from jinja2 import DictLoader, Environment, StrictUndefined
+    except ImportError as error:
+        raise EnvironmentMissing(
+            f"report needs jinja2, which cannot be imported ({error}); pip install jinja2"
+        ) from error
+    folder = files("reconstruction.measure.report")
+    sources = {name: (folder / name).read_text(encoding="utf-8") for name in _SOURCES}
+    environment = Environment(
+        loader=DictLoader(sources),
+        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("template.html.j2").render(
+        scene=g.scene,
+        revision=g.bundle.revision,
+        picture=pictures.preview(g),
+        tiles=sections.summary_tiles(g),
+        sections=sections.all_sections(g),
+        missing=by_reason(g.stages.missing),
+    )

@@ -1,0 +1,92 @@
+"""What the stages of a scene made, where the work folder still holds it."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from reconstruction.core import artifacts
+from reconstruction.core.types import DepthMaps, PosedFrames, WorldFrame
+from reconstruction.gaussians import Gaussians
+from reconstruction.pipeline import STAGES
+from registry import SceneBundle
+from registry.errors import BundleError
+
+_MANIFEST = "manifest.json"
+
+
+@dataclass
+class StageResults:
+    """Artifacts of a scene's stages by name, loaded when first asked for (large arrays memory-mapped)."""
+
+    folders: dict[str, Path]
+    missing: dict[str, str]  # stage -> why its result cannot be had
+    work_dir: Path | None = None
+    _loaded: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def find(cls, bundle: SceneBundle, registry_root: Path, work_dir: Path | None = None) -> "StageResults":
+        """Look for the results that the bundle was made from.
+
+        Args:
+            bundle: the scene.
+            registry_root: its registry; work folders lie beside it unless another was chosen.
+            work_dir: the folder that `simrecon reconstruct --work-dir` was given, if it was.
+        """
+        work = bundle.scene["report"].get("volatile", {}).get("work")
+        if not work:
+            reason = "the bundle does not say which stage results it was made from"
+            return cls({}, {stage.name: reason for stage in STAGES})
+        folder = work_dir or registry_root.parent / "work" / work["input_digest"][:16]
+        keys = {**work["stage_keys"], **_noted_keys(folder, bundle)}
+        folders, missing = {}, {}
+        for number, stage in enumerate(STAGES, start=1):
+            key = keys.get(stage.name)
+            place = folder / f"{number:02d}_{stage.name}-{key}"
+            if key is None and stage.on_demand:
+                continue
+            if key is None:
+                missing[stage.name] = "this scene was made without the stage"
+            elif not (place / _MANIFEST).is_file():
+                missing[stage.name] = f"{place} is gone; reconstruct the scene again to have it"
+            else:
+                folders[stage.name] = place
+        return cls(folders, missing, folder)
+
+    def get(self, stage: str) -> Any | None:
+        """Return a stage's artifact, or None where it is missing."""
+        if stage not in self.folders:
+            return None
+        if stage not in self._loaded:
+            kind = next(s.produces for s in STAGES if s.name == stage)
+            try:
+                self._loaded[stage] = artifacts.load(kind, self.folders[stage])
+            except BundleError as error:
+                self.missing[stage] = f"{error}; reconstruct the scene again to have it"
+                del self.folders[stage]
+                return None
+        return self._loaded[stage]
+
+    def in_world(self) -> tuple[PosedFrames | None, DepthMaps | None]:
+        """Return posed frames and depth maps as measured, in world space, in metres; None for what is missing."""
+        world: WorldFrame | None = self.get("world")
+        posed, depth = self.get("poses"), self.get("depth")
+        if world is None:
+            return None, None
+        return posed and world.apply_to(posed), depth and world.scale_depth(depth)
+
+    def refined_in_world(self) -> tuple[Gaussians | None, DepthMaps | None]:
+        """Return the Gaussians and the depth maps that they corrected, in world space, in metres."""
+        world, scene = self.get("world"), self.get("gaussians")
+        if world is None or scene is None:
+            return None, None
+        return scene.in_world(world), world.scale_depth(scene.depth)
+
+
+def _noted_keys(folder: Path, bundle: SceneBundle) -> dict[str, str]:
+    """Return the stages of the latest run that gave this very bundle, where the work folder knows of it."""
+    try:
+        noted = json.loads((folder / f"published-{bundle.scene['id']}.json").read_text())
+    except (OSError, json.JSONDecodeError):
+        return {}
+    return noted["stage_keys"] if noted.get("revision") == bundle.revision else {}

@@ -1,0 +1,82 @@
+"""A picture of the assembled scene, drawn on the CPU without any graphics driver."""
+
+import cv2
+import numpy as np
+
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import AssembledScene, AssetSet, Camera, PosedFrames, TexturedMesh
+from registry.geometry import transform_points
+
+_BACKGROUND = np.array([236, 238, 241], np.float32)
+
+
+def render_textured(
+    meshes: list[tuple[TexturedMesh, np.ndarray]],
+    camera: Camera,
+    world_from_camera: np.ndarray,
+    supersample: int = 2,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw textured meshes, each with its `world_from_mesh`, unshaded.
+
+    Returns:
+        The picture uint8 (h, w, 3), and float32 (h, w) z-depth with 0 where there is nothing.
+    """
+    big = camera.resized(camera.width * supersample, camera.height * supersample)
+    color = np.broadcast_to(_BACKGROUND, (big.height, big.width, 3)).copy()
+    depth = np.zeros((big.height, big.width), np.float32)
+    for mesh, world_from_mesh in meshes:
+        vertices = transform_points(world_from_mesh, mesh.vertices)
+        raster = rasterize_mesh(vertices, mesh.faces, big, world_from_camera)
+        nearer = (raster.face >= 0) & ((depth == 0) | (raster.depth < depth))
+        if not nearer.any():
+            continue
+        corners = mesh.faces[raster.face[nearer]]
+        uv = np.einsum("nk,nkc->nc", raster.barycentric[nearer], mesh.uvs[corners])
+        rows, columns = mesh.texture.shape[:2]
+        x = np.clip((uv[:, 0] * columns).astype(int), 0, columns - 1)
+        y = np.clip(((1.0 - uv[:, 1]) * rows).astype(int), 0, rows - 1)
+        color[nearer] = mesh.texture[y, x]
+        depth[nearer] = raster.depth[nearer]
+    picture = color.reshape(camera.height, supersample, camera.width, supersample, 3).mean(axis=(1, 3))
+    return picture.round().astype(np.uint8), depth[::supersample, ::supersample]
+
+
+def scene_meshes(assets: AssetSet, assembled: AssembledScene) -> list[tuple[TexturedMesh, np.ndarray]]:
+    """Return every mesh of the assembled scene with its world pose."""
+    pose = {item.id: item.world_from_object for item in assembled.placed}
+    return [(item.visual, np.eye(4)) for item in assets.base] + [
+        (o.visual, pose[o.id]) for o in assets.objects
+    ]
+
+
+def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFrames) -> np.ndarray:
+    """Draw the scene from the keyframe that sees the most of its objects, beside that frame: uint8 (h, 2w, 3)."""
+    camera = posed.camera.resized(640, round(640 * posed.camera.height / posed.camera.width))
+    best = best_view(assembled, posed, camera)
+    picture, _ = render_textured(scene_meshes(assets, assembled), camera, posed.world_from_camera[best])
+    frame = cv2.resize(
+        np.asarray(posed.images[best]), (camera.width, camera.height), interpolation=cv2.INTER_AREA
+    )
+    return np.hstack([frame, picture])
+
+
+def best_view(assembled: AssembledScene, posed: PosedFrames, camera: Camera) -> int:
+    """Return the row of the frame whose image holds the most object centers, the nearest of equals."""
+    centers = np.array([item.world_from_object[:3, 3] for item in assembled.placed]).reshape(-1, 3)
+    scores = []
+    for pose in posed.world_from_camera:
+        local = (centers - pose[:3, 3]) @ pose[:3, :3]
+        z = np.maximum(local[:, 2], 1e-6)
+        u = camera.fx * local[:, 0] / z + camera.cx
+        v = camera.fy * local[:, 1] / z + camera.cy
+        margin = 0.05 * camera.width
+        inside = (
+            (local[:, 2] > 0.1)
+            & (u > margin)
+            & (u < camera.width - margin)
+            & (v > margin)
+            & (v < camera.height - margin)
+        )
+        distance = float(np.linalg.norm(local, axis=1).mean()) if len(local) else 0.0
+        scores.append(inside.sum() - 0.1 * distance)
+    return int(np.argmax(scores)) if scores else 0

@@ -1,0 +1,338 @@
+"""The last step: write the scene bundle (`docs/bundle_format.md`) and publish it in the registry."""
+
+import dataclasses
+import json
+import platform
+import subprocess
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from reconstruction.assembly import base_slabs
+from reconstruction.assets.gltf import write_glb, write_obj
+from reconstruction.assets.physics.load import physics_backend
+from reconstruction.cache import canonical_json
+from reconstruction.core.profiling import Usage, UsageMeter
+from reconstruction.core.types import (
+    AssembledScene,
+    AssetSet,
+    BaseAsset,
+    ObjectAsset,
+    PlacedObject,
+    PosedFrames,
+    WorldFrame,
+)
+from reconstruction.costs import OTHER, PUBLISH
+from reconstruction.gaussians import write_ply
+from reconstruction.instances import backends as instance_backends
+from reconstruction.instances.gaussian_ids import add_instances_to_ply, gaussian_instances
+from reconstruction.publish.instance_views import write_views
+from reconstruction.publish.phrases import Described, phrases
+from reconstruction.publish.preview import render_preview
+from reconstruction.scene_graph import backend_name
+from reconstruction.scene_graph.publishing import graph_of_bundle
+from registry import SceneRecord, SceneRegistry, seal_bundle
+from registry.errors import EnvironmentMissing, SimReconError
+from registry.primitives import primitive_of
+from registry.report_card import failures
+
+if TYPE_CHECKING:
+    from reconstruction.runner import Run
+
+SCHEMA = "simrecon.scene/1"
+_RECORDED_PACKAGES = (
+    "simrecon",
+    "numpy",
+    "pycolmap",
+    "numba",
+    "sapien",
+    "mani-skill",
+    "coacd",
+    "trimesh",
+    "torch",
+)
+
+
+def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require_stable: bool) -> SceneRecord:
+    """Write the bundle of a finished run in the work folder, then publish it atomically.
+
+    Raises:
+        SimReconError: `require_stable`, and an object does not stay put or the report card falls short of something.
+        EnvironmentMissing: the registry cannot be written.
+    """
+    report = run.results["assembly"].physics_report
+    faults = failures(report)
+    if require_stable and faults:
+        raise SimReconError(
+            f"{scene_id}: not published, because it does not rest: {'; '.join(faults)}. Drop or fix these objects with "
+            f"--overrides, or leave out --require-stable."
+        )
+    staging = run.store.scratch("publish")
+    try:
+        with UsageMeter() as meter:
+            scene = write_bundle(run, scene_id, staging)
+        _add_costs(scene["report"], run, meter.usage)
+        seal_bundle(staging, scene)
+        return registry.publish(staging, scene_id)
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"{scene_id}: cannot write its bundle to {registry.root}: {error.strerror or error}. "
+            f"The registry is unchanged and finished stages are kept; free some space and run the same command "
+            f"again."
+        ) from error
+    finally:
+        run.store.discard(staging)
+
+
+def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
+    """Write all files of the bundle but scene.json, and return what goes into that."""
+    assets: AssetSet = run.results["assets"]
+    posed, _ = run.in_world()
+    assembled = run.results["assembly"]
+    placed = {item.id: item for item in assembled.placed}
+    attached = {edge.child for edge in assembled.graph.edges if edge.relation == "attached_to"}
+    scene = {
+        "schema": SCHEMA,
+        "id": scene_id,
+        "source": {**dataclasses.asdict(posed.source), "file": Path(posed.source.file).name},
+        "scale": _scale(run.results["world"]),
+        "world": _world(run.results["world"]),
+        "cameras": _cameras(posed),
+        "base": [_base(item, folder) for item in assets.base],
+        "objects": [_object(item, placed[item.id], item.id in attached, folder) for item in assets.objects],
+        "graph": graph_of_bundle(assembled.graph.edges, run.results["scene_graph"], folder),
+        "gaussians": _gaussians(run, folder),
+        "report": _report(run),
+    }
+    scene["instances"], anchors = write_views(
+        run.results["instances"],
+        [o["id"] for o in scene["objects"]],
+        run.results["frames"],
+        posed,
+        run.lens(),
+        folder,
+    )
+    names = _names(assets, assembled)
+    for item in scene["objects"]:
+        item["name"] = names[item["id"]]
+        if item["id"] in anchors:
+            item["anchor"] = anchors[item["id"]]
+    picture = render_preview(assets, assembled, posed)
+    cv2.imwrite(str(folder / "preview.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    return scene
+
+
+def _names(assets: AssetSet, assembled: AssembledScene) -> dict[int, str]:
+    """Return a unique noun phrase for each object, by id."""
+    parents = {edge.child: edge.parent for edge in assembled.graph.edges}
+    poses = {item.id: item.world_from_object for item in assembled.placed}
+    described = [
+        Described.of(o.id, o.label, o.visual, np.asarray(poses[o.id]), parents[o.id]) for o in assets.objects
+    ]
+    return phrases(described, {item.id: item.label for item in assets.base})
+
+
+def _scale(world: WorldFrame) -> dict:
+    return {
+        "method": world.scale.method,
+        "uncertainty": world.scale.uncertainty,
+        "detail": world.scale.detail,
+    }
+
+
+def _world(world: WorldFrame) -> dict:
+    return {
+        "gravity_method": world.gravity_method,
+        "gravity_sigma_deg": world.gravity_sigma_deg,
+        "floor_observed": world.floor_observed,
+        "yaw_snapped": world.yaw_snapped,
+    }
+
+
+def _cameras(posed: PosedFrames) -> dict:
+    camera = posed.camera
+    indices = np.concatenate([posed.indices, posed.held_out_indices])
+    times = np.concatenate([posed.times_s, posed.held_out_times_s])
+    poses = np.concatenate([posed.world_from_camera, posed.held_out_world_from_camera.reshape(-1, 4, 4)])
+    held_out = np.arange(len(indices)) >= len(posed.indices)
+    frames = [
+        {
+            "index": int(indices[i]),
+            "time_s": float(times[i]),
+            "world_from_camera": poses[i].tolist(),
+            "held_out": bool(held_out[i]),
+        }
+        for i in np.argsort(indices, kind="stable")
+    ]
+    return {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "frames": frames,
+    }
+
+
+def _gaussians(run: "Run", folder: Path) -> dict:
+    gaussians = run.results["gaussians"].in_world(run.results["world"])
+    write_ply(gaussians, folder / "gaussians.ply")
+    found, kept = run.results["instances"], run.results["assets"]
+    published = [item.id for item in (*kept.base, *kept.objects)]
+    labels = np.where(np.isin(found.vertex_instance, published), found.vertex_instance, 0)
+    instances = gaussian_instances(gaussians.means, run.results["surface"].vertices, labels)
+    add_instances_to_ply(folder / "gaussians.ply", instances)
+    return {"file": "gaussians.ply", "count": len(gaussians)}
+
+
+def _base(item: BaseAsset, folder: Path) -> dict:
+    (folder / "base").mkdir(exist_ok=True)
+    mesh = f"base/{item.id:03d}_{item.label}.glb"
+    write_glb(item.visual, folder / mesh)
+    collision = []
+    for number, part in enumerate(base_slabs(item)):
+        collision.append(f"base/{item.id:03d}_collision_{number:03d}.obj")
+        write_obj(part, folder / collision[-1])
+    return {
+        "id": item.id,
+        "label": item.label,
+        "mesh": mesh,
+        "plane": [float(x) for x in item.plane],
+        "observed": item.observed,
+        "collision": collision,
+    }
+
+
+def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Path) -> dict:
+    home = Path("objects") / f"{item.id:03d}"
+    (folder / home).mkdir(parents=True)
+    write_glb(item.visual, folder / home / "visual.glb")
+    collision, primitives = [], []
+    for number, part in enumerate(item.collision if placed.collision is None else placed.collision):
+        collision.append(str(home / f"collision_{number:03d}.obj"))
+        write_obj(part, folder / collision[-1])
+        primitive = primitive_of(part.vertices)
+        primitives.append(None if primitive is None else primitive.as_json())
+    extents = item.visual.vertices.max(axis=0) - item.visual.vertices.min(axis=0)
+    physics = item.physics
+    return {
+        "id": item.id,
+        "label": item.label,
+        "label_confidence": float(item.label_confidence),
+        "world_from_object": placed.world_from_object.tolist(),
+        "scale": [float(x) for x in extents],
+        "visual": str(home / "visual.glb"),
+        "collision": collision,
+        "collision_primitives": primitives,
+        "material": physics.material,
+        "density_kg_m3": float(physics.density_kg_m3),
+        "mass_kg": float(physics.mass_kg),
+        "center_of_mass": [float(x) for x in physics.center_of_mass],
+        "inertia": [[float(x) for x in row] for row in physics.inertia],
+        "friction": float(physics.friction),
+        "restitution": float(physics.restitution),
+        "ranges": {name: list(span) for name, span in dataclasses.asdict(physics.ranges).items()},
+        "dynamic": bool(placed.dynamic),
+        "relation_fixed": attached,
+        "provenance": dataclasses.asdict(item.provenance),
+        "views": [int(x) for x in item.views],
+        "assembly": {
+            "moved_m": float(placed.moved_m),
+            "turned_deg": float(placed.turned_deg),
+            "repair": placed.repair,
+            "stable": bool(placed.stable),
+        },
+    }
+
+
+def _add_costs(report: dict, run: "Run", publishing: Usage) -> None:
+    """Add what is spent outside the stages, so that the times of an uncached run sum up to its wall time."""
+    in_stages = sum(run.usage[name].wall_s for name in run.computed if name in run.usage)
+    elapsed = time.perf_counter() - run.started
+    report["timings_s"] |= {
+        PUBLISH: round(publishing.wall_s, 3),
+        OTHER: round(max(0.0, elapsed - in_stages - publishing.wall_s), 3),
+    }
+    report["peak_memory_mb"] = round(max(report["peak_memory_mb"], publishing.peak_memory_mb), 1)
+    volatile = report["volatile"]
+    volatile["cpu_s"][PUBLISH] = round(publishing.cpu_s, 3)
+    volatile["stage_peak_memory_mb"][PUBLISH] = round(publishing.peak_memory_mb, 1)
+    volatile["cached"] = [name for name in run.usage if name not in run.computed]
+
+
+def _report(run: "Run") -> dict:
+    timings = {name: round(usage.wall_s, 3) for name, usage in run.usage.items()}
+    posed: PosedFrames = run.results["poses"]
+    return {
+        "physics": run.results["assembly"].physics_report,
+        "timings_s": timings,
+        "peak_memory_mb": round(max(usage.peak_memory_mb for usage in run.usage.values()), 1),
+        "volatile": {
+            "cpu_s": {name: round(usage.cpu_s, 3) for name, usage in run.usage.items()},
+            "stage_peak_memory_mb": {
+                name: round(usage.peak_memory_mb, 1) for name, usage in run.usage.items()
+            },
+            "machine": f"{platform.machine()} {platform.system()}",
+            "versions": _versions(),
+            "commit": _commit(),
+            # Where `simrecon evaluate` and `report` find what the stages made, while the work folder is kept.
+            "work": {"input_digest": run.input_digest, "stage_keys": dict(run.keys)},
+        },
+        "backends": _backends(run),
+        "config": json.loads(canonical_json(run.config)),
+        "overrides": run.overrides.entries,
+        "notes": run.notes,
+        "registration": {
+            "keyframes": posed.chosen_frames,
+            "registered": len(posed.images),
+            "reprojection_error_px": float(posed.reprojection_error_px),
+        },
+    }
+
+
+def _backends(run: "Run") -> dict[str, str]:
+    """Say what computed each stage; a stage that the truth stood in for says so."""
+    backends = {
+        "poses": "pycolmap",
+        "depth": "plane-sweep",
+        "gaussians": run.config.gaussians.backend,
+        **instance_backends(run.config.instances),
+        "assets": _completion(run.config.assets.generator),
+        "physics": physics_backend(run.config.assets),
+        "relations": backend_name(run.config.scene_graph),
+    }
+    if "views" in run.keys:
+        backends["views"] = run.config.avo.strategy
+    if run.oracle is not None:
+        if "instances" in run.oracle.stages:
+            del backends["masks"], backends["labels"]
+        backends |= dict.fromkeys(run.oracle.stages, "ground-truth")
+    return backends
+
+
+def _completion(generator: str) -> str:
+    return "embedded" if generator == "none" else f"{generator}, embedded where it is rejected"
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _RECORDED_PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _commit() -> str:
+    """Return the commit of a source checkout, or an empty string for an installed wheel."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return ""
+    done = subprocess.run(
+        ["git", "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    )
+    return done.stdout.strip() if done.returncode == 0 else ""

@@ -1,0 +1,43 @@
+"""The stage `views`: views of every thing that a generator, a vision-language model or a person is shown."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.types import InstanceSet
+from reconstruction.views.config import AvoConfig
+from reconstruction.views.find import TargetViews, find_views
+from reconstruction.views.pictures import View
+
+if TYPE_CHECKING:
+    from reconstruction.views.scene import ViewScene
+
+
+@dataclass(frozen=True)
+class SceneViews:
+    """What the stage makes: the views of each thing, in the order of `InstanceSet.objects`."""
+
+    strategy: str
+    targets: tuple[TargetViews, ...]
+
+    def of(self, number: int) -> tuple[View, ...]:
+        """Return the views of a thing by its id, the most informative first; none where nothing of it can be seen."""
+        return next((target.views for target in self.targets if target.ids == (number,)), ())
+
+
+def make_views(
+    scene: "ViewScene", instances: InstanceSet, config: AvoConfig, *, progress: Progress = NO_PROGRESS
+) -> SceneViews:
+    """Choose and draw the views of every thing.
+
+    Args:
+        scene: of `prepare_scene`, in world space, metres.
+        instances: the things.
+        config: how views are chosen.
+        progress: told of things, and of those that cannot be seen.
+
+    Raises:
+        UsageError: an unknown strategy or inpainter.
+    """
+    found = find_views(scene, [item.id for item in instances.objects], config, progress=progress)
+    return SceneViews(config.strategy, tuple(found))
