@@ -68,6 +68,35 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """Return fx, fy, cx, cy as float64 (4,), as compiled kernels take them."""
+        return np.array([self.fx, self.fy, self.cx, self.cy], np.float64)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project points (..., 3) of the camera's frame; return columns and rows (...), in pixels.
+
+        Points need z > 0; others project to what the formula gives, without a check.
+        """
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
+        return self.fx * x / z + self.cx, self.fy * y / z + self.cy
+
+    def unproject(self, columns: np.ndarray, rows: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return the points (..., 3) of the camera's frame at pixels, in the units of `z`.
+
+        Args:
+            columns: pixel coordinates, the centre of the first pixel is 0.5.
+            rows: the same.
+            z: depth along the optical axis, 1 for rays.
+        """
+        x, y = (columns - self.cx) / self.fx * z, (rows - self.cy) / self.fy * z
+        return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
+
+    def pixel_rays(self) -> np.ndarray:
+        """Return the rays float64 (height, width, 3) through the centres of all pixels, z = 1."""
+        columns, rows = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
+        return self.unproject(columns[None, :], rows[:, None], np.ones((self.height, self.width)))
+
 
 @dataclass(frozen=True)
 class PosedFrames:
