@@ -165,8 +165,8 @@ def _measure_costs(
     import cv2
 
     from reconstruction.depth.aggregation import bin_costs, smoothed_scores
-    from reconstruction.depth.estimate import sweep_frame, winner_of
     from reconstruction.depth.images import gray_images, sized_camera
+    from reconstruction.depth.measure import sweep_frame, winner_of
     from reconstruction.depth.views import plan_views
 
     small = sized_camera(posed.camera, config.sweep_side_px)

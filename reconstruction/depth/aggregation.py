@@ -1,6 +1,6 @@
-"""Learned aggregation of a cost volume: costs and picture of a keyframe -> inverse depth, and how sure it is.
+"""Learned cost aggregation: matching costs and picture of a keyframe -> inverse depth and its probability.
 
-The network and what it was trained on: docs/priors.md. Weights ship with the project.
+Weights ship with the project; docs/priors.md has the network and its data.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from reconstruction.depth.channels import BINS, PLANES
 
 WEIGHTS = Path(__file__).parent / "weights" / "aggregation.safetensors"
-_HOPELESS = 508.0  # sum of eight path costs behind the winner from which a bin has no chance
+_HOPELESS = 508.0  # bins whose aggregated cost exceeds the winner's by this much score 0
 
 
 def bin_costs(cost: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Candidate depths of a pixel: its own, and those of surfaces nearby, extended to it as planes."""
+"""Candidate depths of each pixel: its own, and planes of nearby surfaces extended to it."""
 
 import numba
 import numpy as np
@@ -18,7 +18,7 @@ OFFSETS = np.array(
 """(k, 2) rows and columns from a pixel to the pixels whose surfaces it may lie on; the first is itself."""
 SPREAD = np.float32(0.02)
 """Relative difference of depths at which a candidate has half a say in another one's probability."""
-_KEPT = np.float32(0.9)  # share of the mode's probability from which a pixel keeps its own depth
+_KEPT = np.float32(0.9)  # a pixel keeps its own depth from this share of the mode's probability on
 _NO_MODE = np.float32(0.01)  # candidates less probable than this are no mode
 _JUMP = np.float32(
     0.012

@@ -1,23 +1,23 @@
-"""Completion: fill what could not be measured with planes that the surroundings support, and small gaps.
+"""Plane completion: measured depth maps -> maps whose textureless regions lie on planes of the scene.
 
-Every view chooses, for each pixel, one of the scene's planes or none. Measured pixels vote for the plane that they
-lie on; labels spread along the image where it shows no edge (the aggregation of `sgm`, with labels in place of
-depths); and other views object where they looked through the plane. A fill must be anchored in measured pixels.
+Every pixel of a view gets one of the scene's planes as its label, or none (piecewise planar stereo). Measured pixels
+vote for the plane that they lie on. Labels spread where the image has no edge, by the aggregation of `sgm` with a
+Potts model. Views that look through a plane raise its cost. A labelled piece needs enough measured pixels in it.
 """
 
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
-from reconstruction.core.progress import Progress
-from reconstruction.core.types import Camera, PosedFrames
-from reconstruction.depth.config import DepthConfig
-from reconstruction.depth.views import ViewPlan
-from registry.geometry import invert_rigid
+from reconstruction.core.types import Camera
+from reconstruction.depth.scene import DepthScene
 
 _MAX_LABELS = 20
-_RIM_SHARE = 0.15  # of a blank region's rim that has to lie on one plane: much is skirts of what stands there
-_LIMITS = (66, 16)
+_RIM_SHARE = (
+    0.15  # least share of a blank region's rim on one plane; the rest is mostly fattened edges of objects
+)
+_PASSES = ((66, True), (16, False))  # greatest cost of a label, and whether the rim of a blank region votes
+_OBJECTING_VIEWS = 8  # neighbors that are asked whether they look through a plane
 
 
 def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarray:
@@ -36,10 +36,10 @@ def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarra
 
 
 def _fill_regions(label: np.ndarray, cost: np.ndarray, measured: np.ndarray, color: np.ndarray) -> None:
-    """Give blank regions that no label reached the plane that the measured pixels around them lie on, in place.
+    """Label blank regions that no label reached by a vote of the measured pixels on their rim; writes `label`.
 
-    The spreading of labels dies where wrong depth surrounds a blank surface, as around things on a plain table. Here
-    the whole rim of a region votes, pixels of the region's own colour first, and the vote must be clear.
+    Labels do not spread across wrong depth, such as the fattened edges of objects on a plain table. Votes are weighted
+    by similarity of color; a region is labelled where one plane wins clearly.
     """
     import cv2
 
@@ -78,10 +78,10 @@ def _fill_regions(label: np.ndarray, cost: np.ndarray, measured: np.ndarray, col
 
 
 def _crooked(planes: np.ndarray) -> np.ndarray:
-    """Return 1.0 for each plane that is neither parallel nor square to the room's main direction, else 0.0.
+    """Return 1.0 for each plane that is neither parallel nor perpendicular to the main direction, else 0.0.
 
-    That is the direction to which most planes are parallel or square: the vertical, in a room. Shells that wrong
-    matches of blank surfaces leave behind face the cameras and are crooked.
+    The main direction is the one that most planes are parallel or perpendicular to: the vertical, in a room. Wrong
+    matches on blank surfaces make oblique planes that face the cameras.
     """
     if len(planes) == 0:
         return np.zeros(0)
@@ -109,126 +109,159 @@ def _view_planes(
     return order, np.ascontiguousarray(local[order])
 
 
-def complete_depth(
-    posed: PosedFrames, camera: Camera, plan: ViewPlan, depth: np.ndarray, raw: np.ndarray, config: DepthConfig,
-    each: Callable, progress: Progress,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return completed depth and confidence (n, h, w): 2 measured, 1 completed, 0 unknown."""
-    import cv2
+def complete_depth(scene: DepthScene, depth: np.ndarray, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fill unmeasured pixels of all views with planes of the scene; return depth and confidence (n, h, w).
 
-    from reconstruction.depth.blank_walls import fill_walls
-    from reconstruction.depth.fill_kernels import (
-        choose_labels,
-        confirm_fill,
-        exposure_gains,
-        fill_small_gaps,
-        label_costs,
-    )
-    from reconstruction.depth.planes import find_planes, oriented_points, plane_extents
-    from reconstruction.depth.refine import fit_slopes
-    from reconstruction.depth.sgm import aggregate
+    Two passes: the second one sees what the first one filled, and accepts a plane only where two other views see it.
 
-    n, h, w = depth.shape
-    scale = min(1.0, config.sweep_side_px / max(w, h))
-    small = camera.resized(round(w * scale), round(h * scale))
-    size = (small.width, small.height)
-    gapless = np.empty_like(depth)
-    maps = np.empty((n, small.height, small.width), np.float32)
-    tones = np.empty((n, small.height, small.width, 3), np.uint8)
-    clouds: list[tuple] = [()] * n
+    Args:
+        scene: keyframes with their plan.
+        depth: float32 (n, h, w) measured depth, 0 = unknown.
+        raw: float32 (n, h, w) depth before views were compared, a weak hint.
 
-    def prepare(i: int) -> None:
-        fill_small_gaps(depth[i], gapless[i])
-        rho = np.where(depth[i] > 0, 1.0 / np.maximum(depth[i], 1e-12), 0).astype(np.float32)
-        smooth, gx, gy = (np.empty((h, w), np.float32) for _ in range(3))
+    Returns:
+        Depth float32, and confidence uint8: 2 measured, 1 completed, 0 unknown.
+    """
+    views = _Views(scene, depth)
+    scene.each(views.prepare, "looking for planes")
+    views.find_planes()
+    scene.progress.note(f"depth: {len(views.planes)} planes support the completion")
+    for limit, by_rim in _PASSES:
+        scene.each(partial(views.complete, raw=raw, limit=limit, by_rim=by_rim), "completing planes")
+        filled, trust = views.out.copy(), views.confidence.copy()
+        scene.each(partial(views.confirm, filled=filled, trust=trust), "confirming planes")
+        views.update_maps()
+    return views.out, views.confidence
+
+
+class _Views:
+    """All views of a scene while their unmeasured pixels are filled with planes."""
+
+    def __init__(self, scene: DepthScene, depth: np.ndarray) -> None:
+        n, h, w = depth.shape
+        scale = min(1.0, scene.config.sweep_side_px / max(w, h))
+        self.scene, self.posed, self.camera, self.plan = scene, scene.posed, scene.camera, scene.plan
+        self.depth = depth
+        self.small = self.camera.resized(
+            round(w * scale), round(h * scale)
+        )  # labels are chosen at this resolution
+        small = (self.small.height, self.small.width)
+        self.gapless = np.empty_like(depth)  # measured depth with small gaps filled
+        self.maps = np.empty((n, *small), np.float32)  # known depth at the small resolution
+        self.tones = np.empty((n, *small, 3), np.uint8)  # smoothed colors
+        self.clouds: list[tuple[np.ndarray, ...]] = [()] * n  # points, normals, depths
+        self.planes, self.bounds, self.doubt = np.zeros((0, 4)), np.zeros((0, 16, 4)), np.zeros(0)
+        self.out, self.confidence = depth, np.zeros(depth.shape, np.uint8)
+
+    def prepare(self, i: int) -> None:
+        """Fill small gaps of a view, and sample its oriented points, depth and colors."""
+        import cv2
+
+        from reconstruction.depth.fill_kernels import fill_small_gaps
+        from reconstruction.depth.planes import oriented_points
+        from reconstruction.depth.refine import fit_slopes
+
+        depth, size = self.depth[i], (self.small.width, self.small.height)
+        fill_small_gaps(depth, self.gapless[i])
+        rho = np.where(depth > 0, 1.0 / np.maximum(depth, 1e-12), 0).astype(np.float32)
+        smooth, gx, gy = (np.empty(depth.shape, np.float32) for _ in range(3))
         fit_slopes(rho, 0.01, smooth, gx, gy)
-        clouds[i] = oriented_points(depth[i], gx, gy, camera, posed.world_from_camera[i])
-        maps[i] = cv2.resize(depth[i], size, interpolation=cv2.INTER_NEAREST)
-        color = cv2.resize(np.ascontiguousarray(posed.images[i]), size, interpolation=cv2.INTER_AREA)
-        tones[i] = cv2.GaussianBlur(color, (0, 0), 1.0)
+        self.clouds[i] = oriented_points(depth, gx, gy, self.camera, self.posed.world_from_camera[i])
+        self.maps[i] = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+        self.tones[i] = cv2.GaussianBlur(self._color(i), (0, 0), 1.0)
 
-    each(n, prepare, "looking for planes", progress)
-    points, normals, depths = (np.concatenate([c[a] for c in clouds]) for a in range(3))
-    planes = find_planes(points, normals, depths, tolerance=0.006, max_planes=48, seed=config.seed)
-    progress.note(f"depth: {len(planes)} planes support the completion")
-    bounds = plane_extents(planes, points, normals, depths, tolerance=0.006)
-    doubt = 14.0 * _crooked(planes)
-    out, confidence = gapless.copy(), np.where(depth > 0, 2, np.where(gapless > 0, 1, 0)).astype(np.uint8)
-    k = np.array([small.fx, small.fy, small.cx, small.cy])
+    def find_planes(self) -> None:
+        """Find the planes of the scene in the points of all views, with their extents."""
+        from reconstruction.depth.planes import find_planes, plane_extents
 
-    def complete(i: int) -> None:
-        chosen, local = _view_planes(planes, posed.world_from_camera[i], maps[i], small)
+        points, normals, depths = (np.concatenate([c[a] for c in self.clouds]) for a in range(3))
+        self.planes = find_planes(
+            points, normals, depths, tolerance=0.006, max_planes=48, seed=self.scene.config.seed
+        )
+        self.bounds = plane_extents(self.planes, points, normals, depths, tolerance=0.006)
+        self.doubt = 14.0 * _crooked(self.planes)
+        self.out = self.gapless.copy()
+        self.confidence = np.where(self.depth > 0, 2, np.where(self.gapless > 0, 1, 0)).astype(np.uint8)
+
+    def complete(self, i: int, raw: np.ndarray, limit: int, by_rim: bool) -> None:
+        """Choose a plane, or none, for every unknown pixel of a view, and write its depth."""
+        import cv2
+
+        chosen, local = _view_planes(self.planes, self.posed.world_from_camera[i], self.maps[i], self.small)
         if len(local) == 0:
             return
-        rows = plan.neighbors[i][:8]
-        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
-        hint = cv2.resize(raw[i], size, interpolation=cv2.INTER_NEAREST)
-        cost = np.empty((small.height, small.width, len(local) + 1), np.uint8)
-        here = bounds[chosen] @ posed.world_from_camera[i]
-        near, far = plan.near[i] * 0.8, plan.far[i]
-        gains = np.ones(len(rows))
-        exposure_gains(maps[i], tones[i], rows, relative, maps, tones, k, gains)
-        label_costs(
-            maps[i],
-            hint,
-            local,
-            here,
-            doubt[chosen],
-            tones[i],
-            rows,
-            relative,
-            maps,
-            tones,
-            gains,
-            k,
-            near,
-            far,
-            cost,
-        )
-        gray = cv2.cvtColor(np.ascontiguousarray(posed.images[i]), cv2.COLOR_RGB2GRAY)
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        total = np.zeros(cost.shape, np.uint16)
-        aggregate(cost, gray, np.int32(20000), np.int32(260), np.int32(12), 3.0, total)
-        label = np.empty((small.height, small.width), np.int32)
-        choose_labels(total, cost, maps[i], limit, label)
-        label[~_anchored(label, maps[i] > 0, 40)] = -1
-        color = cv2.resize(np.ascontiguousarray(posed.images[i]), size, interpolation=cv2.INTER_AREA)
-        if limit == _LIMITS[0]:
-            _fill_regions(label, cost, maps[i] > 0, color.astype(np.float32))
-        label = cv2.resize(label.astype(np.int16), (w, h), interpolation=cv2.INTER_NEAREST)
-        y, x = np.nonzero((label >= 0) & (out[i] == 0))
-        rays = np.stack(
-            [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))], 1
-        )
+        cost = self._costs(i, chosen, local, raw[i])
+        label = self._labels(i, cost, limit)
+        if by_rim:
+            _fill_regions(label, cost, self.maps[i] > 0, self._color(i).astype(np.float32))
+        size = (self.camera.width, self.camera.height)
+        label = cv2.resize(label.astype(np.int16), size, interpolation=cv2.INTER_NEAREST)
+        y, x = np.nonzero((label >= 0) & (self.out[i] == 0))
+        rays = self.camera.unproject(x + 0.5, y + 0.5, np.ones(len(x)))
         plane = local[label[y, x]]
         z = -plane[:, 3] / np.einsum("ij,ij->i", plane[:, :3], rays)
         good = np.isfinite(z) & (z > 0)
-        out[i, y[good], x[good]] = z[good]
-        confidence[i, y[good], x[good]] = 1
+        self.out[i, y[good], x[good]] = z[good]
+        self.confidence[i, y[good], x[good]] = 1
 
-    fine = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    def confirm(self, i: int, filled: np.ndarray, trust: np.ndarray) -> None:
+        """Drop completed pixels of a view that other views do not see, or look through."""
+        from reconstruction.depth.fill_kernels import confirm_fill
 
-    def confirm(i: int) -> None:
-        rows = plan.neighbors[i]
-        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
-        keep = np.zeros((h, w), bool)
-        confirm_fill(i, rows, filled, trust, relative, fine, keep)
-        drop = (trust[i] == 1) & ~keep & (gapless[i] == 0)
-        out[i][drop] = 0
-        confidence[i][drop] = 0
+        rows, relative = self.scene.neighbors(i)
+        keep = np.zeros(filled.shape[1:], bool)
+        confirm_fill(i, rows, filled, trust, relative, self.camera.intrinsics, keep)
+        drop = (trust[i] == 1) & ~keep & (self.gapless[i] == 0)
+        self.out[i][drop] = 0
+        self.confidence[i][drop] = 0
 
-    for limit in _LIMITS:
-        each(n, complete, "completing planes", progress)
-        if limit == _LIMITS[0]:
-            for i in range(n):
-                maps[i] = cv2.resize(out[i], size, interpolation=cv2.INTER_NEAREST)
-            walls, extents = fill_walls(posed, small, maps, tones, planes, plan, out, confidence)
-            planes, bounds = np.concatenate([planes, walls]), np.concatenate([bounds, extents])
-            doubt = np.concatenate([doubt, np.zeros(len(walls))])
-            progress.note(f"depth: {len(walls)} blank planes stand on lines in measured ones")
-        filled, trust = out.copy(), confidence.copy()
-        each(n, confirm, "confirming planes", progress)
-        # What was filled and confirmed speaks to the views that could not decide.
-        for i in range(n):
-            maps[i] = cv2.resize(out[i], size, interpolation=cv2.INTER_NEAREST)
-    return out, confidence
+    def update_maps(self) -> None:
+        """Let later passes see what was filled and confirmed."""
+        import cv2
+
+        size = (self.small.width, self.small.height)
+        for i in range(len(self.maps)):
+            self.maps[i] = cv2.resize(self.out[i], size, interpolation=cv2.INTER_NEAREST)
+
+    def _costs(self, i: int, chosen: np.ndarray, local: np.ndarray, raw: np.ndarray) -> np.ndarray:
+        """Return the costs uint8 (h, w, labels + 1) of the planes `local` of a view and of "none"."""
+        import cv2
+
+        from reconstruction.depth.fill_kernels import exposure_gains, label_costs
+
+        rows, relative = (values[:_OBJECTING_VIEWS] for values in self.scene.neighbors(i))
+        k = self.small.intrinsics
+        hint = cv2.resize(raw, (self.small.width, self.small.height), interpolation=cv2.INTER_NEAREST)
+        cost = np.empty((self.small.height, self.small.width, len(local) + 1), np.uint8)
+        here = self.bounds[chosen] @ self.posed.world_from_camera[i]
+        gains = np.ones(len(rows))
+        exposure_gains(self.maps[i], self.tones[i], rows, relative, self.maps, self.tones, k, gains)
+        label_costs(
+            self.maps[i], hint, local, here, self.doubt[chosen], self.tones[i], rows, relative, self.maps, self.tones,
+            gains, k, self.plan.near[i] * 0.8, self.plan.far[i], cost,
+        )  # fmt: skip
+        return cost
+
+    def _labels(self, i: int, cost: np.ndarray, limit: int) -> np.ndarray:
+        """Return the plane int32 (h, w) of each pixel, -1 = none: labels that spread from measured pixels."""
+        import cv2
+
+        from reconstruction.depth.fill_kernels import choose_labels
+        from reconstruction.depth.sgm import aggregate
+
+        gray = cv2.cvtColor(np.ascontiguousarray(self.posed.images[i]), cv2.COLOR_RGB2GRAY)
+        size = (self.small.width, self.small.height)
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        total = np.zeros(cost.shape, np.uint16)
+        aggregate(cost, gray, np.int32(20000), np.int32(260), np.int32(12), 3.0, total)
+        label = np.empty(cost.shape[:2], np.int32)
+        choose_labels(total, cost, self.maps[i], limit, label)
+        label[~_anchored(label, self.maps[i] > 0, 40)] = -1
+        return label
+
+    def _color(self, i: int) -> np.ndarray:
+        """Return the picture uint8 (h, w, 3) of a view at the small resolution."""
+        import cv2
+
+        size = (self.small.width, self.small.height)
+        return cv2.resize(np.ascontiguousarray(self.posed.images[i]), size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""Agreement of depth maps between views: who supports a pixel, and what all supporters say together."""
+"""Compiled kernels for consistency between depth maps: agreeing views, free space violations, speckles."""
 
 import math
 
@@ -27,13 +27,13 @@ def _sample(depth, u, v, tolerance):  # pragma: no cover - compiled
 def check_view(
     i, neighbors, depth, weight, relative, k, agree_depth, agree_px, count, fused
 ):  # pragma: no cover
-    """Count per pixel of view i the neighbours that agree, and average what they say of its depth.
+    """Count the neighbors that agree with each pixel of view i (forward-backward reprojection), and fuse their depth.
 
     Args:
         i: Row of the view in `depth`.
         neighbors: (k,) rows, -1 = none.
         depth: (n, h, w).
-        weight: (n, h, w) how much a pixel's word counts in the average.
+        weight: (n, h, w) of each pixel in the mean.
         relative: (k, 4, 4) neighbour_from_view.
         k: fx, fy, cx, cy.
         agree_depth: Relative depth difference allowed.
@@ -91,7 +91,7 @@ def check_view(
 def count_witnesses(
     i, neighbors, depth, mask, relative, k, beyond, same, agree, through
 ):  # pragma: no cover - compiled
-    """Count per masked pixel of view i the neighbors that see the same point, and those that look through it.
+    """Count the neighbors that see the same point as each masked pixel of view i, and those that look through it.
 
     Args:
         i: Row of the view in `depth`.

@@ -1,4 +1,4 @@
-"""Put depth edges where the image has its edges: windows that straddle an edge drag depth across it."""
+"""Compiled kernel that moves depth edges to image edges by a vote of pixels of the same color."""
 
 import numba
 import numpy as np
@@ -26,19 +26,19 @@ def _near_jump(rho, y, x, jump):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compiled
-    """Let pixels near a depth jump choose among the surfaces around them: the one that pixels of their colour are on.
+    """Reassign pixels beside depth jumps to the surface that most nearby pixels of their color lie on.
 
     Args:
         rho: (h, w) inverse depth.
         gx: (h, w) its slope along x.
         gy: (h, w) its slope along y.
-        score: (h, w) correlation; what correlates better has more say.
+        score: (h, w) correlation, the weight of a vote.
         color: float32 (h, w, 3).
         out: (h, w), written.
     """
     h, w = rho.shape
     far = _REACH + 2
-    # Pixels beside a jump are the ones in doubt: they have little say about each other.
+    # Pixels beside a jump are in doubt; their votes count a quarter.
     doubt = np.empty((h, w), np.bool_)
     for y in range(h):
         for x in range(w):

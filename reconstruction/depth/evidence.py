@@ -1,4 +1,4 @@
-"""Depth maps with the origin of every pixel's depth, the mending network's input; counts of views that agree."""
+"""Depth maps with the origin of each pixel's depth (the mending network's input), and counts of agreeing views."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,9 +25,7 @@ class Evidence:
     origin: np.ndarray  # uint8 (n, h, w) of `depth`
     correlation: np.ndarray  # float32 (n, h, w) of the windows' refinement, -1 = none
     surety: np.ndarray  # float32 (n, h, w) of the learned aggregation, empty without it
-    agreed: (
-        np.ndarray
-    )  # float32 (n, h, w) depth before completion, 0 = unknown; empty where nobody asked for it
+    agreed: np.ndarray  # float32 (n, h, w) depth before completion, 0 = unknown; empty unless asked for
     affinity: np.ndarray | None = None  # as `DepthMaps.affinity`, once mended
 
     def maps(self) -> DepthMaps:
@@ -63,14 +61,15 @@ def count_views(
     """
     from reconstruction.depth.consistency import count_witnesses
 
-    k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     agree, through = np.zeros(depth.shape, np.uint8), np.zeros(depth.shape, np.uint8)
 
     def work(i: int) -> None:
         rows = neighbors[i]
         relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
         asked = depth[i] > 0 if mask is None else mask[i]
-        count_witnesses(i, rows, depth, asked, relative, k, _BEYOND, _SAME, agree[i], through[i])
+        count_witnesses(
+            i, rows, depth, asked, relative, camera.intrinsics, _BEYOND, _SAME, agree[i], through[i]
+        )
 
     each(len(depth), work, "counting views", progress)
     return agree, through

@@ -1,4 +1,4 @@
-"""Kernels of the completion: what a plane costs at a pixel, the choice, and what other views say of it."""
+"""Compiled kernels of the plane completion: label costs, choice of labels, and confirmation by other views."""
 
 import numba
 import numpy as np
@@ -6,7 +6,7 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def fill_small_gaps(depth, out):  # pragma: no cover - compiled
-    """Fill pixels that measured ones of a single surface surround (5x5, both sides) with the plane through them."""
+    """Fill pixels that are surrounded by measured ones of one surface (5x5 window) with the plane through these."""
     h, w = depth.shape
     for y in range(h):
         for x in range(w):
@@ -53,7 +53,7 @@ def _differ(a, b, gain):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def exposure_gains(depth, tone, neighbors, relative, maps, tones, k, gains):  # pragma: no cover - compiled
-    """Write to gains (m,) the brightness of a view over that of each neighbor, by points that both measured."""
+    """Write the ratio of brightness of a view to each neighbor, over points that both measured, to gains (m,)."""
     h, w = depth.shape
     fx, fy, cx, cy = k
     for s in range(len(neighbors)):
@@ -90,17 +90,17 @@ def exposure_gains(depth, tone, neighbors, relative, maps, tones, k, gains):  # 
 def label_costs(
     depth, raw, planes, bounds, doubt, tone, neighbors, relative, maps, tones, gains, k, near, far, cost
 ):  # pragma: no cover - compiled
-    """Fill cost (h, w, labels + 1): how badly each plane suits a pixel; the last label is "no plane".
+    """Write the cost (h, w, labels + 1) of each plane at each pixel; the last label is "no plane".
 
-    Where another view sees the same point of the plane, it must show the same color: a floor goes on beneath a
-    table, and views from the side see it there, but what this view shows is the table.
+    A plane costs more where another view looks through it, or shows another color at the same point of it (the plane
+    is occluded in one of the two views).
 
     Args:
         depth: (h, w) measured depth, 0 = none.
-        raw: (h, w) depth before it was checked: a weak hint.
+        raw: (h, w) depth before views were compared, a weak hint.
         planes: (labels, 4) in this camera's space: inverse depth = -(n . r) / d.
         bounds: (labels, sides, 4) within which each plane was measured, in this camera's space.
-        doubt: (labels,) what filling with a plane costs more, because few things in a room lie like it.
+        doubt: (labels,) extra cost of oblique planes.
         tone: uint8 (h, w, 3) smoothed colors of this view.
         neighbors: (m,) rows of `maps`, -1 = none.
         relative: (m, 4, 4) neighbour_from_view.
@@ -169,7 +169,7 @@ def label_costs(
 
 @numba.njit(cache=True, nogil=True)
 def choose_labels(total, cost, depth, limit, label):  # pragma: no cover - compiled
-    """Write the cheapest label, or -1 where it is "none" or where another view objects to it."""
+    """Write the cheapest label of each pixel, or -1 where it is "none" or costs more than `limit`."""
     h, w, n = total.shape
     for y in range(h):
         for x in range(w):
@@ -184,10 +184,9 @@ def choose_labels(total, cost, depth, limit, label):  # pragma: no cover - compi
 
 @numba.njit(cache=True, nogil=True)
 def confirm_fill(i, neighbors, depth, confidence, relative, k, keep):  # pragma: no cover - compiled
-    """Mark in keep (h, w) the completed pixels of view i that the completed maps of other views bear out.
+    """Mark in keep (h, w) the completed pixels of view i that at least two other completed maps agree with.
 
-    The planes are the scene's, so right fills meet in space; what was filled with the wrong one differs from view to
-    view, or other views look through it.
+    More views have to agree than look through the point. Planes belong to the scene, so that right fills coincide.
     """
     h, w = depth.shape[1:]
     fx, fy, cx, cy = k

@@ -1,8 +1,8 @@
-"""Mending of finished depth maps: maps with the origin of every pixel's depth -> maps that end where things end.
+"""Depth refinement at occlusion boundaries by a network: depth maps with origins -> maps that end where objects end.
 
-A network classifies every pixel: it lies on one of the surfaces around it, or on none of them (displacement of
-depth at occlusion borders: Ramamonjisoa et al., CVPR 2020, as a choice among plane hypotheses of neighbors). What it
-was trained on: docs/priors.md. Weights ship with the project.
+The network classifies every pixel: it lies on one of the surfaces around it, or on none (displacement fields at
+occlusion boundaries, Ramamonjisoa et al., CVPR 2020, as a choice among plane hypotheses). Weights ship with the
+project; docs/priors.md has their data.
 """
 
 import math

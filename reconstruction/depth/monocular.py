@@ -1,22 +1,19 @@
-"""Learned depth for what nothing else reaches: predicted from single images, fitted to what was measured.
+"""Monocular depth of single images, aligned to measured depth -> depth of pixels that nothing else reaches.
 
-A prediction is inverse depth up to scale and shift, both of which differ from image to image. They are found by
-sampling pairs of measured points (the frame's sparse ones too) and refined on those that agree; what is then left
-between measurement and prediction is smooth, and is carried into the holes. The result fills only pixels that are
-unknown, and only as far as other views do not look through it.
+A prediction is inverse depth up to scale and shift, which differ from image to image. RANSAC over pairs of measured
+points finds them, least squares on the inliers refines them, and the smooth residual is extended into the holes. Only
+unknown pixels are filled, unless other views look through them.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
 import numpy as np
 
-from reconstruction.core.progress import Progress
 from reconstruction.core.types import Camera, PosedFrames
 from reconstruction.depth.config import DepthConfig
-from reconstruction.depth.views import ViewPlan
+from reconstruction.depth.scene import DepthScene
 from registry.geometry import invert_rigid
 
 _BATCH = 4
@@ -117,8 +114,7 @@ def _anchors(posed: PosedFrames, camera: Camera, i: int, depth: np.ndarray, meas
     local = invert_rigid(posed.world_from_camera[i])
     points = posed.points[rows] @ local[:3, :3].T + local[:3, 3]
     points = points[points[:, 2] > 0]
-    u = np.floor(camera.fx * points[:, 0] / points[:, 2] + camera.cx).astype(int)
-    v = np.floor(camera.fy * points[:, 1] / points[:, 2] + camera.cy).astype(int)
+    u, v = (np.floor(values).astype(int) for values in camera.project(points))
     inside = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     rho = np.concatenate([1.0 / depth[y, x], 1.0 / points[inside, 2]])
     return np.concatenate([y, v[inside]]), np.concatenate([x, u[inside]]), rho
@@ -145,13 +141,12 @@ def aligned_depth(
 
 
 def fill_from_predictions(
-    posed: PosedFrames, camera: Camera, plan: ViewPlan, depth: np.ndarray, confidence: np.ndarray,
-    backend: MonocularBackend, config: DepthConfig, each: Callable, progress: Progress,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    scene: DepthScene, depth: np.ndarray, confidence: np.ndarray, backend: MonocularBackend
+) -> tuple[np.ndarray, np.ndarray]:
     """Fill unknown pixels of depth (n, h, w) with confidence 1; measured and completed ones stay what they are."""
     from reconstruction.depth.consistency import count_witnesses
 
-    n = len(depth)
+    posed, camera, progress, n = scene.posed, scene.camera, scene.progress, len(depth)
     size = (camera.width, camera.height)
     filled = depth.copy()
     failed = np.zeros(n, bool)
@@ -163,7 +158,7 @@ def fill_from_predictions(
             prediction = cv2.resize(np.asarray(one, np.float32), size, interpolation=cv2.INTER_LINEAR)
             measured = confidence[i] == 2
             anchors = _anchors(posed, camera, i, depth[i], measured)
-            found = aligned_depth(prediction, depth[i], measured, anchors, config.seed + i)
+            found = aligned_depth(prediction, depth[i], measured, anchors, scene.config.seed + i)
             if found is None:
                 failed[i] = True
             else:
@@ -171,18 +166,16 @@ def fill_from_predictions(
         progress.advance(len(rows))
     out, trust = filled.copy(), confidence.copy()
     trust[(filled > 0) & (depth == 0)] = 1
-    k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
     def check(i: int) -> None:
-        rows = plan.neighbors[i]
-        relative = invert_rigid(posed.world_from_camera[np.maximum(rows, 0)]) @ posed.world_from_camera[i]
+        rows, relative = scene.neighbors(i)
         agree, through = np.zeros(filled[i].shape, np.uint8), np.zeros(filled[i].shape, np.uint8)
         fresh = (depth[i] == 0) & (filled[i] > 0)
-        count_witnesses(i, rows, filled, fresh, relative, k, _THROUGH, _SAME, agree, through)
+        count_witnesses(i, rows, filled, fresh, relative, camera.intrinsics, _THROUGH, _SAME, agree, through)
         drop = fresh & (through >= 2) & (through >= agree)
         out[i][drop], trust[i][drop] = 0, 0
 
-    each(n, check, "checking predictions", progress)
+    scene.each(check, "checking predictions")
     dropped = ((filled > 0) & (out == 0)).mean()
     progress.note(
         f"depth: {backend.name} filled {100 * ((out > 0) & (depth == 0)).mean():.1f} % of the pixels; "

@@ -1,4 +1,4 @@
-"""The learned aggregation: matching costs and the picture of a keyframe in, one score for every depth bin out.
+"""Networks of the depth stage: `Aggregation` scores depth bins of costs, `Mending` scores candidate depths of maps.
 
 A U-Net of 2D convolutions over the plane sweep's costs, planes as channels (SimpleRecon, Sayed et al., ECCV 2022). Its
 output is added to what semi-global aggregation says, so that the untrained network is that, and training only has to

@@ -1,9 +1,8 @@
-"""Put depth edges where the image has its edges.
+"""Compiled kernels that move depth edges to image edges: adaptive support weights against edge fattening.
 
-A window that straddles the outline of a near thing correlates best at the depth of that thing, since the outline is
-what stands out in it: every thing wears a skirt of its own depth, half a window wide, and all views agree on it.
-Here each pixel beside a depth jump chooses anew among the surfaces around it. Evidence is the correlation of a window
-in which only pixels of its own color count, and which surface the pixels of its color around it lie on.
+A stereo window that straddles an occlusion boundary correlates best at the foreground's depth, in all views alike.
+Each pixel beside a depth jump therefore chooses among the surfaces around it, by the correlation of a window weighted
+by color (adaptive support weights, Yoon and Kweon, PAMI 2006) and by the surfaces of nearby pixels of its color.
 """
 
 import numba
@@ -11,7 +10,7 @@ import numpy as np
 
 from reconstruction.depth.windows import make_correlate, offsets, project, source_maps
 
-_REACH = 15  # pixels of the same color have a say from so far
+_REACH = 15  # pixels of the same color vote within this distance
 _VOTE_STRIDE = 3
 _MAX_CANDIDATES = 4
 _RADIUS = 4  # 9x9 windows, every second pixel of them
@@ -72,7 +71,7 @@ def mark_doubt(rho, gx, gy, jump, band, doubt):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def _candidates(rho, gx, gy, doubt, y, x, out):  # pragma: no cover - compiled
-    """Gather in out (m, 3) the surfaces around a pixel, extended to it: its own first, then those far from jumps."""
+    """Write the surfaces around a pixel, extended to it, to out (m, 3): its own first, then those far from jumps."""
     h, w = rho.shape
     count = 0
     if rho[y, x] > 0.0:
@@ -111,7 +110,7 @@ def _differ(color, j, i, y, x):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _vote(rho, score, color, doubt, y, x, candidates, count, votes):  # pragma: no cover - compiled
-    """Count for each candidate surface the pixels of the same color around that lie on it; return all their say."""
+    """Sum the weights of nearby pixels of the same color by candidate surface to `votes`; return the total."""
     h, w = rho.shape
     votes[:] = 0.0
     total = np.float32(1e-6)
@@ -183,7 +182,7 @@ def _seen(
 def resolve_edges(
     reference, color, sources, h_inf, shift, rho, gx, gy, score, doubt, noise, part, out, out_score
 ):  # pragma: no cover - compiled
-    """Let pixels in doubt choose among the surfaces around them; where nothing was known they need good evidence.
+    """Reassign pixels in doubt to one of the surfaces around them; unknown pixels need stronger evidence.
 
     Args:
         reference: float32 (h, w) gray levels.

@@ -1,4 +1,4 @@
-"""Depth maps changed in their last bits: what a figure then moves by is chance, not merit."""
+"""Noise in the last bits of depth maps, to measure the spread of figures between equal runs."""
 
 import numpy as np
 

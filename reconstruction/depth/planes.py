@@ -1,4 +1,4 @@
-"""Planes of the whole scene, found in the measured points of all views, so that every view fills with the same ones."""
+"""Planes of the scene: oriented points of all views -> planes and their extents, by RANSAC and by offset histograms."""
 
 import numpy as np
 
@@ -70,7 +70,7 @@ def find_planes(
             failures += 1
             continue
         planes.append(plane)
-        # What lies near the plane is spent, even if its own normal is noisy.
+        # Points near the plane are removed even if their normals disagree.
         left &= ~(np.abs(points @ plane[:3] + plane[3]) < 1.5 * tolerance * depths) | (
             normals @ plane[:3] < 0.5
         )
@@ -79,10 +79,10 @@ def find_planes(
 
 
 def _parallel_planes(planes: np.ndarray, points, depths, least: int, tolerance: float) -> np.ndarray:
-    """Return planes parallel to the largest ones at offsets where many unexplained points gather, normals unheard.
+    """Return planes parallel to the largest ones, at peaks of the histogram of the remaining points' offsets.
 
-    Of a blank table top only the rim can be measured, and the rim of anything that stands square gathers at one
-    height. A wrong guess does no harm: it finds no view to be anchored in.
+    Normals are not used: of a blank table top only the rim can be measured, and its normals are noise. A wrong plane
+    does no harm, since no measured pixels anchor it in a view.
     """
     directions: list[np.ndarray] = []
     for plane in planes:
@@ -128,16 +128,16 @@ def _fit(points: np.ndarray, depths: np.ndarray, like: np.ndarray) -> np.ndarray
 def plane_extents(
     planes: np.ndarray, points: np.ndarray, normals: np.ndarray, depths: np.ndarray, *, tolerance: float
 ) -> np.ndarray:
-    """Return for each plane 16 bounds (k, 16, 4): a point x on it is within its measured extent if all e.x + f >= 0.
+    """Return 16 bounds (k, 16, 4) around the measured points of each plane: inside, all e.x + f >= 0.
 
-    A fill may join what was measured, never go beyond it: past the end of a wall there may be nothing.
+    Completion stays inside them, since nothing is known beyond the end of a wall.
     """
     out = np.zeros((len(planes), _EXTENT_SIDES, 4))
     angle = np.arange(_EXTENT_SIDES) * 2 * np.pi / _EXTENT_SIDES
     for row, plane in enumerate(planes):
         near = np.abs(points @ plane[:3] + plane[3]) < tolerance * depths
         agreeing = near & (normals @ plane[:3] > 0.9)
-        # A plane known by its rim alone has next to no normals to go by.
+        # A plane that was measured at its rim alone has few reliable normals.
         own = points[agreeing if agreeing.sum() > 0.5 * near.sum() else near]
         first = np.cross(plane[:3], np.eye(3)[np.argmin(np.abs(plane[:3]))])
         first /= np.linalg.norm(first)

@@ -1,4 +1,4 @@
-"""Local refinement of inverse depth with windows slanted like the surface, at full depth resolution."""
+"""Compiled local refinement of inverse depth with slanted windows, at depth resolution."""
 
 import numba
 import numpy as np

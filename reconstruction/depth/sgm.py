@@ -1,4 +1,4 @@
-"""Semi-global aggregation of a cost volume along eight directions, and its winner with sub-plane precision."""
+"""Compiled semi-global aggregation of a cost volume along eight paths (Hirschmueller, PAMI 2008), and its winner."""
 
 import numba
 import numpy as np
@@ -6,7 +6,7 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def _step(cost, previous, lowest, p1, p2, out, total):  # pragma: no cover - compiled
-    """One pixel of one path: out[d] = cost[d] + cheapest way from the previous pixel; return the new minimum."""
+    """Update one pixel of a path: out[d] = cost[d] + least path cost of the previous pixel; return the new minimum."""
     planes = len(cost)
     jump = lowest + p2
     best = np.int32(1 << 30)

@@ -1,7 +1,7 @@
-"""Plane sweep: zero-mean normalised correlation of every pixel's window with the sources, for every inverse depth.
+"""Compiled plane sweep: zero-mean normalized cross-correlation (ZNCC) of windows, for every inverse depth.
 
-A source is resampled row by row as the reference would see it if all lay at one inverse depth, and sums over the
-windows run along: the cost of a window does not grow with its height, and all of it stays in the first cache.
+Sources are warped row by row by the homography of a fronto-parallel plane (Collins, CVPR 1996). Sums over windows are
+running sums, so that the cost does not grow with the window's height.
 """
 
 import math
@@ -109,9 +109,7 @@ def _write_row(first, second, out):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def sweep_costs(reference, sources, h_inf, shift, rhos, noise, out):  # pragma: no cover - compiled
-    """Fill out[plane, y, x] with 127 * (1 - correlation), mean of the two best sources.
-
-    Occlusion spoils the others.
+    """Write 127 * (1 - correlation) to out[plane, y, x], the mean of the two best sources (others may be occluded).
 
     `reference` (h, w) and `sources` (s, h, w) are float32 gray minus 128, so that single precision is enough for the
     running sums; source pixel ~ h_inf @ p + rho * shift.

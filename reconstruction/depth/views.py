@@ -1,4 +1,4 @@
-"""Which frames help which, and which depths to try in each."""
+"""View selection: keyframes with sparse points -> sources, neighbors and depth range of each view."""
 
 from dataclasses import dataclass
 
@@ -9,17 +9,17 @@ from reconstruction.depth.config import DepthConfig
 from registry.errors import InputError
 from registry.geometry import invert_rigid
 
-# No four frames see all of another one well: each part of a frame has its own sources.
+# Parts of a frame have sources of their own, since few frames see all of another one well.
 _ROWS, _COLUMNS = 2, 2
-# Where a part, or a frame, is asked who else sees it, as shares of its width and height.
+# Grid of sample points in a part, as shares of its width and height: first, last, count.
 _GRID = (0.06, 0.94, 5)
-# A point needs two good sources, as others may not see it, and a handful of neighbors to agree.
+# Enough good views of a point: two sources, since one may be occluded, and three neighbors.
 _SOURCES_ENOUGH, _NEIGHBORS_ENOUGH = 2.0, 3.0
 
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """What the sweep needs to know of each frame before it looks at pixels."""
+    """Sources, neighbors and depth range of each view."""
 
     sources: np.ndarray  # int32 (n, parts, s) frames to compare each part with, best first, -1 = none
     neighbors: np.ndarray  # int32 (n, k) frames that check consistency, best first, -1 = none
@@ -75,7 +75,7 @@ def depth_ranges(posed: PosedFrames) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plan_views(posed: PosedFrames, config: DepthConfig) -> ViewPlan:
-    """Choose sources and neighbours by triangulation angle at the depths that a frame sees, so that all of it is seen.
+    """Choose sources and neighbors of each view by triangulation angle, so that all parts of it are covered.
 
     Raises:
         InputError: If most frames have no other that sees the same things from another place.
@@ -135,9 +135,14 @@ def _relation(world: np.ndarray, i: int, posed: PosedFrames, camera_from_world: 
 
 
 def _pick(worth: np.ndarray, offset: np.ndarray, out: np.ndarray, *, enough: float, repulsion: float) -> None:
-    """Fill `out` greedily with the frames that add most at the points (n, p); points seen well `enough` count little.
+    """Write the views that add most coverage of the points to `out`, greedily.
 
-    Those beside a chosen frame lose, so that both sides are used.
+    Args:
+        worth: float (n, p) of each view at each point.
+        offset: float (n, 3) baselines.
+        out: int (k,) written.
+        enough: worth from which a point counts little more.
+        repulsion: loss of views beside a chosen one, so that both sides are used.
     """
     seen, keen = np.zeros(worth.shape[1]), np.ones(len(worth))
     for k in range(len(out)):

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from reconstruction.core.types import Camera
-from reconstruction.depth.estimate import _warps, sweep_frame
+from reconstruction.depth.measure import sweep_frame
 from reconstruction.depth.refine import fit_slopes, refine
+from reconstruction.depth.scene import plane_warps
 from reconstruction.depth.sweep import sweep_costs
 from reconstruction.depth.views import ViewPlan, frame_parts
 from reconstruction.depth.windows import make_correlate, offsets, project, source_maps
@@ -74,7 +75,7 @@ def test_parts_with_the_same_sources_are_the_whole(images) -> None:
     plan = ViewPlan(np.tile(np.array([1, 2]), (3, 4, 1)), np.zeros((3, 0)), np.ones(3), np.ones(3))
     parts = sweep_frame(0, images, posed, camera, plan, rhos, NOISE)
     whole = np.empty((3, H, W), np.uint8)
-    h_inf, shift = _warps(posed, camera, 0, np.array([1, 2]))
+    h_inf, shift = plane_warps(posed, camera, 0, np.array([1, 2]))
     sweep_costs(images[0], images[1:], h_inf, shift, rhos, NOISE, whole)
     # Windows at the frame's border are clipped alike, sums run in another order.
     assert np.abs(parts.astype(int) - np.moveaxis(whole, 0, 2)).max() <= 1

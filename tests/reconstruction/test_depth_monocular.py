@@ -7,10 +7,10 @@ import pytest
 from notes import Notes
 from test_depth import CAMERA, CONFIG, make_posed
 
-from reconstruction.core.workers import Workers
 from reconstruction.depth import estimate_depth
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.monocular import fill_from_predictions, fit_affine
+from reconstruction.depth.scene import DepthScene
 from reconstruction.depth.views import plan_views
 from registry.errors import EnvironmentMissing, UsageError
 
@@ -53,10 +53,10 @@ def scene():
 def fill(scene, backend, depth=None, confidence=None):
     posed, _, known, sure = scene
     watcher = Notes()
+    seen = DepthScene(posed, CAMERA, plan_views(posed, CONFIG), CONFIG, watcher)
     found = fill_from_predictions(
-        posed, CAMERA, plan_views(posed, CONFIG), known if depth is None else depth,
-        sure if confidence is None else confidence, backend, CONFIG, Workers(2).each, watcher,
-    )  # fmt: skip
+        seen, known if depth is None else depth, sure if confidence is None else confidence, backend
+    )
     return *found, watcher.notes
 
 
