@@ -113,6 +113,7 @@ def measure_capture(
 
 
 def spread(poses: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
+    """Return up to `count` poses, evenly spaced."""
     return [poses[i] for i in np.unique(np.linspace(0, len(poses) - 1, count).round().astype(int))]
 
 
@@ -289,6 +290,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def save_pictures(pictures: Sequence[tuple[str, np.ndarray]], page: Path, capture: str) -> None:
+    """Write pictures below each other as one JPEG beside a page."""
     import cv2
 
     if not pictures:

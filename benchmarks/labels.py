@@ -70,10 +70,10 @@ def table(guesses: list[Guess]) -> str:
     """Return the reliability table and the table by label as Markdown."""
     said = sum(g.label != UNKNOWN for g in guesses)
     lines = ["| confidence | things | mean confidence | right |", "| --- | --- | --- | --- |"]
-    for row in reliability(guesses):
-        lines.append(
-            f"| {row.low:.2f} to {row.high:.2f} | {row.count} | {row.confidence:.2f} | {row.right:.2f} |"
-        )
+    lines += [
+        f"| {row.low:.2f} to {row.high:.2f} | {row.count} | {row.confidence:.2f} | {row.right:.2f} |"
+        for row in reliability(guesses)
+    ]
     over = overconfidence(guesses)
     lines.append(
         f"\n{said} of {len(guesses)} things have a label; confidence less share right: {over:+.2f}\n"

@@ -107,6 +107,7 @@ def bake_light(
     light_of_room: Light,
     things: np.ndarray,
 ) -> np.ndarray:
+    """Return the light (n, 3) that falls on vertices (n, 3): ambient, and of lamps with shadow maps."""
     focal = shadow_px / 2 / np.tan(np.radians(62))
     camera = Camera(shadow_px, shadow_px, focal, focal, shadow_px / 2, shadow_px / 2)
     # A little light from everywhere, more from above, stands for all further bounces.
@@ -242,6 +243,7 @@ def mirrored_lamps(lamps: list) -> np.ndarray:
 
 
 def mirrored_windows(light: Light, vertices: np.ndarray) -> np.ndarray:
+    """Return the windows as rows (n, 9) of orientation, plane, extents and color, as `paint` reads them."""
     rows = [
         [
             0.0 if w.wall in ("wall_west", "wall_east") else 1.0,

@@ -1,6 +1,4 @@
-"""A generated room as the assets of a perfect reconstruction: true meshes and masses at true poses, collision parts
-of its own primitives, no hints, no textures.
-"""
+"""A generated room -> the assets of a perfect reconstruction: true meshes, masses, poses and collision primitives."""
 
 import numpy as np
 
