@@ -1,8 +1,8 @@
-"""Reconstruct a video from Python, and print what was found.
+"""Reconstruct a scene from a video in Python, and print its objects.
 
     python examples/01_reconstruct_video.py examples/data/demo_room.mp4 --scene demo_room
 
-The same as `simrecon reconstruct`, but with the intermediate results at hand. A second run takes seconds.
+As `simrecon reconstruct`, with access to intermediate results. A second run reads them from the cache, in seconds.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""Open a scene bundle without any simulator, and walk through it.
+"""Open a scene bundle without a simulator, and print its scene graph and files.
 
     python examples/02_inspect_bundle.py demo_room
 
-Opening checks the schema and every file's hash, so a bundle that someone else made is safe to open.
+Opening checks the schema and all file hashes, so a bundle from someone else is safe to open.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from registry import SceneRegistry
 
 
 def main() -> None:
-    """Print who stands on what."""
+    """Print the scene graph and the mesh files."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

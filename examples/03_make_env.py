@@ -1,6 +1,6 @@
-"""Make the environment of a reconstructed scene, look at what is in it, and take one step.
+"""Make the environment of a reconstructed scene, and take one step.
 
-You will see the scene's tasks and objects, the chosen task in words, and the shapes of the observations.
+Prints the scene's tasks and objects, the instruction, and the shapes of the observations.
 
     python examples/03_make_env.py --env-id SimRecon/scene0001 --robot fetch
 """
@@ -16,18 +16,16 @@ def main() -> None:
     """Parse the arguments and make the environment."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env-id", default="SimRecon/scene0001")
-    parser.add_argument(
-        "--registry", default=None, help="the registry's folder; the default registry if left out"
-    )
+    parser.add_argument("--registry", default=None, help="folder of the registry, if not the default")
     parser.add_argument("--robot", default="panda")
     parser.add_argument(
         "--task", default="pick", help="a kind of task, or a name from the list that is printed"
     )
     arguments = parser.parse_args()
 
-    # `import simrecon_envs` has registered the default registry already; another one is registered by hand.
+    # `import simrecon_envs` has registered the scenes of the default registry; this registers those of another one.
     print("registered:", ", ".join(simrecon_envs.register_scenes(arguments.registry)) or "nothing")
-    # gym.make works just as well; simrecon_envs.make also says what there is where the id is wrong.
+    # gym.make works, too; simrecon_envs.make also lists the scenes where the id is wrong.
     env: gym.Env = simrecon_envs.make(
         arguments.env_id,
         registry=arguments.registry,

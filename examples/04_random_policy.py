@@ -1,4 +1,4 @@
-"""Run a random policy with the plain Gymnasium API (NumPy, no batch), or record a scripted pick as a video.
+"""Run a random policy with the Gymnasium API (NumPy, not batched), or record a scripted pick as a video.
 
 python examples/04_random_policy.py --env-id SimRecon/scene0001 --steps 500
 python examples/04_random_policy.py --env-id SimRecon/scene0001 --video rollout.mp4   # needs a Vulkan driver
@@ -14,9 +14,7 @@ def main() -> None:
     """Parse the arguments and step."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env-id", default="SimRecon/scene0001")
-    parser.add_argument(
-        "--registry", default=None, help="the registry's folder; the default registry if left out"
-    )
+    parser.add_argument("--registry", default=None, help="folder of the registry, if not the default")
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)

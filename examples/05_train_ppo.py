@@ -1,9 +1,8 @@
-"""Train PPO of stable-baselines3 on a task of a scene, with nothing but the library's own pieces.
+"""Train PPO of stable-baselines3 on a task of a scene.
 
-`simrecon train SCENE --task reach` does this with checkpoints, TensorBoard, an evaluation and a video; start from here
-where you want to change how it is done. Two things matter, and both are in this file: an episode ends with success, so
-success has to pay what staying there would (else hovering near the goal pays more), and observations are normalized.
-The same seed gives the same policy.
+`simrecon train SCENE --task reach` adds checkpoints, TensorBoard, an evaluation and a video. Start from this file to
+change the training. Two things matter. Success ends an episode, so it pays the discounted reward of staying successful;
+else hovering near the goal pays more. And observations are normalized. The same seed gives the same policy.
 
     python examples/05_train_ppo.py --env-id SimRecon/scene0001 --task reach
 """
@@ -25,7 +24,7 @@ GAMMA = 0.9
 
 
 class SuccessPays(gym.Wrapper):
-    """Adds at success what staying there for ever would be worth, and says it in stable-baselines3's word."""
+    """Adds the discounted reward of staying successful for ever, and reports success to stable-baselines3."""
 
     def step(self, action):
         """Step."""
@@ -36,28 +35,26 @@ class SuccessPays(gym.Wrapper):
 
 
 def make_env(scene: str, registry: str | None, task: str, robot: str) -> gym.Env:
-    """Make one environment; every process has its own."""
+    """Make one environment; runs in each process."""
     torch.set_num_threads(1)
     env = simrecon_envs.make_cpu(
         scene,
         registry=registry,
         task=task,
         robot_uids=robot,
-        control_mode="pd_ee_delta_pos",  # the hand's shifts, and the fingers
-        observe_objects=False,  # what the task is about is in the observation anyway
-        randomize="start",  # every episode begins differently
+        control_mode="pd_ee_delta_pos",  # displacement of the hand, and the fingers
+        observe_objects=False,  # the task's own observations suffice
+        randomize="start",  # random poses of objects and robot at reset
         max_episode_steps=100,
     )
     return Monitor(SuccessPays(env), info_keywords=("is_success",))
 
 
 def main() -> None:
-    """Parse the arguments, train, and count successes on seeds that were not trained on."""
+    """Train, and count successes on seeds that training did not use."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env-id", default="SimRecon/scene0001")
-    parser.add_argument(
-        "--registry", default=None, help="the registry's folder; the default registry if left out"
-    )
+    parser.add_argument("--registry", default=None, help="folder of the registry, if not the default")
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--task", default="reach", help="a kind of task or a task's name")
     parser.add_argument("--steps", type=int, default=50_000)
@@ -69,7 +66,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     maker = functools.partial(make_env, arguments.env_id, arguments.registry, arguments.task, arguments.robot)
-    # Spawned, not forked: a simulator cannot be forked.
+    # spawn: a simulator cannot be forked.
     many = [maker] * arguments.envs
     vec = SubprocVecEnv(many, start_method="spawn") if arguments.envs > 1 else DummyVecEnv(many)
     env = VecNormalize(vec, gamma=GAMMA)

@@ -1,11 +1,11 @@
-"""Segment the frames of a scene with a tool of your own, and have the scene cut by these masks.
+"""Segment the frames of a scene with your own tool, and reconstruct its objects from these masks.
 
     python examples/06_masks_from_any_tool.py my_room --out masks
     simrecon reconstruct my_room.mp4 --scene my_room --set instances.masks=folder --set instances.masks_path=masks
 
-Frames are taken from the results that the scene was made of: those with a known camera, without lens distortion. One id
-image each is written, named by frame number. What segments here are patches of one color, so that the example
-runs anywhere: put your model into `segment`. See docs/masks.md.
+Reads the undistorted frames with known cameras from the scene's stage results, and writes one id image per frame, named
+by frame number. Replace `segment`, here a color segmentation (Felzenszwalb) that runs anywhere, by your model. See
+docs/masks.md.
 """
 
 import argparse
@@ -28,7 +28,7 @@ def segment(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    """Write one id image a frame."""
+    """Write one id image per frame."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

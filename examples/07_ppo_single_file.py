@@ -1,7 +1,6 @@
-"""PPO in one file, in the manner of CleanRL: torch and Gymnasium's vector environments, nothing hidden.
+"""PPO in one file, in the style of CleanRL: torch and Gymnasium's vector environments.
 
-Read it from top to bottom to see all of what `simrecon train` leaves to stable-baselines3. The same seed gives the same
-policy.
+Shows what `simrecon train` leaves to stable-baselines3. The same seed gives the same policy.
 
     python examples/07_ppo_single_file.py --env-id SimRecon/scene0001 --task reach
 """
@@ -20,14 +19,15 @@ import simrecon_envs
 
 GAMMA, LAMBDA, CLIP, EPOCHS, BATCH = 0.9, 0.9, 0.2, 10, 100
 LEARNING_RATE, MAX_GRAD_NORM, TARGET_KL = 1e-3, 0.5, 0.05
-SUCCESS_BONUS = GAMMA / (1 - GAMMA)  # an episode ends with success: it pays what staying there would
+SUCCESS_BONUS = GAMMA / (1 - GAMMA)  # success ends an episode: discounted reward of staying successful
 EVALUATION_SEED = 10**9
 
 
 class Agent(nn.Module):
-    """A policy, Gaussian with a deviation that does not depend on the state, and a value; and what normalizes both."""
+    """Gaussian policy with state-independent standard deviation, value function, and running normalization."""
 
     def __init__(self, n_obs: int, n_act: int) -> None:
+        """Make networks for observations (n_obs,) and actions (n_act,)."""
         super().__init__()
 
         def net(n_out: int, gain: float) -> nn.Sequential:
@@ -46,12 +46,12 @@ class Agent(nn.Module):
         self.register_buffer("count", torch.tensor(1e-4))
 
     def normalize(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return observations (n, k) with mean 0 and deviation 1."""
+        """Scale observations (n, k) to mean 0 and standard deviation 1."""
         return ((obs - self.mean) / (self.var + 1e-8).sqrt()).clamp(-10, 10)
 
     @torch.no_grad()
     def watch(self, obs: torch.Tensor) -> None:
-        """Update mean and variance with observations (n, k)."""
+        """Update the running mean and variance with observations (n, k)."""
         n, total = len(obs), self.count + len(obs)
         delta = obs.mean(0) - self.mean
         squares = self.var * self.count + obs.var(0, unbiased=False) * n + delta**2 * self.count * n / total
@@ -60,13 +60,13 @@ class Agent(nn.Module):
         self.count.copy_(total)
 
     def policy(self, obs: torch.Tensor) -> torch.distributions.Independent:
-        """Return the distribution of actions for normalized observations."""
+        """Return the action distribution for normalized observations (n, k)."""
         normal = torch.distributions.Normal(self.actor(obs), self.log_std.exp())
         return torch.distributions.Independent(normal, 1)
 
 
 def update(agent: Agent, optimizer: torch.optim.Optimizer, data: dict[str, torch.Tensor]) -> None:
-    """Improve policy and value with what one rollout gave; every tensor has one row a step."""
+    """Update policy and value from one rollout; every tensor has one row per step."""
     for _ in range(EPOCHS):
         for rows in torch.randperm(len(data["obs"])).split(BATCH):
             obs, action, old_log_prob, advantage, target = (
@@ -89,19 +89,18 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, data: dict[str, torch
 def advantages(
     reward: torch.Tensor, value: torch.Tensor, last: torch.Tensor, ended: torch.Tensor, cut: torch.Tensor
 ) -> torch.Tensor:
-    """Return generalized advantages; rows are steps, columns environments.
+    """Return generalized advantage estimates (t, n) for t steps of n environments.
 
     Args:
-        reward: Of every step (t, n).
-        value: Of every step's observation (t, n).
-        last: Of the observation after the last step (n,).
-        ended: The step ended the episode with success: nothing comes after it (t, n).
-        cut: The episode ran out of time: what comes after it was not seen, but has a value (t, n).
+        reward: Rewards (t, n).
+        value: Values of the observations (t, n).
+        last: Value of the observation after the last step (n,).
+        ended: The episode terminated with success (t, n); the next value is 0.
+        cut: The episode was truncated by the step limit (t, n); the next value counts.
     """
     out, carry = torch.zeros_like(reward), torch.zeros_like(last)
-    following = torch.cat(
-        [value[1:], last[None]]
-    )  # Gymnasium gives an episode's last observation, then the next's
+    # Gymnasium returns an episode's last observation before the next episode's first one.
+    following = torch.cat([value[1:], last[None]])
     for t in reversed(range(len(reward))):
         delta = reward[t] + GAMMA * following[t] * ~ended[t] - value[t]
         carry = out[t] = delta + GAMMA * LAMBDA * carry * ~(ended[t] | cut[t])
@@ -109,7 +108,7 @@ def advantages(
 
 
 def evaluate(agent: Agent, env: gym.Env, episodes: int) -> int:
-    """Return how many episodes succeed without noise, on seeds that were not trained on."""
+    """Return the number of successes of the deterministic policy, on seeds that training did not use."""
     successes = 0
     for seed in range(EVALUATION_SEED, EVALUATION_SEED + episodes):
         obs, _ = env.reset(seed=seed)
@@ -124,12 +123,12 @@ def evaluate(agent: Agent, env: gym.Env, episodes: int) -> int:
 
 
 def train(agent: Agent, envs: gym.vector.VectorEnv, steps: int, rollout: int, seed: int) -> None:
-    """Train for about `steps` steps of all environments together, `rollout` of them between two updates."""
+    """Train for about `steps` steps with an update every `rollout` steps, both summed over environments."""
     optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE, eps=1e-5)
     n, began, recent = envs.num_envs, time.perf_counter(), deque(maxlen=100)
     obs, _ = envs.reset(seed=seed)
     obs = torch.as_tensor(obs)
-    over = torch.zeros(n, dtype=torch.bool)  # the step before was an episode's last: this one only resets
+    over = torch.zeros(n, dtype=torch.bool)  # the previous step ended an episode; this one is a reset
     for number in range(max(steps // rollout, 1)):
         rows: dict[str, list[torch.Tensor]] = {
             key: [] for key in ("obs", "action", "log_prob", "value", "reward", "ended", "cut", "real")
@@ -172,12 +171,10 @@ def train(agent: Agent, envs: gym.vector.VectorEnv, steps: int, rollout: int, se
 
 
 def main() -> None:
-    """Parse the arguments, train, evaluate."""
+    """Train and evaluate."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env-id", default="SimRecon/scene0001")
-    parser.add_argument(
-        "--registry", default=None, help="the registry's folder; the default registry if left out"
-    )
+    parser.add_argument("--registry", default=None, help="folder of the registry, if not the default")
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--task", default="reach", help="a kind of task or a task's name")
     parser.add_argument("--steps", type=int, default=50_000)

@@ -1,8 +1,7 @@
-"""PPO on ManiSkill's GPU simulation: a thousand copies of a scene in one process, nothing leaves the GPU. Needs CUDA.
+"""PPO on ManiSkill's GPU simulation: 1024 copies of a scene in one process, all data on the GPU. Needs CUDA.
 
-ManiSkill's `ManiSkillVectorEnv` resets what has ended by itself. Here episodes go on after success, all of them end
-together, and staying is what pays. The same seed gives the same actions; PhysX on a GPU itself does not promise the
-same bits.
+Episodes continue after success and end together at the step limit, so staying successful pays. `ManiSkillVectorEnv`
+resets them. The same seed gives the same actions, but PhysX on a GPU is not deterministic to the last bit.
 
     python examples/08_ppo_gpu.py --env-id SimRecon/scene0001 --task pick --envs 1024
 """
@@ -33,15 +32,16 @@ def net(n_in: int, n_out: int, gain: float) -> nn.Sequential:
 
 
 class Agent(nn.Module):
-    """A Gaussian policy and a value."""
+    """Gaussian policy and value function."""
 
     def __init__(self, n_obs: int, n_act: int) -> None:
+        """Make networks for observations (n_obs,) and actions (n_act,)."""
         super().__init__()
         self.actor, self.critic = net(n_obs, n_act, 0.01), net(n_obs, 1, 1.0)
         self.log_std = nn.Parameter(torch.full((n_act,), -0.5))
 
     def policy(self, obs: torch.Tensor) -> torch.distributions.Independent:
-        """Return the distribution of actions for observations (n, k)."""
+        """Return the action distribution for observations (n, k)."""
         return torch.distributions.Independent(
             torch.distributions.Normal(self.actor(obs), self.log_std.exp()), 1
         )
@@ -54,7 +54,7 @@ class Agent(nn.Module):
 def collect(
     agent: Agent, env: ManiSkillVectorEnv, obs: torch.Tensor, steps: int
 ) -> tuple[dict, torch.Tensor, list]:
-    """Step all environments and return the rows (t, n, ...), the next observation, and metrics of what ended."""
+    """Step all environments; return the rollout (t, n, ...), the next observation, metrics of ended episodes."""
     rows: dict[str, list[torch.Tensor]] = {
         key: [] for key in ("obs", "action", "log_prob", "value", "following", "reward", "cut")
     }
@@ -76,7 +76,7 @@ def collect(
 
 
 def advantages(data: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Return generalized advantages (t, n); an episode that ran out of time has a future, which is not in the rows."""
+    """Return generalized advantage estimates (t, n); `following` has the values after truncated episodes, too."""
     out, carry = torch.zeros_like(data["reward"]), torch.zeros_like(data["reward"][0])
     for t in reversed(range(len(out))):
         delta = data["reward"][t] + GAMMA * data["following"][t] - data["value"][t]
@@ -85,7 +85,7 @@ def advantages(data: dict[str, torch.Tensor]) -> torch.Tensor:
 
 
 def update(agent: Agent, optimizer: torch.optim.Optimizer, data: dict[str, torch.Tensor]) -> None:
-    """Improve policy and value with rows (m, ...)."""
+    """Update policy and value from a rollout (m, ...)."""
     size = len(data["obs"])
     for _ in range(EPOCHS):
         for rows in torch.randperm(size, device=data["obs"].device).chunk(BATCHES):
@@ -104,12 +104,10 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, data: dict[str, torch
 
 
 def main() -> None:
-    """Parse the arguments and train."""
+    """Train."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env-id", default="SimRecon/scene0001")
-    parser.add_argument(
-        "--registry", default=None, help="the registry's folder; the default registry if left out"
-    )
+    parser.add_argument("--registry", default=None, help="folder of the registry, if not the default")
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--task", default="pick", help="a kind of task or a task's name")
     parser.add_argument("--steps", type=int, default=20_000_000, help="of all environments together")

@@ -1,7 +1,7 @@
-"""From a video to a simulation-ready scene bundle in the registry.
+"""Reconstruction of a video as a simulation-ready scene bundle in the registry.
 
-`reconstruct` is the whole pipeline; its stages are in `reconstruction.pipeline`. `PipelineConfig` holds its options.
-Both are loaded on first use, so that importing the package stays light.
+`reconstruct` runs the whole pipeline (stages: `reconstruction.pipeline`) with the options of a `PipelineConfig`. Both
+are imported on first use, to keep `import reconstruction` fast.
 """
 
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ _HOME = {
 
 
 def __getattr__(name: str) -> object:
-    """Load a public name on first use (PEP 562)."""
+    """Import a public name on first use (PEP 562)."""
     if name not in _HOME:
         raise AttributeError(
             f"module 'reconstruction' has no attribute {name!r}; it has {', '.join(__all__)}"

@@ -1,10 +1,9 @@
-"""The stage cache: finished stages are kept under the fingerprint of what went in, and written whole or not at all.
+"""Stage cache: results of finished stages on disk, each under the fingerprint of its inputs.
 
-A stage's fingerprint is the SHA-256 over its name, the code behind it (`code_digest`), its options, and the
-fingerprints of the stages that it reads (the first one has the input's digest). On disk a stage is
-`<work>/<NN>_<stage>-<fingerprint>/`, written as a temporary sibling and renamed when complete, so a killed run leaves
-nothing that looks finished. Two fingerprints of each stage are kept unless more are asked for, so going back and forth
-between two options costs nothing.
+The fingerprint is the SHA-256 over the stage's name, its code (`code_digest`), its options, and the fingerprints of
+the stages that it reads (for the first stage: the digest of the input). A result is a folder
+`<work>/<NN>_<stage>-<fingerprint>/`. It is written under a temporary name and renamed when complete, so that a killed
+run leaves no incomplete result. The last two results of each stage are kept by default.
 """
 
 import dataclasses
@@ -23,12 +22,12 @@ from registry.errors import EnvironmentMissing
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 KEPT_PER_STAGE = 2
-_NEEDED_BYTES = 3 << 29  # The stages of one video take about 1.5 GB.
+_NEEDED_BYTES = 3 << 29  # the results of one video take about 1.5 GB
 _MANIFEST = "manifest.json"
 
 
 def canonical_json(value: Any) -> str:
-    """Serialise dataclasses and plain values so that equal values give equal text."""
+    """Return dataclasses and plain values as JSON; equal values give equal text."""
 
     def default(item: Any) -> Any:
         if dataclasses.is_dataclass(item) and not isinstance(item, type):
@@ -41,20 +40,20 @@ def canonical_json(value: Any) -> str:
 
 
 def fingerprint(stage: str, code: Sequence[str], inputs: Any, upstream: tuple[str, ...]) -> str:
-    """Fingerprint a stage: 16 hex digits over everything that its result depends on.
+    """Return the fingerprint of a stage: 16 hex digits of the SHA-256 over all that its result depends on.
 
     Args:
         stage: its name.
-        code: digests of the code that makes it (`code_digest`).
-        inputs: its options, and whatever else goes in: dataclasses and plain values.
-        upstream: fingerprints of the stages that it reads, or the input's digest.
+        code: digests of its code (`code_digest`).
+        inputs: its options and further inputs: dataclasses and plain values.
+        upstream: fingerprints of the stages that it reads, or the digest of the input.
     """
     parts = [stage, *code, canonical_json(inputs), *upstream]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def digest_input(path: Path) -> str:
-    """SHA-256 of a video file, or of the names and bytes of all files in a folder."""
+    """Return the SHA-256 of a file, or of the names and bytes of all files in a folder."""
     digest = hashlib.sha256()
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     for file in files:
@@ -67,10 +66,14 @@ def digest_input(path: Path) -> str:
 
 
 class StageStore:
-    """Finished stages of one input on disk."""
+    """Results of finished stages of one input, on disk."""
 
     def __init__(self, work_dir: Path, kept_per_stage: int = KEPT_PER_STAGE) -> None:
-        """Open or create the store; leftovers of dead processes are removed."""
+        """Open or create the store, and remove temporary files of processes that ended early.
+
+        Raises:
+            EnvironmentMissing: the folder cannot be written, or the disk is full.
+        """
         self.work_dir = work_dir
         self.kept_per_stage = kept_per_stage
         try:
@@ -93,39 +96,43 @@ class StageStore:
         return self.work_dir / f"{number:02d}_{stage}-{key}"
 
     def has(self, number: int, stage: str, key: str) -> bool:
-        """Tell whether the stage is finished under this fingerprint."""
+        """Return whether a result with this fingerprint exists."""
         return (self._folder(number, stage, key) / _MANIFEST).is_file()
 
     def load(self, cls: type[T], number: int, stage: str, key: str) -> T:
-        """Load a finished stage's result and mark it as used."""
+        """Load a result and set its time of last use to now."""
         folder = self._folder(number, stage, key)
         os.utime(folder)
         return artifacts.load(cls, folder)
 
     def manifest(self, number: int, stage: str, key: str) -> dict:
-        """Return what was recorded when the stage finished: time, memory, notes, config."""
+        """Return the record of a result: time, memory, notes, config."""
         return json.loads((self._folder(number, stage, key) / _MANIFEST).read_text())
 
     def note_published(self, scene_id: str, revision: str, keys: dict[str, str]) -> None:
-        """Remember what a scene was made of: an equal bundle that was published before keeps its own report."""
+        """Record the fingerprints that a published scene was made from; an equal bundle may hold an older report."""
         path = self.work_dir / f"published-{scene_id}.json"
         partial = self.work_dir / f"tmp-{os.getpid()}-{path.name}"
         partial.write_text(canonical_json({"revision": revision, "stage_keys": keys}))
-        os.replace(partial, path)
+        partial.replace(path)
 
     def scratch(self, stage: str) -> Path:
-        """Make an empty folder for a stage's temporary files; `discard` it when done."""
+        """Create an empty folder for temporary files of a stage; remove it with `discard`."""
         folder = self.work_dir / f"tmp-{os.getpid()}-{stage}-scratch"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         return folder
 
     def discard(self, folder: Path) -> None:
-        """Remove a scratch folder."""
+        """Remove a folder of `scratch`."""
         shutil.rmtree(folder, ignore_errors=True)
 
     def save(self, value: Any, number: int, stage: str, key: str, record: dict) -> None:
-        """Write a finished stage atomically, then drop its oldest siblings."""
+        """Write a result atomically, then delete the stage's least recently used results beyond `kept_per_stage`.
+
+        Raises:
+            EnvironmentMissing: the disk is full or not writable.
+        """
         target = self._folder(number, stage, key)
         partial = self.work_dir / f"tmp-{os.getpid()}-{stage}"
         shutil.rmtree(partial, ignore_errors=True)
@@ -133,9 +140,9 @@ class StageStore:
             artifacts.save(value, partial)
             (partial / _MANIFEST).write_text(canonical_json(record))
             _sync_folder(partial)
-            if target.exists():  # Another process finished the same work first, or a damaged leftover.
+            if target.exists():  # of another process, or damaged
                 shutil.rmtree(target)
-            os.rename(partial, target)
+            partial.rename(target)
         except OSError as error:
             shutil.rmtree(partial, ignore_errors=True)
             raise EnvironmentMissing(
@@ -168,7 +175,7 @@ def _is_alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
+        pass
     return True
 
 

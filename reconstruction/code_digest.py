@@ -1,8 +1,8 @@
-"""Digest of the code behind a module: the module and all that it imports, directly or not, in this project.
+"""Digest of the code of a module and of all modules of this project that it imports, directly or indirectly.
 
-Comments, docstrings and layout do not count: the digest is over syntax trees. Files that a package reads beside its
-code (weights, prompts, word lists) count with the modules of their folder. Imports inside functions are followed,
-those for type checkers alone are not. Nothing is imported.
+The digest is over syntax trees without docstrings; comments and layout do not count. Data files beside the modules
+(weights, prompts, word lists) count. Imports inside functions are followed, imports under `TYPE_CHECKING` are not. The
+modules are parsed, not imported.
 """
 
 import ast
@@ -16,11 +16,15 @@ _DATA = (".txt", ".safetensors")
 
 
 def code_digest(module: str, packages: tuple[str, ...] = PACKAGES) -> str:
-    """Return the SHA-256 over a module and all modules of `packages` that it imports, with their data files.
+    """Return the SHA-256 over a module, all modules of `packages` that it imports, and their data files.
 
     Args:
         module: dotted name.
-        packages: top-level packages whose imports are followed; the module may be of another one.
+        packages: top-level packages whose imports are followed; the module itself may belong to another one.
+
+    Raises:
+        ModuleNotFoundError: the module's top-level package is not installed.
+        ValueError: a module has a relative import.
     """
     digest = hashlib.sha256()
     folders = set()
@@ -35,7 +39,7 @@ def code_digest(module: str, packages: tuple[str, ...] = PACKAGES) -> str:
 
 
 def modules_behind(module: str, packages: tuple[str, ...] = PACKAGES) -> list[str]:
-    """Return the names of the modules that a module imports, directly or not, and its own, in order."""
+    """Return the sorted names of a module and of all modules of `packages` that it imports, directly or indirectly."""
     found, open_ends = {module}, [module]
     while open_ends:
         new = set(_source(_file_of(open_ends.pop()), packages)[1]) - found
@@ -50,7 +54,7 @@ def tree_digest(file: Path) -> str:
 
 
 def imported_modules(file: Path, packages: tuple[str, ...] = PACKAGES) -> frozenset[str]:
-    """Return the modules of `packages` that a file imports, anywhere but for type checkers alone."""
+    """Return the modules of `packages` that a file imports, except under `TYPE_CHECKING`."""
     return _source(file, packages)[1]
 
 
@@ -70,8 +74,9 @@ def _parsed(file: Path, mtime_ns: int, size: int, packages: tuple[str, ...]) -> 
         elif isinstance(node, ast.ImportFrom):
             if node.level:
                 raise ValueError(
-                    f"{file}:{node.lineno}: relative imports are not followed, write the whole name"
+                    f"{file}:{node.lineno}: relative imports are not followed; write the full module name"
                 )
+            assert node.module is not None
             inside = {f"{node.module}.{alias.name}" for alias in node.names}
             modules = {name for name in inside if name.split(".")[0] in packages and _exists(name)}
             imported |= modules if modules == inside else modules | {node.module}
@@ -80,7 +85,7 @@ def _parsed(file: Path, mtime_ns: int, size: int, packages: tuple[str, ...]) -> 
 
 
 class _Bare(ast.NodeTransformer):
-    """Drops docstrings and what only type checkers read."""
+    """Removes docstrings and `if TYPE_CHECKING:` blocks."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
@@ -122,7 +127,7 @@ def _bytes_digest(file: Path, mtime_ns: int, size: int) -> bytes:
 
 
 def _data_files(folder: Path) -> list[Path]:
-    """Return the data files in a folder and in those below it that hold no code."""
+    """Return the data files in a folder and in its subfolders without Python files."""
     out = []
     for item in sorted(folder.iterdir()):
         if item.suffix in _DATA:

@@ -1,7 +1,6 @@
-"""The configuration of a whole run: one nested config per stage, and the presets.
+"""Options of a run: one config per stage, presets, and parsing of `--set stage.field=value`.
 
-Every field can be set from the command line as `--set stage.field=value`; `simrecon reconstruct --list-options`
-prints them all with their meaning.
+`simrecon reconstruct --list-options` prints all options with their meaning.
 """
 
 import dataclasses
@@ -15,6 +14,7 @@ from typing import Any, Literal
 
 from reconstruction.assembly import ASSEMBLY_PRESETS, AssemblyConfig
 from reconstruction.assets import ASSETS_PRESETS, AssetsConfig
+from reconstruction.core.plugins import Plugin, built_in_names, find_plugin, plugins_of
 from reconstruction.depth import DEPTH_PRESETS, DepthConfig
 from reconstruction.frames import FRAMES_PRESETS, FramesConfig
 from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig
@@ -32,7 +32,7 @@ PRESET_NAMES: tuple[str, ...] = typing.get_args(Preset)
 
 @dataclass(frozen=True, kw_only=True)
 class PipelineConfig:
-    """Everything that shapes the result of a run."""
+    """Options of all stages."""
 
     frames: FramesConfig = field(default_factory=FramesConfig)
     poses: PosesConfig = field(default_factory=PosesConfig)
@@ -48,7 +48,11 @@ class PipelineConfig:
 
     @classmethod
     def from_preset(cls, name: str) -> "PipelineConfig":
-        """Return the preset `fast`, `default` or `quality`."""
+        """Return the preset `fast`, `default` or `quality`.
+
+        Raises:
+            UsageError: there is no such preset.
+        """
         if name not in PRESET_NAMES:
             raise UsageError(f"unknown preset {name!r}; there are {', '.join(PRESET_NAMES)}")
         return cls(
@@ -66,7 +70,7 @@ class PipelineConfig:
         )
 
     def with_seed(self, seed: int) -> "PipelineConfig":
-        """Return the config with `seed` in every stage that draws random numbers."""
+        """Return a copy with this seed in every stage that has one."""
         changed = {}
         for stage in dataclasses.fields(self):
             config = getattr(self, stage.name)
@@ -75,10 +79,10 @@ class PipelineConfig:
         return dataclasses.replace(self, **changed)
 
     def with_option(self, text: str) -> "PipelineConfig":
-        """Return the config with one `stage.field=value` changed.
+        """Return a copy with one option changed, given as `stage.field=value`.
 
         Raises:
-            UsageError: the stage or field does not exist, or the value has the wrong type.
+            UsageError: there is no such stage, option or backend, or the value cannot be parsed.
         """
         path, equals, value = text.partition("=")
         stage, dot, name = path.strip().partition(".")
@@ -99,11 +103,22 @@ class PipelineConfig:
             changed = dataclasses.replace(config, **{name: _parse(hints[name], value.strip())})
         except (ValueError, TypeError) as error:
             raise UsageError(f"--set {text}: {error}") from error
+        if built_in_names(type(config), name):
+            find_plugin(f"{stage}.{name}", getattr(changed, name), type(config))
         return dataclasses.replace(self, **{stage: changed})
+
+    def plugins(self) -> list[Plugin]:
+        """Return the backends of other packages that the options name.
+
+        Raises:
+            UsageError: an option names a backend that is neither built in nor installed.
+        """
+        stages = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self)]
+        return [plugin for name, config in stages for plugin in plugins_of(name, config)]
 
 
 def _parse(hint: Any, text: str) -> Any:
-    """Read a command-line value as the type of a config field."""
+    """Convert the text of an option to the type of its config field."""
     origin = typing.get_origin(hint)
     if origin is Literal:
         choices = {str(c): c for c in typing.get_args(hint)}
@@ -111,6 +126,8 @@ def _parse(hint: Any, text: str) -> Any:
             raise ValueError(f"{text!r} is not one of {', '.join(choices)}")
         return choices[text]
     if origin in (typing.Union, types.UnionType):
+        if str in typing.get_args(hint):
+            return text  # name of a backend
         if text.lower() == "none":
             return None
         return _parse(next(a for a in typing.get_args(hint) if a is not type(None)), text)
@@ -127,7 +144,7 @@ def _parse(hint: Any, text: str) -> Any:
 
 
 def describe_options() -> str:
-    """List every option with its default and meaning, for people."""
+    """Return a text with every option, its default and its meaning."""
     lines = []
     for stage in dataclasses.fields(PipelineConfig):
         config = getattr(PipelineConfig(), stage.name)
@@ -140,15 +157,17 @@ def describe_options() -> str:
 
 
 def _field_docs(cls: type) -> dict[str, str]:
-    """Read the docstrings under a dataclass's fields (Python drops them at run time)."""
+    """Return the string literals below the fields of a dataclass, from its source (Python drops them)."""
     import ast
     import textwrap
 
-    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+    (found,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+    assert isinstance(found, ast.ClassDef)
     docs = {}
-    for node, after in itertools.pairwise(body):
+    for node, after in itertools.pairwise(found.body):
         if (
             isinstance(node, ast.AnnAssign)
+            and isinstance(node.target, ast.Name)
             and isinstance(after, ast.Expr)
             and isinstance(after.value, ast.Constant)
         ):

@@ -1,16 +1,16 @@
-"""Table of costs: the report of a bundle in, time and memory of each step out, as text or JSON."""
+"""Time and memory of each step of a run: the report of a bundle in, text or JSON out."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from reconstruction.pipeline import STAGE_NAMES
 
 PUBLISH = "publish"  # writing the bundle
-OTHER = "other"  # the rest of the run: digesting the input, saving and loading what stages made
+OTHER = "other"  # the rest of the run: hashing the input, saving and loading results
 
 
 @dataclass(frozen=True)
 class CostRow:
-    """Time and memory of one step of a run; None where not measured."""
+    """Time and memory of one step; None where not measured."""
 
     name: str
     wall_s: float
@@ -20,15 +20,15 @@ class CostRow:
 
     @property
     def cores(self) -> float | None:
-        """How many cores were busy on average."""
+        """Mean number of busy cores; None where it cannot be told."""
         return None if self.cpu_s is None or self.wall_s < 0.05 else self.cpu_s / self.wall_s
 
 
 def cost_rows(report: dict) -> list[CostRow]:
-    """Read what each step cost from a bundle's `report`, in the order in which the steps ran.
+    """Return the cost of each step, in the order in which they ran.
 
     Args:
-        report: the `report` of a `scene.json`, also of one that was written by an earlier version.
+        report: `report` of a `scene.json`; those of earlier versions lack some figures.
     """
     times, volatile = report["timings_s"], report.get("volatile", {})
     order = [*STAGE_NAMES, PUBLISH, OTHER]
@@ -46,7 +46,7 @@ def cost_rows(report: dict) -> list[CostRow]:
 
 
 def describe_costs(report: dict) -> str:
-    """Lay out what each step cost as a table for people, with the total below."""
+    """Return the costs as a text table with a row of totals."""
     rows = cost_rows(report)
     total = CostRow(
         "total",
@@ -66,16 +66,9 @@ def describe_costs(report: dict) -> str:
 
 
 def costs_json(report: dict) -> dict[str, dict]:
-    """Return the same figures for programs: step -> wall_s, cpu_s, peak_memory_mb, cached."""
-    return {
-        row.name: {
-            "wall_s": row.wall_s,
-            "cpu_s": row.cpu_s,
-            "peak_memory_mb": row.peak_memory_mb,
-            "cached": row.cached,
-        }
-        for row in cost_rows(report)
-    }
+    """Return the costs as JSON: step -> wall_s, cpu_s, peak_memory_mb, cached."""
+    rows = [asdict(row) for row in cost_rows(report)]
+    return {row.pop("name"): row for row in rows}
 
 
 def _shown(value: float | None, digits: int = 1) -> str:

@@ -1,15 +1,15 @@
-"""From a video to a scene: the stages in order, what each reads and what it makes. The first file to read.
+"""The stages in order, with the inputs and the result of each. Read this file first.
 
     frames -> poses -> depth -> world -> gaussians -> surface
     -> instances (-> views) -> assets -> scene_graph -> assembly -> publish
 
-Each stage is a function from artifacts (`reconstruction.core.types`) to an artifact, with options of its own. Depth
-comes before the world frame, because the normals of depth maps tell gravity. Gaussians are fitted in the space of the
-poses, so that another scale needs no other fit; they correct the depth maps. From `surface` on everything is in
-metres, +z up, floor at z = 0. `views` is done only where a stage or a command asks for it.
+A stage is a function from artifacts (`reconstruction.core.types`) and its options to an artifact. `depth` precedes
+`world`, as gravity is estimated from the normals of the depth maps. `gaussians` are fitted in the space of the poses
+(`sfm`), so that another scale needs no other fit; they correct the depth maps. From `surface` on all is in world space:
+metres, +z up, floor at z = 0. `views` runs only if a stage or a command needs it.
 
-`runner.Run` runs the stages: it keeps results, measures, corrects. `video_to_scene.reconstruct` is the whole way, from
-the video to the registry.
+`runner.Run` runs the stages and caches their results. `video_to_scene.reconstruct` runs everything, from the video to
+the registry.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,25 +49,25 @@ from reconstruction.world import find_world
 
 @dataclass(frozen=True)
 class Call:
-    """Inputs of a stage: its options, the results that it declares, folders."""
+    """Inputs of a stage: the video, its options, results of other stages, folders."""
 
     video: Path
     options: Any
-    results: Mapping[str, Any]  # of the stages that it needs, by name
-    scratch: Path  # empty, removed afterwards
-    kept: Path  # the run's own folder, for what is worth keeping between runs
+    results: Mapping[str, Any]  # of the stages that it reads, by name
+    scratch: Path  # empty folder, removed when the stage ends
+    kept: Path  # the run's work folder, for data that later runs reuse
     progress: Progress
 
     def __getitem__(self, stage: str) -> Any:
-        """Return the result of a stage before."""
+        """Return the result of another stage."""
         return self.results[stage]
 
     def in_world(self) -> tuple[PosedFrames, DepthMaps]:
-        """Return frames and corrected depth maps in world space, metres."""
+        """See `in_world`."""
         return in_world(self.results)
 
     def view_scene(self) -> ViewScene:
-        """Return the Gaussians, surface and things that views are chosen of."""
+        """See `view_scene`."""
         return view_scene(self.results)
 
 
@@ -126,17 +126,22 @@ def _nothing(options: Any) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage."""
+    """A stage: its function, its inputs, and what its fingerprint covers."""
 
     name: str
     make: Callable[[Call], Any]
-    package: str  # its code; a change there, or in what it imports, makes the stage anew
+    package: str  # its code; the stage runs again if this, or a module that it imports, changes
     produces: type
-    needs: tuple[str, ...]
-    needs_also: Callable[[Any], tuple[str, ...]] = _nothing  # by its options
-    outside: Callable[[Any], tuple[str, ...]] = _nothing  # what its options name, for the fingerprint
-    options: str = ""  # name of its options, where it is not that of the stage
-    on_demand: bool = False  # done only where another stage or a command needs it
+    needs: tuple[str, ...]  # stages that it reads
+    needs_also: Callable[[Any], tuple[str, ...]] = _nothing  # further ones, by its options
+    outside: Callable[[Any], tuple[str, ...]] = _nothing  # digests of files and models that its options name
+    options: str = ""  # its field in `PipelineConfig`; empty: the stage's name
+    on_demand: bool = False  # runs only if another stage or a command needs it
+
+    @property
+    def option_group(self) -> str:
+        """Its field in `PipelineConfig`."""
+        return self.options or self.name
 
 
 _METRIC = ("poses", "gaussians", "world")
@@ -178,12 +183,12 @@ DEFAULT_STAGE_NAMES = tuple(stage.name for stage in STAGES if not stage.on_deman
 
 
 def in_world(results: Mapping[str, Any]) -> tuple[PosedFrames, DepthMaps]:
-    """Return the posed frames and the depth maps that the Gaussians corrected, in world space, metres."""
+    """Return the posed frames and the corrected depth maps, in world space, metres."""
     world, scene = results["world"], results["gaussians"]
     return world.apply_to(scene.posed(results["poses"])), world.scale_depth(scene.depth)
 
 
 def view_scene(results: Mapping[str, Any]) -> ViewScene:
-    """Return Gaussians, surface and things in world space, the input of `reconstruction.views.find_views`."""
+    """Return Gaussians, surface and things in world space: the input of `reconstruction.views.find_views`."""
     gaussians = results["gaussians"].in_world(results["world"])
     return prepare_scene(gaussians, results["surface"], results["instances"], results["poses"].camera)

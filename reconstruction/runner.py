@@ -1,7 +1,7 @@
-"""Runs the stages of `pipeline` on one video: results are kept under fingerprints, measured, corrected.
+"""Runs the stages of `pipeline` on one video: computes results, or loads them from the stage cache.
 
-A stage is computed where no result is kept under its fingerprint: of its code, its options, the user's corrections,
-what its options name outside, and the fingerprints of the stages that it reads.
+The fingerprint of a stage covers its code, its options, the user's corrections, the files, models and packages that its
+options name, and the fingerprints of the stages that it reads.
 """
 
 import logging
@@ -15,6 +15,7 @@ from reconstruction.cache import StageStore, digest_input, fingerprint
 from reconstruction.code_digest import code_digest, tree_digest
 from reconstruction.config import PipelineConfig
 from reconstruction.core.compiling import compilation_shown
+from reconstruction.core.plugins import plugins_of
 from reconstruction.core.profiling import Usage, UsageMeter
 from reconstruction.core.progress import NO_PROGRESS, Progress, StageListener
 from reconstruction.core.types import DepthMaps, InstanceSet, PosedFrames
@@ -34,28 +35,28 @@ _EDITING = "reconstruction.editing.corrections"
 
 @dataclass
 class Run:
-    """One reconstruction in progress: results by stage name, with their fingerprints and costs."""
+    """One reconstruction in progress: results by stage name, their fingerprints and costs."""
 
     video: Path
     config: PipelineConfig
     store: StageStore
     overrides: Overrides = field(default_factory=Overrides)
-    oracle: "Oracle | None" = None  # stages whose output the truth replaces, for measuring
+    oracle: "Oracle | None" = None  # stages that the ground truth replaces, for evaluation
     listener: StageListener = NO_PROGRESS
     results: dict[str, Any] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)
     usage: dict[str, Usage] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    input_digest: str = ""  # of the video; computed where it is not given
-    computed: set[str] = field(default_factory=set)  # stages that this run did itself; the others were kept
+    input_digest: str = ""  # of the video; computed if not given
+    computed: set[str] = field(default_factory=set)  # stages that this run computed; the others were loaded
     started: float = field(default_factory=time.perf_counter)
 
     def __post_init__(self) -> None:
-        """Digest the input once."""
+        """Compute the digest of the input."""
         self.input_digest = self.input_digest or digest_input(self.video)
 
     def execute(self, until: str = STAGE_NAMES[-1]) -> None:
-        """Run or load every stage up to and including `until`, and of those on demand what is asked for."""
+        """Compute or load all stages up to and including `until`; stages on demand only if one of these reads them."""
         wanted = self.wanted_stages()
         if until not in wanted:
             wanted = tuple(name for name in STAGE_NAMES if name in (*wanted, until))
@@ -66,45 +67,45 @@ class Run:
                 return
 
     def complete(self, name: str) -> None:
-        """Run or load one stage whose inputs are among the results already."""
+        """Compute or load one stage; `results` must hold its inputs."""
         self._execute_stage(next(stage for stage in STAGES if stage.name == name), (name,))
 
     def wanted_stages(self) -> tuple[str, ...]:
-        """Return the stages that make this scene, in order."""
+        """Return the stages that this config needs, in order."""
         asked = {name for stage in STAGES for name in self.needs_of(stage)}
         return tuple(stage.name for stage in STAGES if not stage.on_demand or stage.name in asked)
 
     def needs_of(self, stage: Stage) -> tuple[str, ...]:
-        """Return which stages a stage reads under this config."""
+        """Return the stages that a stage reads under this config."""
         return tuple(dict.fromkeys((*stage.needs, *stage.needs_also(self.options_of(stage)))))
 
     def options_of(self, stage: Stage) -> Any:
-        """Return a stage's config."""
-        options = getattr(self.config, stage.options or stage.name)
+        """Return the options of a stage."""
+        options = getattr(self.config, stage.option_group)
         if stage.name == "gaussians" and self.oracle is not None and "depth" in self.oracle.stages:
-            return replace(options, refine_depth=False)  # true depth has nothing to gain
+            return replace(options, refine_depth=False)  # true depth needs no correction
         return options
 
     def in_world(self) -> tuple[PosedFrames, DepthMaps]:
-        """Return the posed frames and the depth maps that the Gaussians corrected, in world space, metres."""
+        """See `pipeline.in_world`."""
         return in_world(self.results)
 
     def view_scene(self) -> "ViewScene":
-        """Return Gaussians, surface and things in world space, the input of `reconstruction.views.find_views`."""
+        """See `pipeline.view_scene`."""
         return view_scene(self.results)
 
     def lens(self) -> Lens:
-        """Return the map from the film's pixels to those of its straightened frames."""
+        """Return the map from pixels of the video to pixels of the undistorted frames."""
         return Lens.measure(self.results["frames"], self.results["poses"])
 
     def pointer(self, found: InstanceSet) -> Pointer:
-        """Return the lookup of addresses in the overrides: things, surface, keyframes."""
+        """Return the lookup of things and places that overrides refer to."""
         posed, depth = self.in_world()
         surface = self.results["surface"]
         return Pointer(found, surface, Footage(posed, depth, surface, self.lens()))
 
     def _execute_stage(self, stage: Stage, wanted: tuple[str, ...]) -> None:
-        number = STAGE_NAMES.index(stage.name) + 1  # of its folder
+        number = STAGE_NAMES.index(stage.name) + 1  # prefix of its folder
         corrections = self.overrides.fingerprint_of_stage(stage.name)
         key = self.keys[stage.name] = self.key_of(stage, corrections)
         kept = self.store.has(number, stage.name, key)
@@ -117,7 +118,7 @@ class Run:
                     self._keep(number, stage, key, lambda noted: self._compute(stage, noted), shown)
             self.computed.add(stage.name)
         manifest = self.store.manifest(number, stage.name, key)
-        # Always continue from what is on disk: a resumed run then computes with the very same values.
+        # Load also what was just computed: a resumed run continues with the same values.
         self.results[stage.name] = self.store.load(stage.produces, number, stage.name, key)
         self.usage[stage.name] = Usage(**manifest["usage"])
         self.notes.extend(
@@ -127,7 +128,7 @@ class Run:
         self.listener.end_stage(stage.name, None if kept else self.usage[stage.name])
 
     def key_of(self, stage: Stage, corrections: list) -> str:
-        """Return a stage's fingerprint, with these corrections."""
+        """Return the fingerprint of a stage with these corrections."""
         upstream = tuple(self.keys[name] for name in self.needs_of(stage)) or (self.input_digest,)
         options = self.options_of(stage)
         said_by_truth = self.oracle.of_stage(stage.name) if self.oracle is not None else []
@@ -138,7 +139,8 @@ class Run:
         ]
         if corrections:
             code.append(code_digest(_EDITING))
-        inputs = (options, corrections, stage.outside(options), said_by_truth)
+        plugins = [(str(plugin), plugin.digest()) for plugin in plugins_of(stage.option_group, options)]
+        inputs = (options, corrections, stage.outside(options), plugins, said_by_truth)
         return fingerprint(stage.name, code, inputs, upstream)
 
     def _keep(
@@ -150,7 +152,7 @@ class Run:
         shown: Progress,
         before: dict | None = None,
     ) -> None:
-        """Make a stage's result and keep it; `before` is the manifest of the result that it was made from."""
+        """Compute and save a result; `before`: manifest of the uncorrected result that it is computed from."""
         notes = list(before["notes"]) if before else []
         with UsageMeter() as meter:
             result = make(_NoteTaker(shown, notes))
@@ -160,7 +162,7 @@ class Run:
         self.store.save(result, number, stage.name, key, record)
 
     def _keep_corrected(self, number: int, stage: Stage, key: str, shown: Progress) -> None:
-        """Correct a stage's result as the user says; the result before that is kept too, for the next correction."""
+        """Apply the user's corrections to a result; the uncorrected result is saved, too, for other corrections."""
         from reconstruction.editing.corrections import corrected
 
         plain_key = self.key_of(stage, [])
@@ -191,7 +193,7 @@ class Run:
 
 
 class _NoteTaker:
-    """Passes progress on and keeps the notes for the stage's manifest."""
+    """Passes progress on, and collects the notes for the manifest of the stage."""
 
     def __init__(self, listener: Progress, notes: list[str]) -> None:
         self._listener, self._notes = listener, notes

@@ -1,4 +1,4 @@
-"""From a video to a registered scene: all stages, a second pass where the scale asks for one, the published bundle."""
+"""Reconstruction of a video as a registered scene: all stages, passes at other scales if needed, publication."""
 
 import time
 from dataclasses import dataclass, replace
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from reconstruction.measure.oracle import Oracle
 
 _OBJECT_SCALE_PASSES = 3
-_OBJECT_SCALE_TOLERANCE = 0.015  # half of what the scale is said to be sure to
+_OBJECT_SCALE_TOLERANCE = 0.015  # relative; half of the 1-sigma that is reported for such a scale
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What `reconstruct` returns."""
+    """Result of `reconstruct`."""
 
     record: SceneRecord
     run: Run
 
     @property
     def env_id(self) -> str:
-        """The id to give to `gym.make`."""
+        """Id for `gym.make`."""
         return f"SimRecon/{self.record.scene_id}"
 
 
@@ -50,38 +50,37 @@ def reconstruct(
     keep_results: int = KEPT_PER_STAGE,
     listener: StageListener = NO_PROGRESS,
 ) -> Reconstruction:
-    """Turn a video (or a folder of images) into a registered scene.
+    """Reconstruct a video, or a folder of images, as a scene of the registry.
 
     Args:
         video: any file that ffmpeg decodes, or a folder of images in name order.
-        scene_id: id in the registry, `[a-z0-9_]+`; None takes the next free `sceneNNNN`.
-        registry_root: where scenes live; None is `$SIMRECON_HOME/registry` or `~/.simrecon/registry`.
-        work_dir: where finished stages are kept for resuming; None is a folder beside the registry, named by the
-            input's digest.
-        config: options of every stage.
+        scene_id: id in the registry, `[a-z0-9_]+`; None: the next free `sceneNNNN`.
+        registry_root: folder of the registry; None: `$SIMRECON_HOME/registry` or `~/.simrecon/registry`.
+        work_dir: folder of the stage cache; None: a folder beside the registry, named by the digest of the input.
+        config: options of all stages.
         overrides: the user's corrections.
-        oracle: stages that the ground truth replaces, to measure what they cost.
-        require_stable: refuse to publish a scene in which an object does not stay put.
-        keep_results: how many results of each stage stay in the work folder; more of them make going back and forth
-            between several configs cheap.
-        listener: told of stages, progress and notes.
+        oracle: stages that the ground truth replaces, to measure their share of the errors.
+        require_stable: do not publish a scene in which an object moves in the final simulation.
+        keep_results: number of results of each stage that stay in the stage cache.
+        listener: receives stages, progress and notes.
 
     Raises:
-        UsageError: the video does not exist, or the id is malformed.
+        UsageError: the video does not exist, the id is malformed, or an option names an unknown backend.
         InputError: the video cannot be reconstructed.
         SceneBusy: another process is reconstructing the same scene into the same registry.
-        EnvironmentMissing: no space, no permission, something not installed.
+        EnvironmentMissing: no disk space, no permission, or a missing package, key or endpoint.
     """
     started = time.perf_counter()
     video = Path(video)
     if not video.exists():
         raise UsageError(f"{video}: no such file or folder")
     config = config or PipelineConfig()
-    _refuse_missing(config)
+    _check_backends(config)
     registry = SceneRegistry(registry_root, create=True)
     holder = registry.hold(scene_id) if scene_id is not None else registry.reserve_next_id()
     with holder as held_id:
         scene_id = scene_id or held_id
+        assert scene_id is not None
         digest = digest_input(video)
         folder = Path(work_dir) if work_dir else registry.root.parent / "work" / digest[:16]
         run = Run(
@@ -101,8 +100,10 @@ def reconstruct(
     return Reconstruction(record, run)
 
 
-def _refuse_missing(config: PipelineConfig) -> None:
-    """Raise what a backend lacks now, not minutes later: a folder, an endpoint, a key."""
+def _check_backends(config: PipelineConfig) -> None:
+    """Raise now, not minutes later, if a backend lacks its package, folder, endpoint or key."""
+    for plugin in config.plugins():
+        plugin.load()
     if config.instances.masks == "folder":
         from reconstruction.instances.masks import load_mask_backend
 
@@ -126,7 +127,7 @@ def _refuse_missing(config: PipelineConfig) -> None:
 
 
 def _with_object_scale(run: Run) -> Run:
-    """Apply `--scale object:ID.height=H`: run again at the scale that its height asks for, until it is that high."""
+    """Apply `--scale object:ID.height=H`: run again at other scales until the object has height H."""
     from reconstruction.world import parse_scale, settle_object_height
 
     request = parse_scale(run.config.world.scale) if run.config.world.scale else None
@@ -149,9 +150,9 @@ def _with_object_scale(run: Run) -> Run:
         objects = again.results["assets"].objects
         if not objects:
             raise InputError(
-                f"--scale {run.config.world.scale}: at that scale nothing is found any more. Is it in metres?"
+                f"--scale {run.config.world.scale}: no object is found at that scale. Is the height in metres?"
             )
-        # Ids are given by size and may change with the scale; the place stays.
+        # Ids are ordered by size and may change with the scale; the place does not.
         return _height(min(objects, key=lambda item: np.linalg.norm(_place_in_sfm(again, item) - place)))
 
     best, error = settle_object_height(
@@ -176,5 +177,5 @@ def _height(item: ObjectAsset) -> float:
 
 
 def _place_in_sfm(run: Run, item: ObjectAsset) -> np.ndarray:
-    """Return where an object is in sfm space, which the scale does not change."""
+    """Return the position of an object in `sfm` space, (3,), which does not depend on the scale."""
     return np.linalg.solve(run.results["world"].world_from_sfm, item.world_from_object[:, 3])[:3]

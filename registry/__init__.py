@@ -1,4 +1,5 @@
-"""The registry of scenes: bundles on disk and an index of them. NumPy and the standard library only."""
+# pyright: strict
+"""Registry of scenes: scene bundles in folders and a SQLite index of them. NumPy and the standard library only."""
 
 from registry.bundle import (
     BundleBase,

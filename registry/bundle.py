@@ -1,8 +1,8 @@
-"""A scene bundle on disk: sealing one that we made, opening one that anybody made.
+# pyright: strict, reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+"""Scene bundles on disk: write the manifest of a new bundle, open and check an untrusted one.
 
-A bundle is a folder: `scene.json`, `manifest.json` (SHA-256 and size of every other file, and the revision)
-and the mesh files. Opening trusts nothing: schema, ranges, sizes, hashes and paths are checked; nothing is
-pickled.
+A bundle is a folder with `scene.json`, `manifest.json` (SHA-256 and size of every other file, and the revision)
+and mesh files. Opening checks the schema, value ranges, sizes, hashes and paths. Nothing is pickled.
 """
 
 import contextlib
@@ -14,58 +14,60 @@ import weakref
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from registry.errors import BundleError
 from registry.locks import lease_folder
 from registry.meshfiles import check_mesh_file
-from registry.schema import check_relative_path, referenced_files, validate_scene
+from registry.schema import JsonObject, as_object, check_relative_path, referenced_files, validate_scene
 
 MANIFEST_FORMAT = "simrecon.manifest/1"
+# Limits of a bundle; exceeding one raises BundleError.
 MAX_FILE_BYTES = 256 << 20
 MAX_TOTAL_BYTES = 4 << 30
 MAX_SCENE_JSON_BYTES = 64 << 20
-MAX_FILES = 20_000
-MAX_DEPTH = 8
+MAX_FILES = 20_000  # files and folders
+MAX_DEPTH = 8  # nested folders
+Files: TypeAlias = dict[str, tuple[str, int]]  # {path: (SHA-256, bytes)}
 _VOLATILE_REPORT_KEYS = ("timings_s", "peak_memory_mb", "volatile")
 
 
 @dataclass(frozen=True)
 class BundleCameras:
-    """The cameras of the video, OpenCV axes."""
+    """Intrinsics and poses of the video frames; OpenCV camera axes."""
 
     model: str  # "PINHOLE" | "OPENCV"
     width: int
     height: int
     params: np.ndarray  # float64: fx, fy, cx, cy (then k1, k2, p1, p2)
     indices: np.ndarray  # int32 (n,) decoded video frame numbers
-    times_s: np.ndarray  # float64 (n,)
+    times_s: np.ndarray  # float64 (n,) since the start of the video
     world_from_camera: np.ndarray  # float64 (n, 4, 4)
 
 
 @dataclass(frozen=True)
 class BundleBase:
-    """A floor, wall or ceiling. Its meshes are in world space."""
+    """A floor, wall or ceiling; meshes in world space."""
 
     id: int
     label: str
     mesh: str  # path in the bundle
     collision: tuple[str, ...]  # paths in the bundle; may be empty
-    plane: np.ndarray  # float64 (4,) n . x + d = 0, n into the room
+    plane: np.ndarray  # float64 (4,) n . x + d = 0; the unit normal n points into the room
     observed: bool
 
 
 @dataclass(frozen=True)
 class BundleObject:
-    """One placed object. Its meshes are in object space (+z up, metres)."""
+    """A placed object; meshes in object space (+z up, metres)."""
 
     id: int
     label: str
     label_confidence: float
     world_from_object: np.ndarray  # float64 (4, 4) rigid
-    scale: np.ndarray  # float64 (3,) extents of its box, metres
+    scale: np.ndarray  # float64 (3,) extents of its bounding box, metres
     visual: str  # path in the bundle
     collision: tuple[str, ...]  # paths in the bundle
     material: str
@@ -74,55 +76,52 @@ class BundleObject:
     center_of_mass: np.ndarray  # float64 (3,) object space
     inertia: (
         np.ndarray | None
-    )  # float64 (3, 3) about the centre of mass, object axes; None where the bundle has none
+    )  # float64 (3, 3) kg m^2 about the centre of mass, object axes; None: not in the bundle
     friction: float
     restitution: float
-    ranges: dict[
-        str, tuple[float, float]
-    ]  # (low, high) of mass_kg, friction, restitution; {} where it has none
+    ranges: dict[str, tuple[float, float]]  # (low, high) of mass_kg, friction, restitution; may be empty
     dynamic: bool
-    relation_fixed: bool  # attached to its parent rather than resting on it
-    provenance: dict
-    views: tuple  # video frame numbers, best first
-    name: str = ""  # noun phrase that no other object of the scene has; "" in bundles of before
+    relation_fixed: bool  # attached to its parent, not resting on it
+    provenance: JsonObject
+    views: tuple[int, ...]  # video frame numbers, best first
+    name: str = ""  # noun phrase, unique in the scene; "" in older bundles
 
 
 @dataclass(frozen=True)
 class BundleEdge:
-    """(child, relation, parent) of the scene graph."""
+    """An edge (child, relation, parent) of the scene graph."""
 
     child: int
     relation: str  # "supported_by" | "attached_to"
     parent: int
     confidence: float
     evidence: Any
-    said_by: str = ""  # "geometry", a model, "assembly", "user"; "" in bundles of before
+    said_by: str = ""  # source: "geometry", a model, "assembly", "user"; "" in older bundles
 
 
 class SceneBundle:
-    """One revision of one scene, read only. Make it with `SceneBundle.open`.
+    """One revision of a scene, read only. Create it with `SceneBundle.open`.
 
-    While it lives it holds a shared lock on its folder, so that publishing a newer revision does not remove
-    the files under its feet.
+    It holds a shared lock on its folder for its lifetime. Publishing a newer revision keeps a locked folder.
     """
 
-    def __init__(self, root: Path, scene: dict, revision: str, files: dict[str, tuple[str, int]]) -> None:
+    def __init__(self, root: Path, scene: JsonObject, revision: str, files: Files) -> None:
         self.root = root
         self.scene = scene
         self.revision = revision
-        self.files = files  # {path: (sha256, bytes)} of everything but manifest.json
+        self.files = files  # all but manifest.json
 
     @classmethod
     def open(cls, folder: Path, check_hashes: bool = True) -> "SceneBundle":
-        """Open a bundle that anybody may have made.
+        """Open and check an untrusted bundle.
 
         Args:
             folder: The bundle's folder.
-            check_hashes: Also read every file and compare its SHA-256. Without it the schema, the list of
-                files, their sizes and the hash of scene.json are still checked.
+            check_hashes: Compare the SHA-256 of every file. If false, only the schema, the list of files, their
+                sizes and the hash of scene.json are checked.
 
         Raises:
-            BundleError: it is malformed, unsafe or damaged.
+            BundleError: The bundle is malformed, unsafe or damaged.
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -142,10 +141,10 @@ class SceneBundle:
         return bundle
 
     def resolve(self, path: str) -> Path:
-        """Return where a file of the bundle lies; never outside the folder.
+        """Return the location on disk of a file of the bundle, always inside the folder.
 
         Raises:
-            BundleError: the path is unsafe, is not in the manifest, or leads through a symbolic link.
+            BundleError: The path is unsafe, is not in the manifest, or contains a symbolic link.
         """
         check_relative_path(path, f"bundle {self.root}")
         if path not in self.files:
@@ -159,8 +158,9 @@ class SceneBundle:
 
     @cached_property
     def cameras(self) -> BundleCameras:
-        """The cameras of the video."""
+        """Cameras of the video frames."""
         c, frames = self.scene["cameras"], self.scene["cameras"]["frames"]
+        poses = np.array([f["world_from_camera"] for f in frames], np.float64)
         return BundleCameras(
             model=c["model"],
             width=c["width"],
@@ -168,14 +168,12 @@ class SceneBundle:
             params=np.array(c["params"], np.float64),
             indices=np.array([f["index"] for f in frames], np.int32),
             times_s=np.array([f["time_s"] for f in frames], np.float64),
-            world_from_camera=np.array([f["world_from_camera"] for f in frames], np.float64).reshape(
-                -1, 4, 4
-            ),
+            world_from_camera=poses.reshape(-1, 4, 4),
         )
 
     @cached_property
     def base(self) -> tuple[BundleBase, ...]:
-        """Floor, walls, ceiling."""
+        """Floors, walls and ceilings."""
         return tuple(
             BundleBase(
                 id=b["id"],
@@ -190,7 +188,7 @@ class SceneBundle:
 
     @cached_property
     def objects(self) -> tuple[BundleObject, ...]:
-        """The placed objects."""
+        """Placed objects."""
         arrays = ("world_from_object", "scale", "center_of_mass")
         plain = ("id", "label", "label_confidence", "visual", "material", "density_kg_m3", "mass_kg")
         plain += ("friction", "restitution", "dynamic", "provenance")
@@ -210,7 +208,7 @@ class SceneBundle:
 
     @cached_property
     def edges(self) -> tuple[BundleEdge, ...]:
-        """The scene graph."""
+        """Edges of the scene graph."""
         keys = ("child", "relation", "parent", "confidence", "evidence")
         return tuple(
             BundleEdge(**{key: e[key] for key in keys}, said_by=e.get("said_by", ""))
@@ -218,11 +216,11 @@ class SceneBundle:
         )
 
 
-def seal_bundle(folder: Path, scene: dict) -> str:
-    """Write scene.json and manifest.json beside the mesh files that lie in `folder`; return the revision.
+def seal_bundle(folder: Path, scene: JsonObject) -> str:
+    """Write scene.json and manifest.json into a folder of mesh files; return the revision.
 
     Raises:
-        BundleError: the scene is not valid, names a file that is not there, or the folder breaks a limit.
+        BundleError: The scene is not valid, it names a missing file, or the folder exceeds a limit.
     """
     folder = Path(folder)
     try:
@@ -242,29 +240,27 @@ def seal_bundle(folder: Path, scene: dict) -> str:
     revision = content_revision(scene, files)
     listed = {name: {"sha256": digest, "bytes": size} for name, (digest, size) in files.items()}
     manifest = {"format": MANIFEST_FORMAT, "revision": revision, "files": listed}
-    (folder / "manifest.json").write_text(
-        json.dumps(manifest, indent=1, sort_keys=True) + "\n", encoding="utf-8"
-    )
+    text = json.dumps(manifest, indent=1, sort_keys=True)
+    (folder / "manifest.json").write_text(text + "\n", encoding="utf-8")
     return revision
 
 
-def content_revision(scene: dict, files: dict[str, tuple[str, int]]) -> str:
-    """Return the content address: the same reconstruction gives the same one, whatever it is called and took.
+def content_revision(scene: JsonObject, files: Files) -> str:
+    """Return the content address of a bundle: the first 16 hexadecimal digits of a SHA-256.
 
-    Left out are the id (a name, not content) and what differs between two equal runs (timings, memory,
-    `report.volatile`).
+    Equal reconstructions have equal addresses. The scene id and `report.timings_s`, `report.peak_memory_mb` and
+    `report.volatile` are not hashed.
     """
     report = {key: value for key, value in scene["report"].items() if key not in _VOLATILE_REPORT_KEYS}
     kept = {**{key: value for key, value in scene.items() if key != "id"}, "report": report}
     hashes = {name: digest for name, (digest, _) in files.items() if name != "scene.json"}
-    text = json.dumps(
-        {"files": hashes, "scene": kept}, sort_keys=True, separators=(",", ":"), allow_nan=False
-    )
+    hashed = {"files": hashes, "scene": kept}
+    text = json.dumps(hashed, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def hash_file(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """Return the SHA-256 of a file, in hexadecimal."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while chunk := file.read(1 << 20):
@@ -272,7 +268,7 @@ def hash_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _read(folder: Path, check_hashes: bool) -> tuple[dict, str, dict[str, tuple[str, int]]]:
+def _read(folder: Path, check_hashes: bool) -> tuple[JsonObject, str, Files]:
     sizes = _list_files(folder)
     for required in ("scene.json", "manifest.json"):
         if required not in sizes:
@@ -298,15 +294,13 @@ def _read(folder: Path, check_hashes: bool) -> tuple[dict, str, dict[str, tuple[
     return scene, claimed_revision, files
 
 
-def _manifest(folder: Path, sizes: dict[str, int]) -> tuple[str, dict[str, tuple[str, int]]]:
-    manifest = _parse((folder / "manifest.json").read_bytes(), f"bundle {folder}: manifest.json")
-    listed = manifest.get("files") if isinstance(manifest, dict) else None
-    if not isinstance(listed, dict) or manifest.get("format") != MANIFEST_FORMAT:
+def _manifest(folder: Path, sizes: dict[str, int]) -> tuple[str, Files]:
+    manifest = as_object(_parse((folder / "manifest.json").read_bytes(), f"bundle {folder}: manifest.json"))
+    if manifest.get("format") != MANIFEST_FORMAT or not isinstance(manifest.get("files"), dict):
         raise BundleError(f"bundle {folder}: manifest.json is not a {MANIFEST_FORMAT} file")
-    files = {}
-    for name, entry in listed.items():
-        digest = entry.get("sha256") if isinstance(entry, dict) else None
-        size = entry.get("bytes") if isinstance(entry, dict) else None
+    files: Files = {}
+    for name, entry in as_object(manifest["files"]).items():
+        digest, size = as_object(entry).get("sha256"), as_object(entry).get("bytes")
         if not isinstance(digest, str) or not isinstance(size, int):
             raise BundleError(f"bundle {folder}: manifest.json: files[{name!r}]: expected sha256 and bytes")
         if name not in sizes:
@@ -320,14 +314,14 @@ def _manifest(folder: Path, sizes: dict[str, int]) -> tuple[str, dict[str, tuple
     return str(manifest.get("revision")), files
 
 
-def _check_references(scene: dict, sizes: dict[str, int]) -> None:
+def _check_references(scene: JsonObject, sizes: dict[str, int]) -> None:
     for name, place in referenced_files(scene).items():
         if name not in sizes:
             raise BundleError(f"{place}: {name} is not in the bundle")
 
 
 def _list_files(folder: Path) -> dict[str, int]:
-    """Return {relative path: bytes} of all files; refuse what breaks a limit or is not a plain file."""
+    """Return {relative path: bytes} of all files; raise BundleError at a limit or at a file that is not regular."""
     sizes: dict[str, int] = {}
     entries_seen = 0
     pending = [("", 0)]
@@ -358,7 +352,7 @@ def _list_files(folder: Path) -> dict[str, int]:
 
 
 def _parse(data: bytes, where: str) -> Any:
-    """Parse strict JSON: UTF-8, no NaN or infinity, no key twice, bounded nesting."""
+    """Parse strict JSON: UTF-8, no NaN or infinity, no duplicate key, bounded nesting."""
 
     def constant(name: str) -> None:
         raise BundleError(f"{where}: {name} is not strict JSON")
@@ -369,12 +363,11 @@ def _parse(data: bytes, where: str) -> Any:
             raise BundleError(f"{where}: {text} is not a finite number")
         return value
 
-    def pairs(items: list[tuple[str, Any]]) -> dict:
+    def pairs(items: list[tuple[str, Any]]) -> JsonObject:
         found = dict(items)
         if len(found) != len(items):
-            raise BundleError(
-                f"{where}: a key appears twice in one object ({sorted(k for k, _ in items)[:8]})"
-            )
+            keys = sorted(key for key, _ in items)[:8]
+            raise BundleError(f"{where}: a key appears twice in one object ({keys})")
         return found
 
     try:

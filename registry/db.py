@@ -1,23 +1,24 @@
-"""The index: one SQLite file with one row a scene. All SQL is here and in `registry.migrations`.
+# pyright: strict
+"""Index of the registry: a SQLite file with one row per scene. All SQL is here and in `registry.migrations`.
 
-Connections live for one operation: they are cheap (well below a millisecond), and none is ever shared by
-threads or carried across a fork. The index is only a way to find things fast; the bundles hold everything it
-holds.
+A connection lives for one operation (opening takes well below a millisecond): none is shared by threads or inherited
+by a fork. The index is a cache; all of its content can be rebuilt from the bundles.
 """
 
 import contextlib
 import datetime
 import json
 import sqlite3
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Generator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from registry import migrations
 from registry.errors import BundleError, EnvironmentMissing
 from registry.locks import file_lock
 
-_BUSY_TIMEOUT_S = 60.0
+_BUSY_TIMEOUT_S = 60.0  # SQLite waits for another writer up to this
 _COLUMNS = (
     "scene_id, revision, schema_version, created_utc, source_file, source_sha256, n_objects, status, metrics"
 )
@@ -25,7 +26,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class SceneRow:
-    """One row of the index; `SceneRecord` adds the path."""
+    """A row of the index; the fields are the columns, in order. `SceneRecord` adds the path."""
 
     scene_id: str
     revision: str
@@ -35,24 +36,24 @@ class SceneRow:
     source_sha256: str
     n_objects: int
     status: str  # "stable" | "unstable" | "unchecked"
-    metrics: dict  # JSON values
+    metrics: dict[str, Any]  # JSON values
 
 
 def utc_text(timestamp: float | None = None) -> str:
-    """Return a time (now when None; else seconds since 1970) as ISO 8601 UTC."""
+    """Format a POSIX timestamp (seconds; None for now) as ISO 8601 UTC with a resolution of one second."""
     now = datetime.datetime.now(datetime.timezone.utc)
     moment = now if timestamp is None else datetime.datetime.fromtimestamp(timestamp, datetime.timezone.utc)
     return moment.isoformat(timespec="seconds")
 
 
 class Index:
-    """`<registry>/index.sqlite`. Reading an absent index finds nothing; writing creates it."""
+    """`<registry>/index.sqlite`. An absent index reads as empty and is created by the first write."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def exists(self) -> bool:
-        """Tell whether the index was ever written."""
+        """Return whether the index file exists."""
         return self.path.is_file()
 
     def rows(self) -> list[SceneRow]:
@@ -64,14 +65,14 @@ class Index:
             return [_row(values) for values in connection.execute(query)]
 
     def revisions(self) -> dict[str, str]:
-        """Return {scene id: current revision}, ordered by scene id, and read nothing else."""
+        """Return {scene id: current revision}, ordered by scene id; reads only these two columns."""
         if not self.exists():
             return {}
         with self._reading() as connection:
             return dict(connection.execute("SELECT scene_id, revision FROM scenes ORDER BY scene_id"))
 
     def row(self, scene_id: str) -> SceneRow | None:
-        """Return one row, or None."""
+        """Return the row of a scene, or None."""
         if not self.exists():
             return None
         with self._reading() as connection:
@@ -80,9 +81,8 @@ class Index:
             return None if found is None else _row(found)
 
     def put(self, *rows: SceneRow) -> None:
-        """Insert rows, replacing those of the same scene, all or none."""
+        """Insert or replace the rows of scenes in one transaction."""
         with self.writing() as connection, atomic(connection):
-            # The fields of a row are the columns, in the same order.
             connection.executemany(
                 f"INSERT OR REPLACE INTO scenes ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 [_values(row) for row in rows],
@@ -94,12 +94,12 @@ class Index:
             connection.execute("DELETE FROM scenes WHERE scene_id = ?", (scene_id,))
 
     def create(self) -> None:
-        """Make sure that the index exists, is writable and has the current schema."""
+        """Create the index if it is absent and apply pending migrations."""
         with self.writing():
             pass
 
     def replace_all(self, rows: list[SceneRow]) -> None:
-        """Make these rows the whole content; an index that cannot be read is moved aside first."""
+        """Replace the whole content; an index that cannot be read is renamed to `index.damaged-TIME.sqlite` first."""
         try:
             with self.writing() as connection, atomic(connection):
                 connection.execute("DELETE FROM scenes")
@@ -108,17 +108,15 @@ class Index:
             for suffix in ("", "-wal", "-shm"):
                 part = self.path.with_name(self.path.name + suffix)
                 if part.exists():
-                    part.replace(
-                        self.path.with_name(f"{self.path.stem}.damaged-{stamp}{self.path.suffix}{suffix}")
-                    )
+                    name = f"{self.path.stem}.damaged-{stamp}{self.path.suffix}{suffix}"
+                    part.replace(self.path.with_name(name))
         self.put(*rows)
 
     @contextlib.contextmanager
-    def writing(self) -> Iterator[sqlite3.Connection]:
-        """Open for writing: created, in WAL mode and migrated. Writers queue on a lock file.
+    def writing(self) -> Generator[sqlite3.Connection, None, None]:
+        """Open the index for writing, under a lock file: create it, switch it to WAL mode and migrate it.
 
-        SQLite's busy handler does not cover switching to WAL and the last close, hence the lock around it
-        all.
+        The lock file is necessary because SQLite's busy handler covers neither the switch to WAL nor the last close.
         """
         with self._translated("write"), file_lock(self.path.parent / "locks" / ".index.lock"):
             connection = self._connect(f"{self.path.absolute().as_uri()}?mode=rwc")
@@ -132,7 +130,7 @@ class Index:
                 connection.close()
 
     @contextlib.contextmanager
-    def _reading(self) -> Iterator[sqlite3.Connection]:
+    def _reading(self) -> Generator[sqlite3.Connection, None, None]:
         uri = self.path.absolute().as_uri()
         with self._translated("read"):
             connection = self._connect(f"{uri}?mode=ro")
@@ -140,7 +138,7 @@ class Index:
                 try:
                     steps = migrations.pending(connection)
                 except sqlite3.OperationalError:
-                    # A read-only folder has no room for WAL's side files; nobody can be writing there either.
+                    # WAL's side files cannot be created in a read-only folder. It has no writers, so it is immutable.
                     connection.close()
                     connection = self._connect(f"{uri}?mode=ro&immutable=1")
                     steps = migrations.pending(connection)
@@ -158,8 +156,8 @@ class Index:
         return connection
 
     @contextlib.contextmanager
-    def _translated(self, verb: str) -> Iterator[None]:
-        """Turn SQLite's and the file system's errors into ours."""
+    def _translated(self, verb: str) -> Generator[None, None, None]:
+        """Convert SQLite errors into EnvironmentMissing or BundleError."""
         try:
             yield
         except sqlite3.OperationalError as error:
@@ -169,14 +167,14 @@ class Index:
             ) from error
         except sqlite3.DatabaseError as error:
             raise BundleError(
-                f"registry: the index {self.path} is damaged ({error}); the scenes are whole in their "
+                f"registry: the index {self.path} is damaged ({error}); the scenes are intact in their "
                 "folders: recover it with `registry.SceneRegistry(root).rebuild_index()`"
             ) from error
 
 
 @contextlib.contextmanager
-def atomic(connection: sqlite3.Connection) -> Iterator[None]:
-    """Run the block in one transaction; nested ones are savepoints."""
+def atomic(connection: sqlite3.Connection) -> Generator[None, None, None]:
+    """Run the block in one transaction, or in a savepoint if a transaction is open."""
     nested = connection.in_transaction
     connection.execute("SAVEPOINT nested" if nested else "BEGIN IMMEDIATE")
     try:
@@ -206,7 +204,7 @@ def _migrate(connection: sqlite3.Connection) -> None:
             connection.execute("INSERT INTO migrations (name, applied_utc) VALUES (?, ?)", values)
 
 
-def _row(values: tuple) -> SceneRow:
+def _row(values: tuple[Any, ...]) -> SceneRow:
     try:
         metrics = json.loads(values[-1])
     except ValueError as error:
@@ -214,6 +212,6 @@ def _row(values: tuple) -> SceneRow:
     return SceneRow(*values[:-1], metrics=metrics)
 
 
-def _values(row: SceneRow) -> tuple:
+def _values(row: SceneRow) -> tuple[Any, ...]:
     metrics = json.dumps(row.metrics, sort_keys=True, allow_nan=False)
-    return tuple(vars(replace(row, metrics=metrics)).values())
+    return tuple({**vars(row), "metrics": metrics}.values())

@@ -1,11 +1,12 @@
-"""The error tree of the whole project.
+# pyright: strict
+"""Error classes of the whole project, with the exit codes of the command line.
 
-SimReconError                 exit code 1   anything that we raise on purpose
+SimReconError                 exit code 1   any error raised on purpose
 ├── UsageError                exit code 2   wrong use: bad flag, unknown scene, malformed overrides
 │   ├── SceneNotFound         exit code 2   (also KeyError)
 │   └── SceneBusy             exit code 2   another process holds the scene
-├── InputError                exit code 3   the input cannot be reconstructed (too short, no parallax, blank …)
-├── EnvironmentMissing        exit code 4   something is missing on the machine (driver, disk, permission, extra)
+├── InputError                exit code 3   the video cannot be reconstructed (too short, no parallax, blank …)
+├── EnvironmentMissing        exit code 4   the machine lacks a driver, disk space, a permission or an extra
 └── BundleError               exit code 1   a bundle on disk is malformed, unsafe or damaged (also ValueError)
 
 A message says what failed, where (scene, stage, frame or file), what was expected, and what to do next.
@@ -16,17 +17,17 @@ from collections.abc import Iterable
 
 
 class SimReconError(Exception):
-    """Root of every error that the project raises on purpose."""
+    """Base class of all errors that the project raises on purpose."""
 
     exit_code = 1
 
     def __str__(self) -> str:
-        """Return the message unquoted (`KeyError` would print its repr)."""
+        """Return the message without quotes (`KeyError` prints its repr)."""
         return str(self.args[0]) if self.args else self.__class__.__name__
 
 
 class UsageError(SimReconError, ValueError):
-    """The command or function was called wrongly."""
+    """A command or function was called with invalid arguments."""
 
     exit_code = 2
 
@@ -38,7 +39,7 @@ class SceneNotFound(SimReconError, KeyError):
 
 
 class SceneBusy(SimReconError):
-    """Another process is reconstructing the same scene into the same registry."""
+    """Another process reconstructs the same scene into the same registry."""
 
     exit_code = 2
 
@@ -50,7 +51,7 @@ class InputError(SimReconError, ValueError):
 
 
 class EnvironmentMissing(SimReconError, RuntimeError):
-    """The machine lacks something: a driver, an extra, disk space, a permission."""
+    """The machine lacks a driver, an extra, disk space or a permission."""
 
     exit_code = 4
 
@@ -60,15 +61,15 @@ class BundleError(SimReconError, ValueError):
 
 
 def did_you_mean(wrong: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
-    """Return a sentence for a message with the nearest of the names that are known, or nothing if none is near.
+    """Suggest the known name closest to an unknown one.
 
     Args:
-        wrong: the name that is not known.
-        known: those that are.
-        cutoff: how alike the two are at least, 0 to 1 (`difflib.SequenceMatcher.ratio`).
+        wrong: Unknown name.
+        known: Known names.
+        cutoff: Minimum similarity, 0 to 1 (`difflib.SequenceMatcher.ratio`).
 
     Returns:
-        " Did you mean 'name'?" with a space before it, or "".
+        " Did you mean 'name'?" with a leading space, or "" if no name is similar enough.
     """
     near = difflib.get_close_matches(wrong, list(known), n=1, cutoff=cutoff)
     return f" Did you mean {near[0]!r}?" if near else ""

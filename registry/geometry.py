@@ -1,21 +1,22 @@
-"""Rigid and similarity transforms, quaternions, axis constants. NumPy only.
+# pyright: strict, reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+"""Rigid and similarity transforms, quaternions and axis conventions. NumPy only.
 
 Transforms are named `b_from_a`: `x_b = b_from_a @ x_a`. Quaternions are wxyz. See `docs/conventions.md`.
 """
 
 import numpy as np
 
-# Rotation that takes glTF's axes (+Y up, +Z towards the viewer) to object/world axes (+Z up).
-WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+# From glTF axes (+Y up, +Z towards the viewer) to object or world axes (+Z up).
+WORLD_FROM_GLTF = np.array([[1.0, 0.0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 GLTF_FROM_WORLD = WORLD_FROM_GLTF.T
-# SAPIEN's camera looks along +x with +y left and +z up; OpenCV's along +z with +x right and +y down.
+# SAPIEN camera: +x forward, +y left, +z up. OpenCV camera: +x right, +y down, +z forward.
 SAPIEN_CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 
 
 def quat_from_matrix(rotation: np.ndarray) -> np.ndarray:
     """Convert rotation matrices (..., 3, 3) to unit quaternions wxyz (..., 4) with w >= 0."""
     m = np.asarray(rotation, dtype=np.float64)
-    # The 4x4 symmetric matrix whose top eigenvector is the quaternion (Bar-Itzhack 2000), robust everywhere.
+    # Eigenvector of the largest eigenvalue of a symmetric 4x4 matrix (Bar-Itzhack 2000); no singular cases.
     k = np.empty((*m.shape[:-2], 4, 4))
     k[..., 0, 0] = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     k[..., 0, 1] = k[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
@@ -33,7 +34,7 @@ def quat_from_matrix(rotation: np.ndarray) -> np.ndarray:
 
 
 def matrix_from_quat(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Convert quaternions wxyz (..., 4), normalised here, to rotation matrices (..., 3, 3)."""
+    """Normalize quaternions wxyz (..., 4) and convert them to rotation matrices (..., 3, 3)."""
     q = np.asarray(quat_wxyz, dtype=np.float64)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
@@ -45,7 +46,7 @@ def matrix_from_quat(quat_wxyz: np.ndarray) -> np.ndarray:
 
 
 def rigid(rotation: np.ndarray | None = None, translation: np.ndarray | None = None) -> np.ndarray:
-    """Compose a 4x4 from a rotation (3, 3) and a translation (3,)."""
+    """Compose a rigid transform (4, 4) from a rotation (3, 3) and a translation (3,); None is the identity."""
     out = np.eye(4)
     if rotation is not None:
         out[:3, :3] = rotation
@@ -55,7 +56,7 @@ def rigid(rotation: np.ndarray | None = None, translation: np.ndarray | None = N
 
 
 def invert_rigid(b_from_a: np.ndarray) -> np.ndarray:
-    """Invert rigid transforms (..., 4, 4) exactly (transpose, not a solve)."""
+    """Invert rigid transforms (..., 4, 4) by transposing the rotation."""
     m = np.asarray(b_from_a, dtype=np.float64)
     out = np.zeros_like(m)
     rotation_t = np.swapaxes(m[..., :3, :3], -1, -2)
@@ -66,13 +67,17 @@ def invert_rigid(b_from_a: np.ndarray) -> np.ndarray:
 
 
 def transform_points(b_from_a: np.ndarray, points_a: np.ndarray) -> np.ndarray:
-    """Apply a 4x4 (rigid or similarity) to points (n, 3)."""
+    """Apply a rigid or similarity transform (4, 4) to points (n, 3)."""
     m = np.asarray(b_from_a, dtype=np.float64)
     return np.asarray(points_a, dtype=np.float64) @ m[:3, :3].T + m[:3, 3]
 
 
 def umeyama(points_a: np.ndarray, points_b: np.ndarray, with_scale: bool = True) -> np.ndarray:
-    """Least-squares similarity `b_from_a` (4x4, scale inside the 3x3 block) between paired points (n, 3)."""
+    """Estimate the least-squares similarity between paired points (n, 3) (Umeyama 1991).
+
+    Returns:
+        `b_from_a` (4, 4) with the scale in the 3x3 block; the scale is 1 without `with_scale`.
+    """
     a, b = np.asarray(points_a, np.float64), np.asarray(points_b, np.float64)
     mean_a, mean_b = a.mean(0), b.mean(0)
     u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
@@ -84,7 +89,7 @@ def umeyama(points_a: np.ndarray, points_b: np.ndarray, with_scale: bool = True)
 
 
 def split_similarity(b_from_a: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Split a similarity 4x4 into (scale, rotation (3, 3), translation (3,))."""
+    """Split a similarity (4, 4) into scale, rotation (3, 3) and translation (3,)."""
     m = np.asarray(b_from_a, dtype=np.float64)
     scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
     return scale, m[:3, :3] / scale, m[:3, 3]

@@ -1,12 +1,13 @@
-"""Locks between processes: `flock` on files and folders. The kernel frees them when their holder dies.
+# pyright: strict
+"""Interprocess locks: `flock` on files and folders. The kernel releases them when their holder dies.
 
-Lock files are never deleted: removing one while another process opens it would let two processes both "hold"
-it.
+Lock files are never deleted: if one were removed while another process opens it, two processes could lock the same
+path.
 """
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 from registry.errors import EnvironmentMissing
@@ -18,37 +19,36 @@ except ImportError:  # pragma: no cover - Windows
 
 
 class LockHeld(Exception):
-    """Another holder has the lock; `.holder` says who, as far as it is known."""
+    """Another process has the lock; `holder` describes it, if it is known."""
 
     def __init__(self, holder: str) -> None:
         super().__init__(holder)
         self.holder = holder
 
 
-def _flock(descriptor: int, operation: int) -> None:
+def _flock(descriptor: int, *, shared: bool = False, blocking: bool = False) -> None:
     if fcntl is None:  # pragma: no cover - Windows
         raise EnvironmentMissing("registry: this platform has no flock; use Linux, macOS or WSL")
-    fcntl.flock(descriptor, operation)
+    fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if blocking else fcntl.LOCK_NB))
 
 
 @contextlib.contextmanager
-def file_lock(path: Path, blocking: bool = True) -> Iterator[None]:
-    """Hold an exclusive lock on the file `path` (created where absent) while the block runs.
+def file_lock(path: Path, blocking: bool = True) -> Generator[None, None, None]:
+    """Hold an exclusive lock on the file `path` (created if absent) while the block runs.
 
     Raises:
-        LockHeld: it is taken and `blocking` is False.
-        OSError: the lock file cannot be created.
+        LockHeld: The lock is taken and `blocking` is false.
+        OSError: The lock file cannot be created.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
         try:
-            _flock(descriptor, fcntl.LOCK_EX | (0 if blocking else fcntl.LOCK_NB))
+            _flock(descriptor, blocking=blocking)
         except BlockingIOError:
             holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
             raise LockHeld(holder or "an unknown process") from None
-        # The pid is only for the message of whoever finds the lock taken, so a full disk must not matter
-        # here.
+        # The pid only serves the error message of other processes: ignore a full disk.
         with contextlib.suppress(OSError):
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"pid {os.getpid()}\n".encode(), 0)
@@ -58,15 +58,16 @@ def file_lock(path: Path, blocking: bool = True) -> Iterator[None]:
 
 
 def lease_folder(folder: Path) -> int | None:
-    """Take a shared lock on a folder, so that nobody removes it while it is read.
+    """Take a shared lock on a folder, which keeps `SceneRegistry` from removing it.
 
-    Returns the open descriptor (close it to end the lease), or None where the file system has no such locks.
+    Returns:
+        The open descriptor (close it to release the lock), or None if the file system has no such locks.
     """
     if fcntl is None:  # pragma: no cover - Windows
         return None
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        _flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        _flock(descriptor, shared=True)
     except OSError:
         os.close(descriptor)
         return None
@@ -74,7 +75,7 @@ def lease_folder(folder: Path) -> int | None:
 
 
 def is_leased(folder: Path) -> bool:
-    """Tell whether somebody reads the folder under a lease."""
+    """Return whether any process holds a shared lock on the folder."""
     if fcntl is None:  # pragma: no cover - Windows
         return False
     try:
@@ -82,7 +83,7 @@ def is_leased(folder: Path) -> bool:
     except OSError:
         return False
     try:
-        _flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _flock(descriptor)
     except BlockingIOError:
         return True
     except OSError:

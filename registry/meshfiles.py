@@ -1,14 +1,16 @@
-"""Mesh files name other files: glTF by `uri`, Wavefront by `mtllib`. In a bundle neither may point anywhere.
+# pyright: strict
+"""Check that mesh files reference no other files: `uri` in glTF, `mtllib` in Wavefront.
 
-Whoever loads a mesh (SAPIEN, trimesh, a viewer) follows such names, so a foreign bundle could read outside
-its folder.
+Mesh loaders (SAPIEN, trimesh, viewers) follow such references, so an untrusted bundle could read outside its folder.
 """
 
 import json
 import struct
 from pathlib import Path
+from typing import Any, cast
 
 from registry.errors import BundleError
+from registry.schema import as_object
 
 _GLB_MAGIC = 0x46546C67
 _GLB_JSON = 0x4E4F534A
@@ -17,10 +19,10 @@ _OBJ_STATEMENTS = frozenset((b"v", b"vn", b"vt", b"f", b"o", b"g", b"s", b"l", b
 
 
 def check_mesh_file(path: Path, name: str) -> None:
-    """Check that a .glb or .obj is well-formed at its head and self-contained; other files are not looked at.
+    """Check the header of a .glb or the statements of an .obj; other files are accepted unread.
 
     Raises:
-        BundleError: it names a file outside itself, or is not what its suffix says.
+        BundleError: The mesh references another file, or does not have the format of its suffix.
     """
     if name.endswith(".glb"):
         _check_glb(path, name)
@@ -47,9 +49,9 @@ def _check_glb(path: Path, name: str) -> None:
     if not isinstance(document, dict):
         raise BundleError(f"{name}: its glTF header is not a JSON object")
     for group in ("buffers", "images"):
-        items = document.get(group, [])
-        for i, item in enumerate(items if isinstance(items, list) else []):
-            uri = item.get("uri") if isinstance(item, dict) else None
+        items = as_object(document).get(group)
+        for i, item in enumerate(cast("list[Any]", items) if isinstance(items, list) else []):
+            uri = as_object(item).get("uri")
             if uri is not None and not (isinstance(uri, str) and uri.startswith("data:")):
                 raise BundleError(f"{name}: {group}[{i}].uri names another file ({str(uri)[:80]!r})")
 

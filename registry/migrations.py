@@ -1,7 +1,7 @@
-"""The index's schema, as steps that are only ever appended. Never edit one that was released.
+# pyright: strict
+"""Schema migrations of the index. The list is append-only: never edit a released step.
 
-Each step runs in one transaction together with the row that records it, so a killed upgrade is simply done
-again.
+A step and the row that records it are one transaction, so an interrupted upgrade is repeated.
 """
 
 import sqlite3
@@ -28,7 +28,7 @@ def m001_initial(connection: sqlite3.Connection) -> None:
 
 
 def m002_status_and_metrics(connection: sqlite3.Connection) -> None:
-    """Add what `simrecon list` shows besides the id, so that listing opens no bundle."""
+    """Add the columns that `simrecon list` shows, so that listing opens no bundle."""
     connection.execute("ALTER TABLE scenes ADD COLUMN status TEXT NOT NULL DEFAULT 'unchecked'")
     connection.execute("ALTER TABLE scenes ADD COLUMN metrics TEXT NOT NULL DEFAULT '{}'")
 
@@ -37,7 +37,7 @@ MIGRATIONS: tuple[Callable[[sqlite3.Connection], None], ...] = (m001_initial, m0
 
 
 def applied(connection: sqlite3.Connection) -> list[str]:
-    """Return the names of the steps that the database has been through, in order."""
+    """Return the names of the applied steps, in order."""
     known = connection.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'migrations'")
     if known.fetchone() is None:
         return []
@@ -45,10 +45,10 @@ def applied(connection: sqlite3.Connection) -> list[str]:
 
 
 def pending(connection: sqlite3.Connection) -> list[Callable[[sqlite3.Connection], None]]:
-    """Return the steps that are still to be run.
+    """Return the steps that are not applied yet, in order.
 
     Raises:
-        EnvironmentMissing: a newer simrecon wrote this index.
+        EnvironmentMissing: A newer simrecon wrote this index.
     """
     names, ours = applied(connection), [step.__name__ for step in MIGRATIONS]
     if names != ours[: len(names)]:

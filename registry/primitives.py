@@ -1,8 +1,9 @@
-"""Boxes, cylinders, spheres and capsules among convex collision parts: said by their corners, exactly.
+# pyright: strict, reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+"""Recognize boxes, cylinders, spheres and capsules among convex collision parts, by their vertices.
 
-A part of a bundle is a mesh of corners. Where these are the corners of `corners_of`, the part is that primitive, and
-who simulates it may take the primitive: it is round, and its contacts are computed exactly. Parts that were cut or
-stretched since are what they are: a box cut level is a box, a sphere cut level is only a mesh.
+A part of a bundle is a vertex cloud. If it equals `corners_of` some primitive, a simulator may use that primitive: it
+is round and has exact contacts. A part that was cut or stretched afterwards matches only if it still is a primitive: a
+box cut level is a box, a sphere cut level is only a mesh.
 """
 
 import math
@@ -15,20 +16,21 @@ import numpy as np
 from registry.geometry import transform_points
 
 Shape = Literal["box", "cylinder", "sphere", "capsule"]
-SIZES: dict[str, int] = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}
-SIDES = 20  # of a cylinder, of the rings of spheres and capsules: none has more than the 255 corners of PhysX
-_LATITUDES_DEG = (0.0, 20.0, 40.0, 60.0, 78.0)  # no corner at a pole: round things rest on flats
-FLAT = 1.0 - math.sin(math.radians(_LATITUDES_DEG[-1]))  # how deep these lie, beside the radius
-_UPRIGHT = 0.9999  # of its axis' z
-_EXACT_M, _EXACT_SHARE = 2e-5, 2e-5  # files round to seven digits, arrays to float32; the larger part counts
+SIZES: dict[str, int] = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}  # numbers in `Primitive.size`
+SIDES = 20  # vertices per ring; every primitive stays below PhysX's 255 vertices
+_LATITUDES_DEG = (0.0, 20.0, 40.0, 60.0, 78.0)  # of rings; no vertex at a pole: round parts rest on flats
+FLAT = 1.0 - math.sin(math.radians(_LATITUDES_DEG[-1]))  # depth of these flats below the pole, of the radius
+_UPRIGHT = 0.9999  # minimum z component of the axis of an upright cylinder
+# Vertex tolerance: metres + share of the extent. Files have 7 digits, arrays are float32.
+_EXACT_M, _EXACT_SHARE = 2e-5, 2e-5
 
 
 @dataclass(frozen=True)
 class Primitive:
-    """One primitive. Its axis, if it has one, is the z axis of its own space.
+    """A box, cylinder, sphere or capsule; the axis is the z axis of primitive space.
 
-    The size, in metres, is of a box its half extents (3), of a cylinder radius and half length, of a sphere its radius,
-    of a capsule radius and half length without caps.
+    `size` in metres: half extents (3) of a box; radius and half length of a cylinder; radius of a sphere; radius and
+    half length without the caps of a capsule.
     """
 
     shape: Shape
@@ -37,14 +39,14 @@ class Primitive:
 
     @property
     def stands(self) -> bool:
-        """Tell whether it stays where it stands: a box, or a cylinder on its end.
+        """Return whether it cannot roll: a box, or a cylinder on its end.
 
-        Balls and lying cylinders roll for ever where a simulator knows no rolling resistance; their corners do not.
+        Without rolling resistance, spheres and lying cylinders roll forever. Their vertex hulls do not.
         """
         return self.shape == "box" or (self.shape == "cylinder" and bool(self.pose[2, 2] > _UPRIGHT))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the entry of `scene.json`."""
+        """Return the entry of `collision_primitives` in scene.json."""
         return {
             "shape": self.shape,
             "size": [round(float(x), 7) for x in self.size],
@@ -53,12 +55,12 @@ class Primitive:
 
 
 def corners_of(primitive: Primitive) -> np.ndarray:
-    """Return the corners (n, 3) of the convex mesh that stands for a primitive, in object space, metres."""
+    """Return the vertices (n, 3) of the convex mesh of a primitive, in object space (m)."""
     return transform_points(primitive.pose, _corners(primitive.shape, primitive.size))
 
 
 def primitive_of(points: np.ndarray) -> Primitive | None:
-    """Return the primitive whose corners these points (n, 3) in metres are, in any order; None for anything else."""
+    """Return the primitive with exactly these vertices (n, 3) (m), in any order; None if there is none."""
     points = np.unique(np.asarray(points, np.float64).round(7), axis=0)
     if not np.isfinite(points).all():
         return None
@@ -73,11 +75,11 @@ def primitive_of(points: np.ndarray) -> Primitive | None:
 
 @lru_cache(maxsize=64)
 def _corners(shape: Shape, size: tuple[float, ...]) -> np.ndarray:
-    """Return the corners in the primitive's own space; those of round ones lie on its surface."""
+    """Return the vertices in primitive space; they lie on the surface of round primitives."""
     if shape == "box":
         return np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
     radius, half = (size[0], 0.0) if shape == "sphere" else size
-    angle = 2.0 * math.pi * (np.arange(SIDES) + 0.5) / SIDES  # a side, not a corner, lies below what lies
+    angle = 2.0 * math.pi * (np.arange(SIDES) + 0.5) / SIDES  # a lying cylinder rests on a face, not an edge
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(SIDES)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
     if shape == "cylinder":
@@ -97,13 +99,13 @@ def _box(points: np.ndarray, exact: float) -> Primitive | None:
     center = points.mean(axis=0)
     away = points[1:] - points[0]
     near = np.argsort(np.linalg.norm(away, axis=1), kind="stable")
-    # The nearest corner and the next nearest lie along edges; the third edge stands on both.
+    # The two nearest vertices lie along edges; the third edge is perpendicular to both.
     first, second = away[near[0]], away[near[1]]
     third = np.cross(first, second)
     if np.linalg.norm(third) < exact**2:
         return None
     axes = np.stack([v / np.linalg.norm(v) for v in (first, second, third)])
-    axes = axes[np.argsort(np.abs(axes[:, 2]), kind="stable")]  # the most upright one last
+    axes = axes[np.argsort(np.abs(axes[:, 2]), kind="stable")]  # the most upright axis last
     axes[2] *= 1.0 if axes[2, 2] >= 0 else -1.0
     axes[1] = np.cross(axes[2], axes[0])
     return _checked("box", np.abs((points - center) @ axes.T).max(axis=0), axes.T, center, points, exact)
@@ -129,15 +131,15 @@ def _round(shape: Shape, points: np.ndarray, exact: float) -> Primitive | None:
 
 
 def _axis(shape: Shape, points: np.ndarray, exact: float) -> np.ndarray | None:
-    """Return the axis (3,), upwards, of corners (n, 3) about the origin; None where there is none."""
-    if shape == "cylinder":  # from a corner to the one across: all corners lie equally far along it
+    """Return the upward axis (3,) of vertices (n, 3) about the origin, or None."""
+    if shape == "cylinder":  # between opposite vertices; all vertices project to the same distance
         ways = points[1:] - points[0]
         ways /= np.linalg.norm(ways, axis=1, keepdims=True)
         off = np.abs(np.abs(points @ ways.T) - np.abs(ways @ points[0])).max(axis=0)
         axis = ways[np.argmin(off)]
         if off.min() > exact:
             return None
-    else:  # two directions are alike, the third is the axis; of a sphere, whose corners lie in rings, too
+    else:  # the principal axis whose variance differs from the two others; holds for a sphere made of rings, too
         values, vectors = np.linalg.eigh(np.cov(points.T))
         axis = vectors[:, 2 if values[2] - values[1] > values[1] - values[0] else 0]
     return axis if axis[2] >= 0 else -axis
@@ -146,7 +148,7 @@ def _axis(shape: Shape, points: np.ndarray, exact: float) -> np.ndarray | None:
 def _checked(
     shape: Shape, size: np.ndarray, rotation: np.ndarray, center: np.ndarray, points: np.ndarray, exact: float
 ) -> Primitive | None:
-    """Return the primitive where its corners are the points, each of them."""
+    """Return the primitive if its vertices and the points match one to one, else None."""
     if (size <= 0).any():
         return None
     pose = np.eye(4)

@@ -1,7 +1,8 @@
-"""The physics report card of CONTRACT section 4: bodies and the edges of the scene graph in, JSON out.
+# pyright: strict, reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+"""Physics report card (CONTRACT section 4): simulate bodies, compare contacts with the scene graph, return JSON.
 
-All movable objects together, undamped, never asleep. Measured by assembly, by `simrecon verify --physics` and by
-`simrecon evaluate`, in the same way.
+All movable objects are simulated together, without damping and without sleeping. Assembly, `simrecon verify --physics`
+and `simrecon evaluate` use this function.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,20 +15,20 @@ from registry.geometry import rigid
 from registry.simulation import TIMESTEP_S, BodySpec, Contact, Physics, build_physics, pose_change
 
 VERIFY_DURATION_S = 10.0
-STABLE_MOVE_M, STABLE_TURN_DEG = 0.02, 5.0
-MOST_PENETRATION_MM = 1.0
-MOST_GAP_MM = 2.0  # between what is immovable and what carries it or what it hangs on
-REST_J_PER_KG = 5e-5  # of a body that moves at 1 cm/s
-_FLOAT_WINDOW_S, _FLOAT_DROP_M = 0.5, 0.005
-_REST_WINDOW_S = 0.1  # at the end, over which contacts are summed and motion is measured
-_TOUCHING_SHARE = 0.02  # of what an object is pushed up by; less is no support
-_CARRYING_SHARE = 0.5
-_PROBE_M = 0.015  # PhysX reports contacts a little farther apart than this
-_FAR_AWAY_M = 1e3  # where a body that left the world is said to be: reports hold finite numbers only
+STABLE_MOVE_M, STABLE_TURN_DEG = 0.02, 5.0  # a stable object changes its pose by less
+MOST_PENETRATION_MM = 1.0  # at the start
+MOST_GAP_MM = 2.0  # between an immovable or attached object and its parent
+REST_J_PER_KG = 5e-5  # maximum specific kinetic energy at rest: that of 1 cm/s
+_FLOAT_WINDOW_S, _FLOAT_DROP_M = 0.5, 0.005  # an object that drops farther in this time floated at the start
+_REST_WINDOW_S = 0.1  # final interval in which impulses are summed and motion is measured
+_TOUCHING_SHARE = 0.02  # minimum share of an object's upward impulse that counts as support
+_CARRYING_SHARE = 0.5  # minimum share of a main support
+_PROBE_M = 0.015  # maximum separation of reported contacts; PhysX finds them a little farther apart
+_FAR_AWAY_M = 1e3  # distance (down) reported for a diverged body, because JSON needs finite numbers
 
 
 class GraphEdge(Protocol):
-    """An edge of the scene graph, of a bundle or of a stage."""
+    """An edge of the scene graph, from a bundle or a stage."""
 
     child: int
     relation: str
@@ -35,9 +36,9 @@ class GraphEdge(Protocol):
 
 
 def spawn_contacts(specs: Sequence[BodySpec], max_separation_m: float = 0.0) -> list[Contact]:
-    """Return every contact at the given poses that is no farther apart, fixed objects against everything included.
+    """Return all contacts at the given poses with at most this separation.
 
-    PhysX reports no contact between two immovable bodies, so all objects are movable for this one step.
+    All objects are movable in this one time step, because PhysX reports no contact between two immovable bodies.
     """
     physics = build_physics([replace(spec, dynamic=not spec.base, fixed_to=None) for spec in specs])
     physics.step()
@@ -51,16 +52,16 @@ def physics_report(
     duration_s: float = VERIFY_DURATION_S,
     timestep_s: float = TIMESTEP_S,
 ) -> dict[str, Any]:
-    """Measure the report card.
+    """Simulate all bodies and measure the report card.
 
     Args:
-        specs: All bodies, floor and walls too.
-        edges: Of the scene graph; compared with who carries whom at the end.
-        duration_s: How long everything is let go.
-        timestep_s: Of the simulation.
+        specs: All bodies, floor and walls included.
+        edges: Edges of the scene graph; compared with the supports at the end.
+        duration_s: Simulated time.
+        timestep_s: Time step of the simulation.
 
     Returns:
-        JSON. Rates are shares of the movable objects (1.0 where there is none; `dynamic_objects` says so).
+        JSON. Rates are shares of the movable objects, and 1.0 if there is none (see `dynamic_objects`).
     """
     specs = list(specs)
     names = {spec.id: spec.name for spec in specs}
@@ -76,7 +77,7 @@ def physics_report(
     physics.step(steps - early_steps - last_steps)
     before = {spec.id: physics.pose(spec.id) for spec in moving}
     push = _pushes(physics, last_steps)
-    objects = []
+    objects: list[dict[str, Any]] = []
     for spec in moving:
         energy = physics.energy_of_motion(spec.id, before[spec.id], max(last_steps, 1) * timestep_s)
         objects.append(_object_entry(spec, physics, early[spec.id], _depth_mm(near, spec.id), energy))
@@ -96,22 +97,21 @@ def physics_report(
         "stable_rate_5cm_drop_5deg": rate("stable_5cm_drop_5deg", 1.0),
         "floating_rate": rate("floating", 0.0),
         "spawn_penetration_mm": round(penetration, 4),
-        "spawn_penetration_between": [names[deepest.first], names[deepest.second]] if penetration else [],
+        "spawn_penetration_between": [names[deepest.first], names[deepest.second]]
+        if deepest and penetration
+        else [],
         "energy_at_rest_j": float(f"{sum(entry['energy_j'] for entry in objects):.3g}"),
         "at_rest_rate": rate("at_rest", 1.0),
         "contacts": contact_graph(specs, edges, push, near),
         "objects": objects,
-        "fixed": [
-            {"id": spec.id, "name": spec.name, "spawn_penetration_mm": _depth_mm(near, spec.id)}
-            for spec in fixed
-        ],
+        "fixed": [{"id": s.id, "name": s.name, "spawn_penetration_mm": _depth_mm(near, s.id)} for s in fixed],
     }
 
 
 def failures(report: dict[str, Any]) -> list[str]:
-    """Return what a report card falls short of, one line each; empty: the scene rests.
+    """Return the failed criteria of a report card, one line each; empty if the scene is at rest.
 
-    Edges that are no contacts, and contacts that are no edges, are in the report and do not count here.
+    Differences between contacts and the scene graph are no failures.
     """
     found = [
         f"{o['name']} does not stay put: moved {100 * o['moved_m']:.1f} cm, turned {o['turned_deg']:.1f} degrees"
@@ -136,24 +136,26 @@ def contact_graph(
     push: dict[tuple[int, int], float],
     near: list[Contact],
 ) -> dict[str, Any]:
-    """Compare the edges of the scene graph with who carries whom.
+    """Compare the edges of the scene graph with the supports in the simulation.
 
-    An edge is real if what carries a movable child pushes it up at rest; of immovable and attached children, if they
-    are within 2 mm of their parent. Who bears half of a movable object or more must be its parent; lesser carriers
-    are counted, since an object has one parent only.
+    An edge of a movable child is real if the parent pushes the child up at rest. An edge of an immovable or attached
+    child is real if the two are within 2 mm. A body that bears half or more of a movable object must be its parent;
+    lesser supports are only counted, because an object has one parent.
 
     Args:
         specs: All bodies.
-        edges: Of the scene graph.
-        push: Upward impulse by (child, carrier) at the end.
-        near: Contacts at the start, up to a few millimetres apart.
+        edges: Edges of the scene graph.
+        push: Upward impulse (N s) by (child, carrier) at the end.
+        near: Contacts at the start, with separations up to `_PROBE_M`.
     """
     by_id = {spec.id: spec for spec in specs}
     total: dict[int, float] = {}
     for (child, _), value in push.items():
         total[child] = total.get(child, 0.0) + value
     share = {pair: value / total[pair[0]] for pair, value in push.items() if total[pair[0]] > 0}
-    parents, real, unreal = {}, {"supported_by": [0, 0], "attached_to": [0, 0]}, []
+    real = {"supported_by": [0, 0], "attached_to": [0, 0]}
+    parents: dict[int, int] = {}
+    unreal: list[dict[str, Any]] = []
     for edge in edges:
         parents[edge.child] = edge.parent
         child = by_id[edge.child]
@@ -164,16 +166,12 @@ def contact_graph(
         real[edge.relation][1] += 1
         if not holds:
             shown = round(gap, 2) if np.isfinite(gap) else None
-            unreal.append(
-                {"child": edge.child, "relation": edge.relation, "parent": edge.parent, "gap_mm": shown}
-            )
+            found = {"child": edge.child, "relation": edge.relation, "parent": edge.parent, "gap_mm": shown}
+            unreal.append(found)
     carried = [pair for pair in sorted(share) if by_id[pair[0]].fixed_to is None]
     main = [pair for pair in carried if share[pair] >= _CARRYING_SHARE]
     wrong = [pair for pair in main if parents and parents.get(pair[0]) != pair[1]]
-    lesser = sum(
-        _TOUCHING_SHARE < share[pair] < _CARRYING_SHARE and parents.get(pair[0]) != pair[1]
-        for pair in carried
-    )
+    small = [pair for pair in carried if _TOUCHING_SHARE < share[pair] < _CARRYING_SHARE]
     return {
         "support_edges": real["supported_by"][1],
         "support_edges_real": real["supported_by"][0],
@@ -185,7 +183,7 @@ def contact_graph(
             {"child": child, "carrier": carrier, "share": round(share[child, carrier], 2)}
             for child, carrier in wrong
         ],
-        "lesser_supports": lesser,
+        "lesser_supports": sum(parents.get(child) != carrier for child, carrier in small),
     }
 
 
@@ -213,7 +211,7 @@ def _object_entry(
 
 
 def _pushes(physics: Physics, steps: int) -> dict[tuple[int, int], float]:
-    """Step, and return the summed upward impulse (N s) by (object, who pushes it)."""
+    """Simulate `steps` and return the summed upward impulse (N s) by (object, carrier)."""
     push: dict[tuple[int, int], float] = {}
     for _ in range(steps):
         physics.step()
@@ -226,19 +224,19 @@ def _pushes(physics: Physics, steps: int) -> dict[tuple[int, int], float]:
 
 
 def _depth_mm(near: list[Contact], body_id: int) -> float:
-    """Return how deep a body is in any other at the start."""
+    """Return the largest penetration of a body at the start."""
     depth = max((-c.separation_m for c in near if body_id in (c.first, c.second)), default=0.0)
     return round(max(depth, 0.0) * 1e3, 4)
 
 
 def _gap_mm(near: list[Contact], one: int, other: int) -> float:
-    """Return how far apart two bodies are at the start; infinite if more than was looked for, 0 if they overlap."""
+    """Return the gap between two bodies at the start: 0 if they overlap, infinite if no contact was reported."""
     gap = min((c.separation_m for c in near if {c.first, c.second} == {one, other}), default=np.inf)
     return max(gap, 0.0) * 1e3
 
 
 def _finite(pose: np.ndarray) -> np.ndarray:
-    """Replace a pose that diverged or left the world by a finite one far away."""
+    """Replace a diverged pose by a finite one far below the floor."""
     if np.isfinite(pose).all() and np.abs(pose[:3, 3]).max() < _FAR_AWAY_M:
         return pose
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, -_FAR_AWAY_M]))

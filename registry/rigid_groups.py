@@ -1,10 +1,11 @@
-"""Which objects of a bundle can move, and which are one body with another: the same for the environment and exports.
+# pyright: strict
+"""Decide which objects of a bundle move and which are welded to another; used by the environment and the exports.
 
 | in the bundle                         | in a simulator                        |
 |---------------------------------------|---------------------------------------|
 | `dynamic: false`                      | static                                |
-| attached to what is static            | static                                |
-| attached to what can move             | welded to it, whatever `dynamic` says |
+| attached to a static object           | static                                |
+| attached to a moving object           | welded to it, whatever `dynamic` says |
 | everything else                       | dynamic                               |
 """
 
@@ -12,7 +13,7 @@ from registry.bundle import SceneBundle
 
 
 def moving_ids(bundle: SceneBundle) -> set[int]:
-    """Return the ids of the objects that can move, welded ones among them."""
+    """Return the ids of the objects that can move, welded ones included."""
     attached = _attached(bundle)
     dynamic = {item.id: item.dynamic for item in bundle.objects}
 
@@ -23,7 +24,7 @@ def moving_ids(bundle: SceneBundle) -> set[int]:
 
 
 def welded_to(bundle: SceneBundle) -> dict[int, int]:
-    """Return {id: id of the object that can move and to which it is fixed}, by the edges of the scene graph."""
+    """Return {id: id of the moving object that it is welded to}, from the edges of the scene graph."""
     moving = moving_ids(bundle)
     return {child: parent for child, parent in _attached(bundle).items() if parent in moving}
 

@@ -1,18 +1,16 @@
-"""The registry of scenes: bundles in folders, an index beside them.
+# pyright: strict
+"""Registry of scenes: bundles in folders and an index beside them.
 
-    <root>/index.sqlite                     one row a scene: which revision is the current one
+    <root>/index.sqlite                     one row per scene, with its current revision
     <root>/scenes/<scene id>/<revision>/    a bundle; the folder's name is the hash of its content
     <root>/locks/                           lock files, never deleted
 
-Publishing copies the staging folder to `scenes/<id>/.publishing-…`, flushes it to the disk, verifies it,
-renames it to its revision and writes the row last: a scene is there whole or not at all, and a kill at any
-moment leaves only a `.publishing-…` folder, which the next publish of anything removes. A scene's publish
-lock is held for as long as such a folder is in use, so one that is found while the lock is free belongs to
-the dead.
+Publishing is atomic: the staging folder is copied to `scenes/<id>/.publishing-…`, flushed to disk, verified and renamed
+to its revision; the row is written last. An interrupted publish leaves only a `.publishing-…` folder. The scene's
+publish lock is held while such a folder is in use, so the next publish of any scene removes those whose lock is free.
 
-A new revision of a scene replaces the row; then the older revisions are removed, except those that some
-reader has open (`SceneBundle` holds a shared lock on its folder): these go at the scene's next publish or
-removal.
+A new revision replaces the row, and older revisions are removed. A revision that a reader has open (`SceneBundle` holds
+a shared lock on its folder) is removed at the next publish or removal of the scene.
 """
 
 import contextlib
@@ -21,9 +19,10 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from registry.bundle import SceneBundle, seal_bundle
 from registry.db import Index, SceneRow, utc_text
@@ -53,7 +52,7 @@ _CAUSES = {
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """What the index knows of a scene."""
+    """The index entry of a scene."""
 
     scene_id: str
     revision: str
@@ -64,12 +63,14 @@ class SceneRecord:
     source_sha256: str
     n_objects: int
     status: str  # "stable" | "unstable" | "unchecked", from the bundle's own physics report
-    metrics: dict  # JSON values: scale method and uncertainty, counts, numbers of the physics report
+    metrics: dict[
+        str, Any
+    ]  # JSON values: scale method and uncertainty, counts, numbers of the physics report
 
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What `SceneRegistry.verify` found."""
+    """Result of `SceneRegistry.verify`."""
 
     scene_id: str
     revision: str
@@ -79,20 +80,20 @@ class VerifyReport:
     total_bytes: int
 
 
-# `SceneRegistry.list` hides the built-in name inside the class body, so its annotations use these.
+# `SceneRegistry.list` hides the built-in name inside the class, so annotations use these.
 Records = list[SceneRecord]
 Rows = list[SceneRow]
 Names = list[str]
 
 
 def default_registry_root() -> Path:
-    """Return `$SIMRECON_HOME/registry`, or `~/.simrecon/registry` where that variable is unset."""
+    """Return `$SIMRECON_HOME/registry`, or `~/.simrecon/registry` if that variable is unset."""
     home = os.environ.get("SIMRECON_HOME")
     return (Path(home).expanduser() if home else Path.home() / ".simrecon") / "registry"
 
 
 class SceneRegistry:
-    """All scenes below one folder. Reading an absent registry works: it is empty."""
+    """All scenes below one folder. An absent registry reads as empty."""
 
     def __init__(self, root: Path | None = None, create: bool = False) -> None:
         self.root = default_registry_root() if root is None else Path(root).expanduser()
@@ -104,7 +105,7 @@ class SceneRegistry:
 
     @property
     def scenes_folder(self) -> Path:
-        """Where the bundles are."""
+        """Folder of the bundles."""
         return self.root / "scenes"
 
     def list(self) -> Records:
@@ -116,10 +117,10 @@ class SceneRegistry:
         return self._index.revisions()
 
     def get(self, scene_id: str) -> SceneRecord:
-        """Return one scene.
+        """Return the record of a scene.
 
         Raises:
-            SceneNotFound: with the nearest match and what exists.
+            SceneNotFound: The scene does not exist; names the closest match and the existing scenes.
         """
         row = self._index.row(check_scene_id(scene_id))
         if row is None:
@@ -133,20 +134,20 @@ class SceneRegistry:
             try:
                 return SceneBundle.open(record.path, check_hashes)
             except BundleError as error:
-                # A newer revision may have taken the place between the two lines above: then look again.
+                # A newer revision may have been published since `get`: retry with it.
                 if self.get(scene_id).revision == record.revision:
                     raise BundleError(
                         f"scene {scene_id}: {error}. Reconstruct it again, or `simrecon remove {scene_id}`"
                     ) from error
 
     def verify(self, scene_id: str) -> VerifyReport:
-        """Check a scene's schema, the list, size and hash of every file, and that the index agrees."""
+        """Check the schema of a scene, the size and hash of every file, and the agreement with the index."""
         record = self.get(scene_id)
         try:
             bundle = SceneBundle.open(record.path, check_hashes=True)
         except BundleError as error:
             return VerifyReport(scene_id, record.revision, False, (str(error),), 0, 0)
-        problems = []
+        problems: Names = []
         if bundle.revision != record.revision:
             problems.append(f"the index says revision {record.revision}, the bundle is {bundle.revision}")
         if bundle.scene["id"] != scene_id:
@@ -157,16 +158,16 @@ class SceneRegistry:
         )
 
     def next_free_id(self) -> str:
-        """Return the next free `sceneNNNN`. Use `reserve_next_id` where other processes may ask, too."""
+        """Return the next free `sceneNNNN`. If other processes may ask at the same time, use `reserve_next_id`."""
         return _scene_name(self._highest_number() + 1)
 
     @contextlib.contextmanager
-    def hold(self, scene_id: str) -> Iterator[None]:
-        """Hold a scene while it is being reconstructed.
+    def hold(self, scene_id: str) -> Generator[None, None, None]:
+        """Lock a scene while the block reconstructs it.
 
         Raises:
-            SceneBusy: another process holds it.
-            EnvironmentMissing: the registry cannot be written.
+            SceneBusy: Another process holds the lock.
+            EnvironmentMissing: The registry cannot be written.
         """
         path = self._lock_path(scene_id, "hold")
         with contextlib.ExitStack() as stack:
@@ -181,8 +182,8 @@ class SceneRegistry:
             yield
 
     @contextlib.contextmanager
-    def reserve_next_id(self) -> Iterator[str]:
-        """Choose the next free id and hold it while the block runs; two processes never get the same one."""
+    def reserve_next_id(self) -> Generator[str, None, None]:
+        """Choose the next free id and lock it while the block runs; no two processes get the same id."""
         number = self._highest_number() + 1
         while True:
             scene_id = _scene_name(number)
@@ -192,7 +193,7 @@ class SceneRegistry:
                 except SceneBusy:
                     number += 1
                     continue
-                # Whoever held it a moment ago may just have published it.
+                # The previous holder may have published it since.
                 if self._index.row(scene_id) is not None:
                     number += 1
                     continue
@@ -200,14 +201,13 @@ class SceneRegistry:
                 return
 
     def publish(self, staging: Path, scene_id: str) -> SceneRecord:
-        """Publish a sealed bundle as the current revision of `scene_id`. The staging folder is left as it is.
+        """Publish a copy of a sealed bundle as the current revision of `scene_id`.
 
-        A bundle that was sealed under another id is given this one. Publishing what is already there changes
-        nothing.
+        A bundle sealed under another id gets this id. Publishing the current revision again changes nothing.
 
         Raises:
-            BundleError: the staging folder is not a valid bundle.
-            EnvironmentMissing: the registry cannot be written; nothing is left behind.
+            BundleError: The staging folder is not a valid bundle.
+            EnvironmentMissing: The registry cannot be written; no partial bundle remains.
         """
         check_scene_id(scene_id)
         SceneBundle.open(staging, check_hashes=False)  # before anything is created
@@ -221,13 +221,13 @@ class SceneRegistry:
                     row = self._place(Path(staging), folder, scene_id)
                 finally:
                     with contextlib.suppress(OSError):
-                        folder.rmdir()  # only succeeds where nothing was published
+                        folder.rmdir()  # succeeds only if nothing was published
                 self._remove_superseded(folder, row.revision)
             self._sweep_others(folder)
         return self._record(row)
 
     def remove(self, scene_id: str) -> None:
-        """Remove a scene: first its row, then its files."""
+        """Remove a scene: its row first, then its files."""
         record = self.get(scene_id)
         folder = record.path.parent
         with (
@@ -242,10 +242,9 @@ class SceneRegistry:
                 folder.rmdir()
 
     def rebuild_index(self) -> Records:
-        """Recover a lost or damaged index from the folders; returns the scenes found.
+        """Rebuild a lost or damaged index from the folders; return the scenes found.
 
-        Where a scene has several revisions that verify, the one written last is taken. Folders that do not
-        verify are left alone and out of the index.
+        Of several valid revisions of a scene, the last written is current. Invalid folders are kept but not indexed.
         """
         with _disk_errors(f"rebuild the index of {self.root}"):
             self.scenes_folder.mkdir(parents=True, exist_ok=True)
@@ -284,7 +283,7 @@ class SceneRegistry:
         return self.root / "locks" / f"{check_scene_id(scene_id)}.{purpose}.lock"
 
     def _create_index(self) -> None:
-        """Create the index; a registry that lost it gets it back from the folders, not an empty one."""
+        """Create the index; rebuild it from the folders if it was lost."""
         if not self._index.exists() and self._folder_ids():
             self.rebuild_index()
         self._index.create()
@@ -305,7 +304,7 @@ class SceneRegistry:
                 _remove_folder(final)
             if not final.exists():
                 _flush_tree(temporary)
-                os.replace(temporary, final)
+                temporary.replace(final)
                 placed = final
                 _flush(folder)
             row = self._index.row(scene_id)
@@ -326,7 +325,7 @@ class SceneRegistry:
                 _remove_folder(revision)
 
     def _sweep(self, folder: Path) -> None:
-        """Remove what dead processes left in a scene's folder; the caller holds its publish lock."""
+        """Remove temporary folders of dead processes; the caller holds the scene's publish lock."""
         if folder.is_dir():
             for item in folder.iterdir():
                 if item.name.startswith(_TEMPORARY):
@@ -336,7 +335,7 @@ class SceneRegistry:
         for folder in self.scenes_folder.iterdir():
             if folder == but or not any(i.name.startswith(_TEMPORARY) for i in folder.iterdir()):
                 continue
-            # A folder in use is somebody else's; one that is no scene is none of ours.
+            # Skip folders in use by another process (LockHeld) and folders that are no scenes (UsageError).
             with (
                 contextlib.suppress(LockHeld, UsageError),
                 file_lock(self._lock_path(folder.name, "publish"), blocking=False),
@@ -346,9 +345,9 @@ class SceneRegistry:
                     folder.rmdir()
 
     def _rows_from_folders(self) -> Rows:
-        rows = []
+        rows: Rows = []
         for scene_id in self._folder_ids():
-            found = []
+            found: list[tuple[float, str, SceneRow]] = []
             for revision in _revisions(self.scenes_folder / scene_id):
                 with contextlib.suppress(BundleError):
                     bundle = SceneBundle.open(revision, check_hashes=True)
@@ -361,8 +360,8 @@ class SceneRegistry:
 
 
 @contextlib.contextmanager
-def _disk_errors(doing: str) -> Iterator[None]:
-    """Turn what the disk refuses into an EnvironmentMissing that says what to do."""
+def _disk_errors(doing: str) -> Generator[None, None, None]:
+    """Convert OSError into EnvironmentMissing with advice."""
     try:
         yield
     except OSError as error:
@@ -393,9 +392,9 @@ def _is_intact(folder: Path) -> bool:
 
 
 def _remove_folder(folder: Path) -> None:
-    """Remove a revision: out of sight in one step, then file by file."""
+    """Remove a revision: rename it first, so that it disappears in one step."""
     doomed = folder.with_name(f"{_TEMPORARY[1]}{folder.name}-{secrets.token_hex(4)}")
-    os.replace(folder, doomed)
+    folder.replace(doomed)
     shutil.rmtree(doomed, ignore_errors=True)
 
 

@@ -1,14 +1,14 @@
 """Gymnasium environments of reconstructed scenes.
 
-Importing this package registers every scene of the default registry as `SimRecon/<scene id>`, reading only
-the registry's index:
+Importing this package registers every scene of the default registry as `SimRecon/<scene id>`; it reads only the
+registry's index:
 
     import gymnasium as gym, simrecon_envs
-    env = gym.make("SimRecon/scene0001")         # batched torch tensors, as every ManiSkill environment
-    env = gym.make("SimRecon/scene0001-pick_mug-v0")          # a task of `list_tasks("scene0001")`
-    env = simrecon_envs.make_cpu("scene0001")    # unbatched NumPy, for stable-baselines3 and the like
+    env = gym.make("SimRecon/scene0001")         # batched torch tensors, as in ManiSkill
+    env = gym.make("SimRecon/scene0001-pick_mug-v0")          # a task from `list_tasks("scene0001")`
+    env = simrecon_envs.make_cpu("scene0001")    # unbatched NumPy, e.g. for stable-baselines3
 
-Nothing heavy (torch, sapien, mani_skill) is loaded before the first `make`.
+torch, sapien and mani_skill are loaded by the first `make`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -60,7 +60,7 @@ _LAZY = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs the simulator on first use."""
+    """Import names that need the simulator on first use."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib

@@ -1,22 +1,25 @@
-"""The functions of arrays that tasks are written with, for NumPy and torch alike.
+"""Array functions for tasks that work with NumPy and with torch.
 
-One environment on the CPU is computed in NumPy, many on a GPU in torch: for a handful of numbers an operation of torch
-costs as much as ten of NumPy, and a task's fifty operations more than the physics does. Operators, slices, `sum(1)` and
-`all(1)` are the same in both. Arrays are batched, (b, ...), float32 or bool. In NumPy b is 1, and what is (b,) may be a
-number of NumPy's, with which an operation costs a tenth of that with an array: take it as a whole, not by index.
+One environment on the CPU uses NumPy, many on a GPU use torch: on a few numbers a torch operation costs as much as ten
+NumPy operations, and the fifty operations of a task more than the physics. Operators, slices, `sum(1)` and `all(1)` are
+the same in both. Arrays are batched, (b, ...), float32 or bool. In NumPy b is 1, and an array (b,) may be a NumPy
+scalar, whose operations cost a tenth of those of an array: do not index it.
 """
 
 import math
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 
-Array = np.ndarray | np.generic | torch.Tensor
+# np.ndarray, np.generic or torch.Tensor; type checkers would reject operators on a union of them.
+Array: TypeAlias = Any
+_SCALAR: Any = np.generic  # not narrowed by type checkers: np.generic has no comparison
 _NUMBERS = frozenset({np.float32, np.bool_, np.int64})
 
 
 def tensor(x: Array) -> torch.Tensor:
-    """Return an array as a tensor of its own, a number as one of shape (1,); doubles become floats."""
+    """Convert an array to a tensor (a copy, if it is NumPy's): a scalar to shape (1,), float64 to float32."""
     if type(x) in _NUMBERS:
         return torch.from_numpy(np.array([x]))
     if isinstance(x, torch.Tensor):
@@ -28,18 +31,18 @@ def tensor(x: Array) -> torch.Tensor:
 
 
 def tensors(named: dict[str, Array]) -> dict[str, torch.Tensor]:
-    """Return arrays as tensors, as `tensor` does."""
+    """Apply `tensor` to every value."""
     array, wrap = np.array, torch.from_numpy
     return {key: wrap(array([x])) if type(x) in _NUMBERS else tensor(x) for key, x in named.items()}
 
 
 def numpy(x: Array) -> np.ndarray:
-    """Return an array as NumPy's, on the CPU."""
+    """Convert an array to NumPy, on the CPU."""
     return x.cpu().numpy() if isinstance(x, torch.Tensor) else x
 
 
 def norm(x: Array) -> Array:
-    """Return the lengths (...) of vectors (..., d)."""
+    """Return the Euclidean norms (...) of vectors (..., d)."""
     if isinstance(x, torch.Tensor):
         return torch.linalg.norm(x, dim=-1)
     if x.ndim == 2 and len(x) == 1:
@@ -48,26 +51,26 @@ def norm(x: Array) -> Array:
 
 
 def surely_not(x: Array) -> bool:
-    """Return whether a condition (b,) is known to hold nowhere, without asking a GPU: of one environment on the CPU."""
+    """Return whether a condition (b,) is a false NumPy scalar; false for tensors, which would need a GPU sync."""
     return isinstance(x, np.bool_) and not x
 
 
 def real(x: Array) -> Array:
-    """Return an array of bool or integers as float32."""
+    """Convert bool or integers to float32."""
     if isinstance(x, np.generic):
         return np.float32(x)
     return x.float() if isinstance(x, torch.Tensor) else x.astype(np.float32)
 
 
 def whole(x: Array) -> Array:
-    """Return an array as integers."""
+    """Convert to int64."""
     if isinstance(x, np.generic):
         return np.int64(x)
     return x.long() if isinstance(x, torch.Tensor) else x.astype(np.int64)
 
 
 def where(condition: Array, yes: Array | float, no: Array | float) -> Array:
-    """Return `yes` where the condition holds, else `no`; numbers stand for arrays of them."""
+    """Select `yes` where the condition holds, else `no`; numbers are broadcast."""
     if isinstance(condition, torch.Tensor):
         return torch.where(condition, yes, no)
     if isinstance(condition, np.bool_):
@@ -76,10 +79,10 @@ def where(condition: Array, yes: Array | float, no: Array | float) -> Array:
 
 
 def clamp(x: Array, least: float | None = None, most: float | None = None) -> Array:
-    """Return an array with its values brought between two bounds."""
+    """Clip values to [least, most]; None is no bound."""
     if isinstance(x, torch.Tensor):
         return torch.clamp(x, least, most)
-    if isinstance(x, np.generic):
+    if isinstance(x, _SCALAR):
         x = x if least is None or x >= least else type(x)(least)
         return x if most is None or x <= most else type(x)(most)
     x = x if least is None else np.maximum(x, least)
@@ -94,14 +97,14 @@ def tanh(x: Array) -> Array:
 
 
 def atan2(y: Array, x: Array) -> Array:
-    """Return the angle of (x, y)."""
+    """Return the angle (rad) of (x, y)."""
     if isinstance(y, np.generic):
         return np.float32(math.atan2(y, x))
     return torch.atan2(y, x) if isinstance(y, torch.Tensor) else np.arctan2(y, x)
 
 
 def turn(x: Array, yaw: Array) -> Array:
-    """Turn vectors (b, 3) about +z by angles (b,)."""
+    """Rotate vectors (b, 3) about +z by angles (b,) (rad)."""
     if isinstance(yaw, np.generic):
         c, s, (along, across, up) = math.cos(yaw), math.sin(yaw), x[0].tolist()
         return np.array([[c * along - s * across, s * along + c * across, up]], np.float32)
@@ -110,7 +113,7 @@ def turn(x: Array, yaw: Array) -> Array:
 
 
 def stack(parts: list[Array]) -> Array:
-    """Return arrays (b, ...) side by side, (b, n, ...)."""
+    """Stack n arrays (b, ...) to (b, n, ...)."""
     if isinstance(parts[0], torch.Tensor):
         return torch.stack(parts, dim=1)
     if all(isinstance(part, np.generic) for part in parts):
@@ -119,34 +122,34 @@ def stack(parts: list[Array]) -> Array:
 
 
 def component(x: Array, axis: int) -> Array:
-    """Return one component (b,) of vectors (b, k)."""
+    """Return a component (b,) of vectors (b, k)."""
     return x[:, axis] if isinstance(x, torch.Tensor) else x[0, axis]
 
 
 def column(x: Array) -> Array:
-    """Return an array (b,) as (b, 1)."""
+    """Reshape (b,) to (b, 1)."""
     return np.array([[x]]) if isinstance(x, np.generic) else x[:, None]
 
 
 def largest(x: Array) -> Array:
-    """Return the largest of the last axis."""
+    """Return the maximum along the last axis."""
     return x.max(-1) if isinstance(x, np.ndarray) else x.amax(dim=-1)
 
 
 def smallest(x: Array) -> Array:
-    """Return the smallest of the last axis."""
+    """Return the minimum along the last axis."""
     return x.min(-1) if isinstance(x, np.ndarray) else x.amin(dim=-1)
 
 
 def larger(x: Array, y: Array) -> Array:
-    """Return the larger one of every two values."""
-    if isinstance(x, np.generic) and isinstance(y, np.generic):
+    """Return the elementwise maximum."""
+    if isinstance(x, _SCALAR) and isinstance(y, _SCALAR):
         return x if x >= y else y
     return torch.maximum(x, y) if isinstance(x, torch.Tensor) else np.maximum(x, y)
 
 
 def pick(x: Array, index: Array) -> Array:
-    """Return of every row of x (b, n, ...) the one that index (b,) says."""
+    """Return x[i, index[i]] (b, ...) of x (b, n, ...) and index (b,)."""
     return x[np.arange(len(x)) if isinstance(x, np.ndarray) else torch.arange(len(x), device=x.device), index]
 
 

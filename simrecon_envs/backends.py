@@ -1,4 +1,4 @@
-"""Whether and where to render."""
+"""Choose the render backend of an environment."""
 
 import functools
 
@@ -8,13 +8,13 @@ _BLIND_OBS_MODES = (None, "state", "state_dict", "none")
 
 
 def choose_render_backend(wanted: str, obs_mode: str | None, render_mode: str | None) -> str:
-    """Return ManiSkill's name of the render backend.
+    """Return ManiSkill's name of the render backend: "gpu", "cpu" or "none".
 
-    "auto" is "none" unless pictures are asked for: without a renderer an environment is made and stepped
-    faster, and works on machines without a Vulkan driver.
+    "auto" is "none" if neither mode needs images: without a renderer an environment is faster, and needs no Vulkan
+    driver.
 
     Raises:
-        EnvironmentMissing: pictures are asked for, and nothing can render here.
+        EnvironmentMissing: Images are requested, and there is no usable renderer.
     """
     pictures = obs_mode not in _BLIND_OBS_MODES or render_mode is not None
     if wanted == "auto":
@@ -36,7 +36,7 @@ def _working_backend() -> str:
         if device.can_render():
             return "gpu"
     except RuntimeError:
-        pass  # no CUDA device: the CPU's driver (Mesa's lavapipe) is next
+        pass  # no CUDA device: try the CPU driver (Mesa's lavapipe)
     try:
         sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError as error:

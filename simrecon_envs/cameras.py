@@ -1,6 +1,6 @@
-"""Where the cameras of an environment look from: occupancy + placement -> poses in SAPIEN's axes.
+"""Choose viewpoints of an environment's cameras by their visibility of target, robot and objects in an occupancy grid.
 
-SAPIEN's camera looks along +x, with +y left and +z up; OpenCV's along +z, with +x right and +y down.
+SAPIEN camera: +x forward, +y left, +z up. OpenCV camera: +x right, +y down, +z forward.
 """
 
 import copy
@@ -9,26 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from registry import SceneBundle
-from registry.geometry import SAPIEN_CAMERA_FROM_OPENCV, quat_from_matrix
+from registry.geometry import SAPIEN_CAMERA_FROM_OPENCV, matrix_from_quat, quat_from_matrix
 from simrecon_envs.occupancy import ConvexSolid, OccupancyGrid
 from simrecon_envs.placement import Placement
 
 _WORKSPACE_FOV_RAD = 1.05
-_MAX_CAPTURE_CANDIDATES = 40
+_MAX_CAPTURE_CANDIDATES = 40  # video frames whose cameras are tried
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera's pose and vertical field of view; pictures are square unless said otherwise."""
+    """Pose and vertical field of view of a camera with square images."""
 
     eye: np.ndarray  # float64 (3,) world
     quat_wxyz: np.ndarray  # float64 (4,) world_from_sapien_camera
     fov_rad: float
 
     def seen_share(self, points: np.ndarray, grid: OccupancyGrid) -> float:
-        """Return which share of world points (n, 3) a square picture shows: in it, in front, not hidden."""
-        from registry.geometry import matrix_from_quat
-
+        """Return the share of world points (n, 3) that are inside the image and not occluded in the grid."""
         local = (points - self.eye) @ matrix_from_quat(self.quat_wxyz)
         limit = np.tan(self.fov_rad / 2) * 0.95
         inside = (local[:, 0] > 0.1) & (np.abs(local[:, 1:]) <= limit * local[:, :1].clip(1e-6)).all(axis=1)
@@ -36,31 +34,41 @@ class Viewpoint:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, fov_rad: float) -> Viewpoint:
-    """Return an upright viewpoint at `eye` (3,) that looks at `target` (3,)."""
+    """Return the upright viewpoint at `eye` (3,) that looks at `target` (3,), world space."""
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward)
     left = np.cross([0.0, 0.0, 1.0], forward)
-    # Straight up or down has no horizontal direction of its own.
+    # Looking straight up or down leaves the roll undefined: use world y.
     left = left / np.linalg.norm(left) if np.linalg.norm(left) > 1e-6 else np.array([0.0, 1.0, 0.0])
     world_from_camera = np.stack([forward, left, np.cross(forward, left)], axis=1)
     return Viewpoint(np.asarray(eye, np.float64), quat_from_matrix(world_from_camera), fov_rad)
 
 
 def from_capture(world_from_camera: np.ndarray, params: np.ndarray, width: int, height: int) -> Viewpoint:
-    """Return the viewpoint of a frame of the video: same pose, square picture that covers the larger side."""
+    """Return the viewpoint of a video frame: its pose and a square image that covers the longer side.
+
+    Args:
+        world_from_camera: (4, 4), OpenCV axes.
+        params: Intrinsics in pixels; the first two are the focal lengths.
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
     world_from_sapien = np.asarray(world_from_camera)[:3, :3] @ SAPIEN_CAMERA_FROM_OPENCV[:3, :3].T
     fov = 2 * np.arctan(max(width / 2 / params[0], height / 2 / params[1]))
-    return Viewpoint(
-        np.asarray(world_from_camera)[:3, 3], quat_from_matrix(world_from_sapien), float(min(fov, 1.6))
-    )
+    eye = np.asarray(world_from_camera)[:3, 3]
+    return Viewpoint(eye, quat_from_matrix(world_from_sapien), float(min(fov, 1.6)))
 
 
 def workspace_view(
     solids: list[ConvexSolid], placement: Placement, middle: np.ndarray, robot_points: np.ndarray
 ) -> Viewpoint:
-    """Return the observation camera's view: onto the target, from beside or opposite the robot, unhidden.
+    """Choose the observation camera: the candidate beside or opposite the robot with the least occluded target.
 
-    The robot at rest (points (n, 3) in its root space) counts as something that hides.
+    Args:
+        solids: All convex solids of the scene.
+        placement: Place of the robot and its target.
+        middle: Point (3,) to look at without a target.
+        robot_points: Points (n, 3) on the robot at rest, root space; they occlude.
     """
     target = placement.target
     focus = target.center if target is not None else middle
@@ -90,9 +98,9 @@ def workspace_view(
 def room_view(
     bundle: SceneBundle, solids: list[ConvexSolid], placement: Placement | None, robot_points: np.ndarray
 ) -> Viewpoint:
-    """Return a view of the robot, its target and much of the scene: from a frame's camera, or a better place.
+    """Choose the view that shows most of the robot, its target and the objects.
 
-    The robot at rest (points (n, 3) in its root space) hides what is behind it.
+    Candidates are cameras of video frames and points on circles around the scene. Arguments as in `workspace_view`.
     """
     boxes: dict[int, list[np.ndarray]] = {item.id: [] for item in bundle.objects}
     for solid in solids:
@@ -110,7 +118,7 @@ def room_view(
     grid = _grid_around(solids, focus, 5.0, cell_m=0.05)
     hiding = copy.deepcopy(grid)
     hiding.add_points(robot)
-    # The robot, which is the last group, hides the others and not itself.
+    # The robot, which is the last group, occludes the others, but not itself.
     seen = [(points, weight, hiding) for points, weight in groups]
     if len(robot):
         seen[-1] = (*groups[-1], grid)
@@ -121,11 +129,11 @@ def room_view(
             continue
         score = bonus + sum(weight * view.seen_share(points, by) for points, weight, by in seen)
         if groups and placement is not None:
-            # The workspace should fill a good part of the picture.
+            # Prefer a distance of about 1.8 m to the workspace.
             middle = groups[-1][0] if placement.target is None else placement.target.center[None]
             distance = np.linalg.norm(middle.mean(axis=0) - view.eye)
             score -= 0.5 * abs(np.log(max(distance, 0.1) / 1.8))
-            # From behind, its body hides what the hand does.
+            # Prefer views from the front: the robot's body occludes its hand from behind.
             ahead = np.array([np.cos(placement.yaw_rad), np.sin(placement.yaw_rad)])
             aside = view.eye[:2] - placement.position[:2]
             score += 0.6 * min(float(ahead @ aside) / max(float(np.linalg.norm(aside)), 0.1), 0.3)
@@ -135,7 +143,7 @@ def room_view(
 
 
 def _framing(eye: np.ndarray, focus: np.ndarray, points: np.ndarray) -> Viewpoint:
-    """Return the view towards `focus` whose picture is filled by most of the points (n, 3)."""
+    """Return the view towards `focus` whose field of view fits the 90th percentile of the points (n, 3)."""
     forward = (focus - eye) / np.linalg.norm(focus - eye)
     rays = points - eye
     cosine = rays @ forward / np.linalg.norm(rays, axis=1).clip(1e-6)
@@ -146,14 +154,14 @@ def _framing(eye: np.ndarray, focus: np.ndarray, points: np.ndarray) -> Viewpoin
 def _room_candidates(
     bundle: SceneBundle, focus: np.ndarray, points: np.ndarray
 ) -> list[tuple[Viewpoint, float]]:
+    """Return viewpoints and their bonus: video cameras, these turned towards `focus`, and circles around it."""
     cameras = bundle.cameras
     count = len(cameras.indices)
     views = []
-    for row in (
-        np.unique(np.linspace(0, count - 1, min(count, _MAX_CAPTURE_CANDIDATES)).astype(int)) if count else []
-    ):
+    rows = np.linspace(0, count - 1, min(count, _MAX_CAPTURE_CANDIDATES)).astype(int)
+    for row in np.unique(rows):
         captured = from_capture(cameras.world_from_camera[row], cameras.params, cameras.width, cameras.height)
-        # Where the person stood is in the room and sees it; turning towards the focus keeps that.
+        # The capture positions are inside the room, and stay so when turned towards the focus.
         views.append((captured, 0.1))
         views.append((_framing(captured.eye, focus, points), 0.3))
     for radius in (1.4, 1.8, 2.3):

@@ -1,24 +1,28 @@
-"""What there is: scenes by what the index knows of them, tasks by what a bundle holds. Light until tasks are listed."""
+"""List scenes (from the registry's index) and tasks (from a bundle). Only `list_tasks` has heavy imports."""
 
 import fnmatch
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from registry import SceneRecord, SceneRegistry, UsageError
 from simrecon_envs.registration import NAMESPACE, env_id
 
+if TYPE_CHECKING:
+    from simrecon_envs.tasks.facts import SceneFacts
+
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """A task that can be made: `gym.make(entry.id)`."""
+    """A task of a scene; create it with `gym.make(entry.id)`."""
 
     id: str
     scene: str
     task: str
     kind: str
     instruction: str
-    problems: tuple[str, ...]  # empty where nothing speaks against it
+    problems: tuple[str, ...]  # reasons why it can hardly be solved; empty if there is none
 
 
 def list_scenes(
@@ -32,20 +36,20 @@ def list_scenes(
     labels: Iterable[str] = (),
     where: Callable[[SceneRecord], bool] | None = None,
 ) -> list[SceneRecord]:
-    """Return the scenes that pass every filter, ordered by id. Opens bundles only for `labels`.
+    """Return the scenes that pass every filter, ordered by id. Bundles are opened only for `labels`.
 
     Args:
-        pattern: The scene's id, with `*` and `?`.
-        registry: The registry's folder; the default registry where left out.
+        pattern: Pattern of the scene id, with `*` and `?`.
+        registry: Folder of the registry; None for the default one.
         status: "stable", "unstable" or "unchecked".
-        min_objects: Least number of objects.
-        max_objects: Greatest number of objects.
-        min_movable: Least number of objects that can move.
-        labels: The scene has an object of each of these labels.
-        where: Any other filter of a `SceneRecord`.
+        min_objects: Minimum number of objects.
+        max_objects: Maximum number of objects.
+        min_movable: Minimum number of movable objects.
+        labels: Labels that must all occur.
+        where: Additional filter.
 
     Raises:
-        UsageError: there is no such status.
+        UsageError: The status is unknown.
     """
     if status not in (None, "stable", "unstable", "unchecked"):
         raise UsageError(f"list_scenes: status {status!r} is not one of stable, unstable, unchecked")
@@ -80,15 +84,15 @@ def list_tasks(
 
     Args:
         scene: `scene0001` or `SimRecon/scene0001`.
-        robot: A robot of ManiSkill; what it can grip and reach decides.
-        kinds: Only these; all where None.
-        hard: With the tasks that something speaks against (their `problems` say what).
-        registry: The registry's folder; the default registry where left out.
+        robot: A robot of ManiSkill; tasks depend on its gripper and reach.
+        kinds: Kinds of tasks; None for all.
+        hard: Include tasks with `problems`.
+        registry: Folder of the registry; None for the default one.
 
     Raises:
-        SceneNotFound: there is no such scene.
-        UsageError: there is no such kind or robot.
-        EnvironmentMissing: the robot's files are not here.
+        SceneNotFound: The scene does not exist.
+        UsageError: The kind or the robot is unknown.
+        EnvironmentMissing: The robot's files are not installed.
     """
     from simrecon_envs.robots import check_robot
     from simrecon_envs.tasks import KINDS
@@ -105,8 +109,8 @@ def list_tasks(
     return [entry for entry in entries if hard or not entry.problems]
 
 
-def _entries(facts: "SceneFacts", kind: str) -> list[TaskEntry]:  # noqa: F821
-    """Return every task of a kind with what speaks against it; kept with the facts."""
+def _entries(facts: "SceneFacts", kind: str) -> list[TaskEntry]:
+    """Return every task of a kind with its problems; cached in `facts.listed`."""
     from simrecon_envs.planning import place_task, without_grip
     from simrecon_envs.tasks import KINDS, list_specs
 

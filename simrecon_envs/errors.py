@@ -1,4 +1,4 @@
-"""Errors of the environments; the tree is in `registry.errors`."""
+"""Errors of the environments; see `registry.errors` for the class tree."""
 
 from gymnasium.error import NameNotFound
 
@@ -6,10 +6,10 @@ from registry.errors import BundleError, EnvironmentMissing, SceneNotFound
 
 
 class SceneAssetsMissing(EnvironmentMissing, BundleError):
-    """The files of a registered scene are gone or damaged. Exit code 4."""
+    """The files of a registered scene are missing or damaged. Exit code 4."""
 
     exit_code = 4
 
 
 class EnvNotFound(SceneNotFound, NameNotFound):
-    """No scene or task has this id; Gymnasium's own error for it, too. Exit code 2."""
+    """No scene or task has this id. Also Gymnasium's `NameNotFound`. Exit code 2."""

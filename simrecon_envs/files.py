@@ -1,4 +1,4 @@
-"""JSON files that are written whole or not at all, and the versions that results depend on."""
+"""Read and atomically write JSON files; collect the package versions that results depend on."""
 
 import hashlib
 import json
@@ -13,15 +13,15 @@ PACKAGES = ("simrecon", "mani_skill", "sapien", "gymnasium", "torch", "numpy")
 
 
 def read_json(path: Path, what: str, schema: str) -> dict[str, Any]:
-    """Read a JSON file of a schema.
+    """Read a JSON object and check its schema.
 
     Args:
         path: The file.
-        what: What it is, for errors, such as "suite".
-        schema: What its "schema" has to be.
+        what: Name of its content in errors, such as "suite".
+        schema: Expected value of its key "schema".
 
     Raises:
-        UsageError: it is absent, no JSON, or of another schema.
+        UsageError: The file is absent, not JSON, or of another schema.
     """
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
@@ -38,20 +38,20 @@ def read_json(path: Path, what: str, schema: str) -> dict[str, Any]:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file in place of the old one, whole or not at all.
+    """Write a JSON file atomically: through a temporary file that replaces the old one.
 
     Raises:
-        EnvironmentMissing: the folder cannot be written.
+        EnvironmentMissing: The folder cannot be written.
     """
     partial = path.with_name(f".{path.name}-{os.getpid()}")
     text = json.dumps(value, indent=1, allow_nan=False) + "\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "w", encoding="utf-8") as handle:
+        with partial.open("w", encoding="utf-8") as handle:
             handle.write(text)
             handle.flush()
             os.fsync(handle.fileno())
-        os.replace(partial, path)
+        partial.replace(path)
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise EnvironmentMissing(
@@ -60,14 +60,14 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def absolute(path: Path | str | None) -> str | None:
-    """Return a path as other processes need it; None stays None."""
+    """Return the absolute path, for use in other processes; None stays None."""
     return None if path is None else str(Path(path).expanduser().absolute())
 
 
 def versions(*more: str) -> dict[str, str]:
-    """Return the versions of what decides how an episode goes, and of more packages.
+    """Return the versions of the packages that episodes depend on, and of `more` packages.
 
-    `source` is the digest of this package's files.
+    "source" is a digest of this package's files.
     """
     found = {}
     for package in (*PACKAGES, *more):
@@ -79,12 +79,12 @@ def versions(*more: str) -> dict[str, str]:
 
 
 def _source_digest() -> str:
-    """Return a digest of the environments' source, which a version does not tell apart between releases."""
+    """Return a digest of the environments' source, which changes between releases of the same version."""
     root = Path(__file__).resolve().parent
     digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
         parts = file.relative_to(root).parts
         if parts[0] == "training":
-            continue  # learners see environments, not the other way round
+            continue  # environments do not depend on learners
         digest.update("/".join(parts).encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]

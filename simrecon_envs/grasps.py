@@ -1,11 +1,12 @@
-"""Where a gripper that comes from above can take hold of a thing: convex parts + hand -> grasps. NumPy and SciPy only.
+"""Find top-down parallel-jaw grasps of an object: convex parts + hand -> ranked grasps. NumPy and SciPy only.
 
-Horizontal sections of the thing are searched, at several heights and turns, for stretches of material that fit between
-the fingers and have room for a finger on both sides: the whole of a narrow thing, the neck of a wide one, the wall of
-an open one. Both fingers and the palm must have a free way down.
+Horizontal sections of the object, at several heights and yaws, are searched for runs of material that fit between the
+fingers, with free space for a finger on both sides: a whole narrow object, the neck of a wide one, the wall of an open
+one. The vertical approach of fingers and palm must be free.
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy import ndimage
@@ -15,30 +16,28 @@ from simrecon_envs.robots import HandShape
 from simrecon_envs.surfaces import height_map
 
 CELL_M = 0.004
-_LEVEL_M = 0.008  # between the heights that are tried
-_BELOW_TOP_M = 0.12  # farther down a palm does not get
-_TURNS = 12
-_ROW_CELLS = 2  # every so many rows across are looked at
-_FREE_M = 0.003  # between the fingertips and what is below them
-_SLACK_M = 0.004  # between a finger and what it is going to grip, at each side
-_MAX_SLOPE = 0.7  # of a surface that a finger does not slip from (ManiSkill's fingers have a friction of 2)
-_MAX_SKEW = 0.6  # of the two sides, over the fingers' width
+_LEVEL_M = 0.008  # spacing of the heights
+_BELOW_TOP_M = 0.12  # maximum depth below the top, which the palm limits
+_TURNS = 12  # yaws over half a turn
+_ROW_CELLS = 2  # spacing of the rows that are searched
+_FREE_M = 0.003  # clearance of the fingertips above the support
+_SLACK_M = 0.004  # clearance between a finger and the object, at each side
+_MAX_SLOPE = 0.7  # of the gripped surface; steeper ones slip (the friction of ManiSkill's fingers is 2)
+_MAX_SKEW = 0.6  # slope of the two sides over the fingers' width
 _MAX_TORQUE_NM = 1.2  # of the weight about the fingers
-_APART_M, _APART_RAD = 0.025, 0.5  # grasps nearer to each other than this are one
-_MOST = 6
+_APART_M, _APART_RAD = 0.025, 0.5  # closer grasps are duplicates
+_MOST = 6  # grasps returned
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """A way to take hold of a thing, as it stands where it was captured."""
+    """A top-down grasp of an object at its captured pose."""
 
-    offset: (
-        np.ndarray
-    )  # float64 (3,) from the thing's box centre to the point between the fingers, world axes
-    yaw_rad: float  # along which the fingers close
-    width_m: float  # of what is between the fingers
-    opening_m: float  # how far apart they are on the way down
-    cost: float  # the less, the better; about 1 is doubtful
+    offset: np.ndarray  # float64 (3,) from the object's box centre to the tool centre point, world axes
+    yaw_rad: float  # closing direction of the fingers
+    width_m: float  # of the material between the fingers
+    opening_m: float  # between the fingers during the approach
+    cost: float  # lower is better; about 1 is doubtful
 
 
 def find_grasps(
@@ -49,14 +48,14 @@ def find_grasps(
     center_of_mass: np.ndarray,
     hand: HandShape,
 ) -> list[Grasp]:
-    """Return the grasps of a thing, the best first.
+    """Return the grasps of an object, best first.
 
     Args:
-        solids: Everything in the scene; what is near the thing is in the hand's way.
-        owner: Id of the thing.
-        center: Its box's centre (3,), world.
+        solids: All convex solids of the scene; those near the object are obstacles.
+        owner: Id of the object.
+        center: Its box centre (3,), world.
         mass_kg: Its mass.
-        center_of_mass: (3,) in the world; far from it, the weight turns the thing out of the hand.
+        center_of_mass: (3,), world; the torque of the weight about the fingers is limited.
         hand: The gripper.
     """
     search = _Search(solids, owner, hand)
@@ -81,22 +80,21 @@ def find_grasps(
     return out
 
 
-_YAW, _WIDTH, _OPENING, _COST = 3, 4, 5, 6  # columns of a candidate after its position
+_YAW, _WIDTH, _OPENING, _COST = 3, 4, 5, 6  # columns of a candidate, after its position
+Sections: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]  # filled cells below, at and above the grip
 
 
 class _Search:
-    """The sections of one thing, and what stands about."""
+    """Sections of one object and the height map around it."""
 
     def __init__(self, solids: list[ConvexSolid], owner: int, hand: HandShape) -> None:
         self._hand = hand
         self._own = [s for s in solids if s.owner == owner]
-        lower, upper = (
-            np.min([s.lower for s in self._own], axis=0),
-            np.max([s.upper for s in self._own], axis=0),
-        )
+        lower = np.min([s.lower for s in self._own], axis=0)
+        upper = np.max([s.upper for s in self._own], axis=0)
         self._bottom, self._top = float(lower[2]), float(upper[2])
         self._middle = (lower + upper)[:2] / 2
-        # Whatever way the hand is turned, fingers and palm are over the map.
+        # The map covers fingers and palm at every yaw.
         reach = float(np.linalg.norm((upper - lower)[:2])) / 2 + hand.opening_m
         self._reach = reach
         edge = reach + max(hand.palm_half_m)
@@ -112,12 +110,12 @@ class _Search:
         self._sections: dict[int, np.ndarray] = {}
 
     def levels(self) -> range:
-        """Return the numbers of the heights to try, counted from the bottom."""
+        """Return the indices of the heights to try, counted from the bottom."""
         first = max(1, int((self._top - _BELOW_TOP_M - self._bottom) / _LEVEL_M))
         return range(first, max(int((self._top - self._bottom) / _LEVEL_M), first + 1))
 
     def at_level(self, level: int) -> list[np.ndarray]:
-        """Return candidates (k, 7) whose fingers press at one height: tip, turn, width, opening, cost."""
+        """Return candidates (k, 7) that grip at one height: tip (3), yaw, width, opening, cost."""
         hand = self._hand
         height = self._bottom + level * _LEVEL_M
         tip = max(height, self._bottom + hand.tip_below_m + _FREE_M + 0.001)
@@ -130,28 +128,25 @@ class _Search:
         out = []
         for number, cells in enumerate(self._turned):
             masks = [mask[cells] for mask in (blocked, *sections)]
-            rows = self._stretches(*masks)
+            rows = self._runs(*masks)
             if len(rows):
                 yaw = number * np.pi / _TURNS
                 along, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
                 xy = self._middle + rows[:, :1] * along + rows[:, 1:2] * across
-                out.append(
-                    np.column_stack([xy, np.full(len(rows), tip), np.full(len(rows), yaw), rows[:, 2:]])
-                )
+                fixed = np.full((len(rows), 2), (tip, yaw))
+                out.append(np.column_stack([xy, fixed, rows[:, 2:]]))
         return out
 
     def palm_is_free(self, row: np.ndarray) -> bool:
-        """Tell whether nothing is under the palm that is higher than the fingers are long."""
+        """Return whether the scene below the palm is lower than the palm."""
         c, s = np.cos(row[_YAW]), np.sin(row[_YAW])
         along, across = (np.arange(-half, half + CELL_M, CELL_M) for half in self._hand.palm_half_m)
         a, b = np.meshgrid(along, across, indexing="ij")
         points = row[:2] + np.stack([c * a - s * b, s * a + c * b], axis=-1)
         return bool((self._heights(points) <= row[2] + self._hand.palm_above_m - 0.002).all())
 
-    def _stretches(
-        self, blocked: np.ndarray, below: np.ndarray, at: np.ndarray, above: np.ndarray
-    ) -> np.ndarray:
-        """Return (k, 5) of one turn: middle along and across (m), width, opening, cost of what fits."""
+    def _runs(self, blocked: np.ndarray, below: np.ndarray, at: np.ndarray, above: np.ndarray) -> np.ndarray:
+        """Return the runs of material that fit at one yaw (k, 5): middle along and across (m), width, opening, cost."""
         hand = self._hand
         width_cells = int(round(hand.finger_m[0] / CELL_M)) | 1
         shut = ndimage.maximum_filter1d(blocked.view(np.uint8), width_cells, axis=0)[::_ROW_CELLS]
@@ -162,30 +157,21 @@ class _Search:
         if not len(row):
             return np.zeros((0, 5))
         found = []
-        for span in range(3):  # how many gaps too narrow for a finger may be in between
+        for span in range(3):  # number of gaps inside the run that are too narrow for a finger
             if len(row) <= span:
                 break
-            first, last = slice(0, len(row) - span), slice(span, None)
-            found.append(self._fitting(row, start, end, first, last, pad, (below, at, above)))
+            found.append(self._fitting(row, start, end, span, pad, (below, at, above)))
         return np.concatenate(found)
 
-    def _fitting(
-        self,
-        row: np.ndarray,
-        start: np.ndarray,
-        end: np.ndarray,
-        first: slice,
-        last: slice,
-        pad: np.ndarray,
-        sections: tuple,
-    ) -> np.ndarray:
+    def _fitting(self, row: np.ndarray, start: np.ndarray, end: np.ndarray, span: int, pad: np.ndarray,
+                 sections: Sections) -> np.ndarray:  # fmt: skip
+        """Return the runs of `span` + 1 neighboring intervals [start, end) of cells in a row, as `_runs` does."""
         hand, size = self._hand, len(self._axis)
-        before = np.where(
-            np.roll(row, 1) == row, start - np.roll(end, 1), size
-        )  # the first of a row has room to the edge
-        before[0] = size
-        after = np.roll(np.where(np.roll(row, 1) == row, start - np.roll(end, 1), size), -1)
-        after[-1] = size
+        first, last = slice(0, len(row) - span), slice(span, None)
+        # Free cells before and after each run; the outer runs of a row have free space to the edge.
+        before = np.where(np.roll(row, 1) == row, start - np.roll(end, 1), size)
+        after = np.roll(before, -1)
+        before[0] = after[-1] = size
         s, e, r = start[first], end[last], row[first]
         width = (e - s) * CELL_M
         room = np.minimum(before[first], after[last]) * CELL_M
@@ -193,8 +179,9 @@ class _Search:
         keep = (row[first] == row[last]) & (opening >= width + 2 * _SLACK_M)
         if not keep.any():
             return np.zeros((0, 5))
-        s, e, r, width, opening = (x[keep] for x in (s, e, r, width, opening))
-        # Where the fingers will press: what is first met at this height, not what blocks farther up or down.
+        s, e, r = (cells[keep] for cells in (s, e, r))
+        width, opening = width[keep], opening[keep]
+        # Contact points: the outermost material at this height, not obstacles above or below.
         left, right = _first_met(pad[r * _ROW_CELLS], s, e)
         off = ((left - s) + (e - 1 - right)) * CELL_M
         slope = self._slopes(sections, r * _ROW_CELLS, s, e)
@@ -207,8 +194,8 @@ class _Search:
         out = np.column_stack([middle, self._axis[r * _ROW_CELLS], width, opening, cost])
         return out[(left <= right) & (off < 0.012) & (slope < _MAX_SLOPE) & (skew < _MAX_SKEW)]
 
-    def _slopes(self, sections: tuple, rows: np.ndarray, s: np.ndarray, e: np.ndarray) -> np.ndarray:
-        """Return how much each stretch narrows or widens between the two heights about it, as a slope."""
+    def _slopes(self, sections: Sections, rows: np.ndarray, s: np.ndarray, e: np.ndarray) -> np.ndarray:
+        """Return the vertical slope of each run's sides, from the sections below and above."""
         low, high = (_first_met(sections[k][rows], s - 3, e + 3) for k in (0, 2))
         lean = [np.abs(low[k] - high[k]) * CELL_M / (2 * _LEVEL_M) for k in (0, 1)]
         missing = (low[0] > low[1]) | (high[0] > high[1])
@@ -216,21 +203,20 @@ class _Search:
         return np.where(missing, 0.25, 0.5 * np.maximum(*lean) + parallel)
 
     def _skew(self, at: np.ndarray, rows: np.ndarray, s: np.ndarray, e: np.ndarray) -> np.ndarray:
-        """Return by how much the two sides lie askew, as slopes, over the fingers' width."""
+        """Return the horizontal slope of each run's sides over the fingers' width."""
         half = max(int(round(self._hand.finger_m[0] / 2 / CELL_M)), 1)
         ends = [_first_met(at[np.clip(rows + step, 0, len(at) - 1)], s, e) for step in (-half, half)]
         here = _first_met(at[rows], s, e)
         out = np.zeros(len(rows))
-        for side in (0, 1):
-            one, other = ends[0][side], ends[1][side]
+        for one, other in zip(*ends, strict=True):
             out = np.maximum(out, np.abs(one - other) / (2 * half))
         there = [ends[k][0] <= ends[k][1] for k in (0, 1)]
-        # A thing narrower than the fingers ends on both sides; a rounded one that is held off its middle on one.
+        # Objects narrower than the fingers end on both sides; rounded ones gripped off their middle end on one.
         out = np.where(there[0] & there[1], out, np.where(there[0] | there[1], 1.0, 0.2))
         return np.where(here[0] <= here[1], out, 1.0)
 
     def _section(self, level: int) -> np.ndarray:
-        """Return which cells of the map the thing fills at a height."""
+        """Return the cells of the map (nx, ny) that the object fills at a height."""
         if level not in self._sections:
             filled = np.zeros(self._map.top.shape, bool)
             height = self._bottom + level * _LEVEL_M
@@ -267,7 +253,7 @@ def _widened(mask: np.ndarray, cells: int) -> np.ndarray:
 
 
 def _first_met(rows: np.ndarray, s: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and last filled column of each row (k, n) within [s, e); first > last where none is."""
+    """Return the first and last filled column of each row (k, n) within [s, e); first > last if it is empty."""
     columns = np.arange(rows.shape[1])
     filled = rows & (columns >= s[:, None]) & (columns < e[:, None])
     some = filled.any(axis=1)

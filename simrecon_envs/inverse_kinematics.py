@@ -1,13 +1,12 @@
-"""Where an arm's joints take its hand, and how they must stand for the hand to be at a goal; compiled, for the CPU.
+"""Forward and inverse kinematics of an arm, in Numba, on the CPU.
 
-Importing this imports Numba: only environments do whose robot is driven by its hand. What is here is compiled at its
-first use and kept for the next process. It has loops in place of expressions of slices and powers, because a first
-`gym.make` waits for the compiler, which takes seconds for those.
+Only environments with a hand-pose controller import this module, and Numba with it. Kernels are compiled at the first
+call and cached on disk. They use explicit loops, because the compilation of array expressions would delay the first
+`gym.make` by seconds.
 
-Joints are screws in the base's space (Brockett's product of exponentials; Lynch and Park, Modern Robotics, chapters 4
-to 6): this is all that has to be known of an arm, whatever joints it has. A step is the one of ManiSkill's solver
-(pinocchio's closed loop with log6), except for how long it is: a share of the screw motion from where the hand is to
-the goal, by the least change of the joints.
+Joints are screws in base space (product of exponentials; Lynch and Park, Modern Robotics, chapters 4 to 6). An
+iteration is the damped least-squares step of ManiSkill's solver (pinocchio's closed loop with log6), with another step
+size: a share of the screw motion from the current hand pose to the goal.
 """
 
 import math
@@ -16,20 +15,20 @@ import numba
 import numpy as np
 
 _DAMPING = 1e-6  # as in ManiSkill's solver
-_SMALL_RAD = 1e-4  # below this series are more exact than quotients
+_SMALL_RAD = 1e-4  # below this sine, limits replace quotients
 
 
 def _compiled(function):
-    # Inlined by Numba, so that LLVM sees everything once.
+    # Inlined by Numba, so that LLVM optimizes one function.
     options = {"error_model": "numpy", "nogil": True, "inline": "always"}
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # "no locator available": no folder, beside the file or at home, can be written to
+    except RuntimeError:  # "no locator available": no writable cache folder
         return numba.njit(**options)(function)
 
 
 def motions(screws: np.ndarray) -> np.ndarray:
-    """Return matrices (n, 3, 3, 4) S, C, L of screws (n, 6): the motion by q is I + sin q S + (1 - cos q) C + q L."""
+    """Return the matrices S, C, L (n, 3, 3, 4) of screws (n, 6): exp(q) = I + sin q S + (1 - cos q) C + q L."""
     along, about = screws[:, :3, None], screws[:, 3:]
     cross = np.zeros((len(screws), 3, 3))
     for row, column, axis in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -41,12 +40,12 @@ def motions(screws: np.ndarray) -> np.ndarray:
 
 @_compiled
 def place(moving, angles, base_from):
-    """Write where joints take what comes after them: base_from (n + 1, 3, 4), before the first, ..., after all.
+    """Compute the forward kinematics: accumulated rigid transforms before the first joint, ..., after the last one.
 
     Args:
-        moving: `motions` of the joints, in the chain's order.
-        angles: Of the joints (n,), rad or m.
-        base_from: Output.
+        moving: `motions` of the joints, in the order of the chain.
+        angles: Joint positions (n,), rad or m.
+        base_from: Output (n + 1, 3, 4).
     """
     for row in range(3):
         for column in range(4):
@@ -68,7 +67,7 @@ def place(moving, angles, base_from):
 
 @_compiled
 def product(one, other, out):
-    """Write the product (3, 4) of two rigid transforms (3, 4); `out` is none of them."""
+    """Write the product of two rigid transforms (3, 4) to `out`, which must not alias them."""
     for row in range(3):
         for column in range(4):
             total = one[row, 3] if column == 3 else 0.0
@@ -79,11 +78,11 @@ def product(one, other, out):
 
 @_compiled
 def away(here, goal, twist):
-    """Write the screw motion (6,) from a place to a goal (3, 4), in the base's axes at the place; return its norm."""
+    """Write the twist (6,) from a pose to a goal (3, 4) (log6), in base axes at the pose; return its norm."""
     trace = 0.0
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
-        turn = 0.0  # of goal @ here's inverse, what is antisymmetric
+        turn = 0.0  # antisymmetric part of goal @ inverse(here)
         for k in range(3):
             turn += goal[j, k] * here[i, k] - goal[i, k] * here[j, k]
             trace += goal[axis, k] * here[axis, k]
@@ -92,10 +91,10 @@ def away(here, goal, twist):
     angle = math.atan2(s, c)
     scale, bend = 1.0, 1.0 / 12.0
     if c < 0.0 and s <= _SMALL_RAD:
-        return np.inf  # half a turn, about who knows what
+        return np.inf  # half a turn: the axis is undefined
     if s > _SMALL_RAD:
         scale = angle / s
-        half = (1.0 + c) / s if c > 0.0 else s / (1.0 - c)  # the half angle's cotangent
+        half = (1.0 + c) / s if c > 0.0 else s / (1.0 - c)  # cotangent of the half angle
         bend = (1.0 - 0.5 * angle * half) / (angle * angle)
     size, dot, squared = 0.0, 0.0, 0.0
     for axis in range(3):
@@ -113,7 +112,7 @@ def away(here, goal, twist):
 
 @_compiled
 def jacobian(screws, free, base_from, tip, out):
-    """Write how joints move and turn the hand, in the base's axes at the hand: (6, n), 0 where they are not free."""
+    """Write the Jacobian (6, n) of the hand, in base axes at the hand; columns of fixed joints are 0."""
     for joint in range(len(screws)):
         for row in range(6):
             total = 0.0
@@ -130,14 +129,14 @@ def jacobian(screws, free, base_from, tip, out):
 
 @_compiled
 def move(matrix, twist, share, angles, factor):
-    """Change joints (n,) by the least that moves the hand by a share of a screw motion (6,), damped.
+    """Apply a damped least-squares step towards a twist (6,) to the joints (n,).
 
     Args:
-        matrix: The Jacobian (6, n).
-        twist: The motion; overwritten.
-        share: Of the motion.
-        angles: The joints, changed in place.
-        factor: Overwritten (6, 6): Cholesky's, of the Jacobian times itself.
+        matrix: Jacobian (6, n).
+        twist: Twist of the hand; overwritten.
+        share: Step size, as a share of the twist.
+        angles: Joint positions, changed in place.
+        factor: Work space (6, 6) for the Cholesky factor of J J^T + damping.
     """
     for row in range(6):
         for column in range(row + 1):
@@ -162,12 +161,12 @@ def move(matrix, twist, share, angles, factor):
 
 @_compiled
 def aim(scale, action, tip, goal):
-    """Write where an action wants a hand (3, 4) that is at `tip` (3, 4).
+    """Write the goal pose (3, 4) of a delta action for a hand at `tip` (3, 4).
 
     Args:
-        scale: Middles (m) and halves (m) of shifts, and thrice the largest turn (rad): (3, 3).
-        action: The shift (3,), and the turn (3,) or not: about the base's z, after that y, after that x.
-        tip: The hand.
+        scale: (3, 3): centre (m) and half range (m) of shifts, and three times the maximum rotation (rad).
+        action: Shift (3,), optionally followed by rotations (3,) about base x, y, z; z is applied first.
+        tip: Current pose of the hand.
         goal: Output.
     """
     size = 1.0
@@ -177,7 +176,7 @@ def aim(scale, action, tip, goal):
         for column in range(3):
             goal[row, column] = tip[row, column]
         goal[row, 3] = tip[row, 3] + scale[0, row] + scale[1, row] * min(max(action[row], -1.0), 1.0)
-    for axis in range(len(action) - 4, -1, -1):  # z, y, x; none of an action of three numbers
+    for axis in range(len(action) - 4, -1, -1):  # z, y, x; none if the action has three numbers
         i, j, angle = (axis + 1) % 3, (axis + 2) % 3, scale[2, axis] * action[3 + axis] / size
         s, c = math.sin(angle), math.cos(angle)
         for column in range(3):
@@ -187,21 +186,21 @@ def aim(scale, action, tip, goal):
 
 @_compiled
 def follow(screws, moving, free, home, phases, within, scale, known, qpos, action, angles):
-    """Write how joints must stand (n,) for a hand to follow an action; return whether they can.
+    """Solve the inverse kinematics of a delta action; return whether it converged.
 
     Args:
-        screws: Of the joints (n, 6), in the chain's order: along (m a rad, or unit), about (unit, or zeros).
+        screws: Screws (n, 6) of the joints in the order of the chain: linear part (m/rad, or unit), axis (unit, or 0).
         moving: Their `motions`.
-        free: Whether a joint may be moved (n,).
-        home: Where the hand is (3, 4) with all joints at 0.
-        phases: Of steps (p, 3): which share of the way each goes, at most how many, and how near is enough. Each phase
-            starts from the nearest place of the one before, the last one from where the joints started.
-        within: How near the hand has to have come for the last one.
+        free: Whether a joint may move (n,).
+        home: Pose of the hand (3, 4) with all joints at 0.
+        phases: (p, 3): step size, maximum steps and tolerance. A phase starts from the best joints of the one before;
+            the last one starts from the initial joints.
+        within: The last phase runs only if the error of the one before is at most this.
         scale: As in `aim`.
-        known: Which of the robot's joints these are (n,).
-        qpos: Where all of the robot's joints are (d,).
+        known: Indices (n,) of these joints in `qpos`.
+        qpos: Positions (d,) of all joints of the robot.
         action: As in `aim`.
-        angles: Output.
+        angles: Output (n,).
     """
     n, last = len(screws), len(phases) - 1
     base_from, tip, goal = np.empty((n + 1, 3, 4)), np.empty((3, 4)), np.empty((3, 4))

@@ -1,4 +1,4 @@
-"""Which things are moved together at reset, and where they may go: as seen from above, with the heights of supports."""
+"""Group objects that move together at a reset, and check new poses in top view: outlines and support heights."""
 
 import functools
 from dataclasses import dataclass
@@ -8,26 +8,26 @@ import numpy as np
 from simrecon_envs.surfaces import CELL_M, height_map
 from simrecon_envs.tasks.facts import SceneFacts
 
-GAP_M = 0.004
-_LEVEL_M = 0.006
-_ROBOT_GAP_M = 0.02
-_AROUND_M = 0.5  # of a support, around what stands on it
+GAP_M = 0.004  # minimum distance between the outlines of two groups
+_LEVEL_M = 0.006  # tolerance of the support's height
+_ROBOT_GAP_M = 0.02  # minimum distance from the robot at rest
+_AROUND_M = 0.5  # margin of a support's height map around a stack
 
 
 @dataclass(frozen=True)
 class Stack:
-    """A thing on something that does not move, with all that stands on it; where it was captured."""
+    """An object on an immovable support, with everything that stands on it, at the captured poses."""
 
     members: tuple[int, ...]
-    hull: np.ndarray  # (h, 2) convex, counterclockwise as seen from above
-    height: tuple[float, float]  # from its bottom to the top of what stands on it (m, world)
-    start: dict[int, np.ndarray]  # world_from_object (4, 4)
-    top: np.ndarray  # (nx, ny) height of its support, and of what does not move and is in the way
+    hull: np.ndarray  # (h, 2) convex outline, counterclockwise in top view
+    height: tuple[float, float]  # of its bottom and its top (m, world)
+    start: dict[int, np.ndarray]  # world_from_object (4, 4) of its members
+    top: np.ndarray  # (nx, ny) height of its support and of immovable obstacles
     own: np.ndarray  # (nx, ny) height of its support alone
-    lower: np.ndarray  # (2,)
+    lower: np.ndarray  # (2,) corner of these maps
 
     def stands(self, hull: np.ndarray) -> bool:
-        """Tell whether the outline lies on the level that it stands on, and nothing within is higher."""
+        """Return whether the outline lies on the captured support height, without higher cells inside."""
         edge = np.floor((_along(hull) - self.lower) / CELL_M).astype(int)
         if (edge < 0).any() or (edge >= self.top.shape).any():
             return False
@@ -37,9 +37,9 @@ class Stack:
         return bool((self.top[self._within(hull)] <= self.height[0] + _LEVEL_M).all())
 
     def rise(self, hull: np.ndarray) -> float:
-        """Return by how much (m) its support is higher under an outline than where it was captured.
+        """Return by how much (m) the support is higher under an outline than under the captured one.
 
-        Reconstructed tops are level to some millimetres, and PhysX throws what is that deep in another thing.
+        Reconstructed supports are level to some millimetres; PhysX ejects an object that penetrates that deep.
         """
         return max(self._highest(hull) - self._stood_at, 0.0)
 
@@ -51,7 +51,7 @@ class Stack:
         return float(self.own[self._within(hull)].max(initial=self.height[0] - _LEVEL_M))
 
     def _within(self, hull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cells (k,), (k,) that an outline covers, and those that it touches."""
+        """Return the indices (k,), (k,) of cells that an outline covers or touches."""
         least = np.floor((hull.min(axis=0) - self.lower) / CELL_M).astype(int).clip(0, self.own.shape)
         most = np.ceil((hull.max(axis=0) - self.lower) / CELL_M).astype(int).clip(0, self.own.shape)
         grid = np.mgrid[least[0] : most[0], least[1] : most[1]].reshape(2, -1)
@@ -61,31 +61,31 @@ class Stack:
 
 @dataclass
 class Group:
-    """Stacks that overlap as seen from above (one leans over the other, say): they move as one."""
+    """Stacks whose outlines overlap in top view; they move as one."""
 
     stacks: list[Stack]
     others: list["Group"]
     robot: np.ndarray  # (n, 3) points on the robot at rest, world
-    robot_gap_m: float
+    robot_gap_m: float  # minimum distance from these
 
     @functools.cached_property
     def members(self) -> tuple[int, ...]:
-        """Return the ids of its things."""
+        """Return the ids of its objects."""
         return tuple(key for stack in self.stacks for key in stack.members)
 
     @functools.cached_property
     def center(self) -> np.ndarray:
-        """Return what it turns about (2,)."""
+        """Return its center of rotation (2,)."""
         return np.mean([stack.hull.mean(axis=0) for stack in self.stacks], axis=0)
 
     @functools.cached_property
     def outlines(self) -> list[np.ndarray]:
-        """Return the stacks' outlines as they were captured."""
+        """Return the captured outlines of its stacks."""
         return [stack.hull for stack in self.stacks]
 
     @functools.cached_property
     def _beside(self) -> list[tuple[np.ndarray, float]]:
-        """Return of every stack the robot's points (n, 2) at its height, and how near they may be (m)."""
+        """Return per stack the robot's points (n, 2) at its height, and their minimum distance (m)."""
         out = []
         for stack in self.stacks:
             low, high = stack.height
@@ -97,15 +97,15 @@ class Group:
         return out
 
     def least_gap(self, other: "Group", mine: int, theirs: int) -> float:
-        """Return how near (m) one of its stacks may come to another group's: no nearer than both were captured."""
+        """Return the minimum distance (m) of two stacks: `GAP_M`, or their captured distance if that is smaller."""
         return min(gap(self.stacks[mine].hull, other.stacks[theirs].hull), GAP_M)
 
     def move(self, transform: np.ndarray, places: dict[int, list[np.ndarray]]) -> np.ndarray | None:
-        """Return a horizontal move (4, 4), risen to where the supports are; None where it cannot go there.
+        """Check a horizontal move; return it raised to the supports' heights, or None if it collides.
 
         Args:
-            transform: The move.
-            places: The outlines of all groups' stacks as they stand now, by the groups' `id`.
+            transform: The move (4, 4), world space.
+            places: Current outlines of the stacks of all groups, by Python `id`; updated on success.
         """
         hulls = [hull @ transform[:2, :2].T + transform[:2, 3] for hull in self.outlines]
         if not all(stack.stands(hull) for stack, hull in zip(self.stacks, hulls, strict=True)):
@@ -121,7 +121,7 @@ class Group:
         return risen
 
     def clears(self, other: "Group", hulls: list[np.ndarray], places: list[np.ndarray]) -> bool:
-        """Tell whether its stacks' outlines keep off those of another group."""
+        """Return whether the outlines `hulls` of its stacks keep their distances from the `places` of another group."""
         return all(
             _boxes_apart(hull, place) or gap(hull, place) >= self.gaps[id(other), mine, theirs]
             for theirs, place in enumerate(places)
@@ -130,7 +130,7 @@ class Group:
 
     @functools.cached_property
     def gaps(self) -> dict[tuple[int, int, int], float]:
-        """Return `least_gap` of all pairs of stacks, by the other group's `id`."""
+        """Return `least_gap` of all pairs of stacks, by Python `id` of the other group."""
         return {
             (id(other), mine, theirs): self.least_gap(other, mine, theirs)
             for other in self.others
@@ -140,12 +140,12 @@ class Group:
 
 
 def group_things(facts: SceneFacts, robot: np.ndarray, robot_gap_m: float = 0.0) -> list[Group]:
-    """Return what moves together, in the order of ids.
+    """Return the groups of objects that move together, ordered by id.
 
     Args:
-        facts: The scene's.
-        robot: Points (n, 3) on the robot at rest, world; nothing is moved to where it is.
-        robot_gap_m: How far the robot's joints may be from there besides.
+        facts: The scene.
+        robot: Points (n, 3) on the robot at rest, world; obstacles.
+        robot_gap_m: Additional distance from the robot, for randomized joints.
     """
     stacks, found = _stacks(facts), []
     left = set(range(len(stacks)))
@@ -153,9 +153,8 @@ def group_things(facts: SceneFacts, robot: np.ndarray, robot_gap_m: float = 0.0)
         together, new = set(), {min(left)}
         while new:
             together |= new
-            new = {
-                k for k in left - together if any(gap(stacks[k].hull, stacks[n].hull) < 0 for n in together)
-            }
+            rest = left - together
+            new = {k for k in rest if any(gap(stacks[k].hull, stacks[n].hull) < 0 for n in together)}
         left -= together
         found.append(Group([stacks[k] for k in sorted(together)], [], robot, _ROBOT_GAP_M + robot_gap_m))
     for group in found:
@@ -190,7 +189,7 @@ def _stacks(facts: SceneFacts) -> list[Stack]:
 
 
 def about(center: np.ndarray, shift: np.ndarray, turn: float) -> np.ndarray:
-    """Return the transform (4, 4) that turns about a vertical axis through `center` (2,) (rad) and shifts (m)."""
+    """Return the transform (4, 4) that rotates about the vertical axis through `center` (2,) and shifts by (2,) m."""
     c, s = np.cos(turn), np.sin(turn)
     out = np.eye(4)
     out[:2, :2] = [[c, -s], [s, c]]
@@ -199,9 +198,9 @@ def about(center: np.ndarray, shift: np.ndarray, turn: float) -> np.ndarray:
 
 
 def gap(first: np.ndarray, second: np.ndarray) -> float:
-    """Return how far apart (m) two convex outlines (h, 2) are along the normal that separates them best.
+    """Return the largest separation (m) of two convex outlines (h, 2) along an edge normal (separating axis theorem).
 
-    Negative where they overlap: by how much one has to move to be clear of the other.
+    Negative if they overlap: the penetration depth.
     """
     gaps = []
     for hull in (first, second):
@@ -212,27 +211,27 @@ def gap(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _boxes_apart(first: np.ndarray, second: np.ndarray) -> bool:
-    """Tell whether the boxes around two outlines are so far apart that `gap` need not be asked: most are."""
+    """Return whether the bounding boxes of two outlines are more than `GAP_M` apart; a fast test before `gap`."""
     between = np.maximum(first.min(axis=0) - second.max(axis=0), second.min(axis=0) - first.max(axis=0))
     return bool(between.max() > GAP_M)
 
 
 def _outside(points: np.ndarray, hull: np.ndarray) -> np.ndarray:
-    """Return how far (n,) (m) points (n, 2) are outside of a convex outline (h, 2), at least; negative within."""
+    """Return a lower bound (n,) of the distance (m) of points (n, 2) from a convex outline (h, 2); negative inside."""
     normals = _normals(hull)
-    # Along the long axis, because NumPy takes the largest of few numbers slowly.
+    # Reduce along the first axis: NumPy reduces a short last axis slowly.
     return (normals @ points.T - (hull * normals).sum(axis=1)[:, None]).max(axis=0)
 
 
 def _normals(hull: np.ndarray) -> np.ndarray:
-    """Return the normals (h, 2) of the edges of an outline that goes counterclockwise, outwards."""
+    """Return the outward unit normals (h, 2) of the edges of a counterclockwise outline."""
     edges = _ends(hull) - hull
     normals = np.column_stack([edges[:, 1], -edges[:, 0]])
     return normals / np.sqrt((normals * normals).sum(axis=1, keepdims=True)).clip(1e-9)
 
 
 def _along(hull: np.ndarray) -> np.ndarray:
-    """Return points (k, 2) on a convex outline, no farther apart than a cell."""
+    """Sample points (k, 2) on an outline, at most one cell apart."""
     edges = _ends(hull) - hull
     counts = np.maximum(np.ceil(np.sqrt((edges * edges).sum(axis=1)) / CELL_M).astype(int), 1)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)  # on its edge
@@ -242,5 +241,5 @@ def _along(hull: np.ndarray) -> np.ndarray:
 
 
 def _ends(hull: np.ndarray) -> np.ndarray:
-    """Return where (h, 2) the edges of an outline end."""
+    """Return the end points (h, 2) of the edges of an outline."""
     return np.concatenate([hull[1:], hull[:1]])

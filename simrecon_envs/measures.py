@@ -1,7 +1,7 @@
-"""What tasks read of the simulator, each quantity once a control step; b environments, n movable things.
+"""Simulator state for tasks, cached per control step; b environments, n movable objects.
 
-With many environments on a GPU these are tensors of ManiSkill's structs. On the CPU, where there is one, they are
-NumPy's and come straight from SAPIEN (`cpu_env`): the structs and tensors cost more than the physics does.
+Many environments on a GPU are read as tensors from ManiSkill's structs. One environment on the CPU is read as NumPy
+arrays directly from SAPIEN (`cpu_env`), because the structs and tensors cost more than the physics.
 """
 
 import math
@@ -15,19 +15,19 @@ from registry.geometry import invert_rigid, transform_points
 from simrecon_envs.arrays import Array, atan2, component, largest, norm, rotate
 from simrecon_envs.cpu_env import DirectReads
 
-_GRASP_REACH_M = 0.12  # nothing farther from the hand than this and its own half diagonal is held
+_GRASP_REACH_M = 0.12  # a held object is nearer to the hand than this plus its radius
 _GRAVITY_M_S2 = 9.81
 
 
 class Measures:
-    """Poses, velocities and contacts of the movable things and of the robot."""
+    """Poses, velocities and contacts of the movable objects and of the robot."""
 
     def __init__(self, env: Any, direct: bool | None = None) -> None:
-        """Find the bodies.
+        """Collect the bodies.
 
         Args:
-            env: A `SceneEnv` that is built.
-            direct: Read straight from SAPIEN, in NumPy; where None, if the simulation runs on the CPU.
+            env: A built `SceneEnv`.
+            direct: Read directly from SAPIEN, as NumPy arrays; None: if the simulation runs on the CPU.
         """
         self._env = env
         direct = not env.gpu_sim_enabled if direct is None else direct
@@ -56,18 +56,18 @@ class Measures:
         self._keys = list(self._row)
         self._about: dict[int, set[Hashable]] = {
             key: set() for key in self._row
-        }  # of `_placed`, by what it is about
+        }  # keys of `_placed` by object
         self._spots: dict[int, list[float]] = {}
         self._axes: dict[tuple[int, int], np.ndarray] = {}
 
     def array(self, numbers: np.ndarray) -> Array:
-        """Return numbers as an array of the kind that is computed with here, float32."""
+        """Convert to float32, as NumPy array or tensor on the device."""
         if self._direct is not None:
             return np.array(numbers, np.float32)
         return torch.as_tensor(numbers, dtype=torch.float32, device=self._env.device)
 
     def refresh(self) -> None:
-        """Forget what was read: the simulator has moved on."""
+        """Clear cached values after a simulation step."""
         self._cache = {}
         moved = range(len(self._actors)) if self._direct is None else self._direct.refresh()
         for row in moved:
@@ -78,9 +78,9 @@ class Measures:
             self._about[key].clear()
 
     def while_still(self, name: Hashable, keys: tuple[int, ...], compute: Callable[[], Any]) -> Any:
-        """Return what `compute` makes of where things are, computed once until one of them moves.
+        """Return `compute()`, cached until one of the objects `keys` moves (most objects do not move).
 
-        Most things stand still most of the time. What else `compute` depends on must not change in an episode.
+        The result may only depend on their poses and on values that are constant in an episode.
         """
         known = self._placed.get(name)
         if known is None:
@@ -90,7 +90,7 @@ class Measures:
         return known
 
     def forget(self, env_idx: torch.Tensor) -> None:
-        """Forget what carried what in the environments that start anew, and all that was computed."""
+        """Clear all cached values, and the known supports in the environments `env_idx` that are reset."""
         if self._direct is not None:
             self._direct.find()
             self._supported = {}
@@ -100,14 +100,14 @@ class Measures:
             known[env_idx] = False
 
     def scale_weight(self, key: int, env_idx: torch.Tensor, factor: torch.Tensor) -> None:
-        """Say that a thing is heavier by a factor (len(env_idx),) than the bundle says."""
+        """Set the weight of an object to that of the bundle times a factor (len(env_idx),)."""
         self._weight_n[key][env_idx, 0] = self._nominal_n[key] * factor
 
-    # ---- Things.
+    # ---- Objects.
 
     @property
     def poses(self) -> Array:
-        """Return the actors' poses (b, n, 7): position, quaternion wxyz; world."""
+        """Return the actor poses (b, n, 7), world: position (m), quaternion wxyz."""
         if "poses" not in self._cache:
             if self._direct is not None:
                 self._cache["poses"] = self._direct.poses
@@ -116,11 +116,11 @@ class Measures:
         return self._cache["poses"]
 
     def position(self, key: int) -> Array:
-        """Return where a thing's box centre is (b, 3)."""
+        """Return the box centre (b, 3) of an object, world."""
         return self.while_still(("position", key), (key,), lambda: self.pose(key)[:, :3])
 
     def pose(self, key: int) -> Array:
-        """Return the pose (b, 7) of a thing's box centre, with the orientation of its actor."""
+        """Return the pose (b, 7) of an object's box centre, with the orientation of its actor."""
         return self.while_still(("pose", key), (key,), lambda: self._pose(self._row[key]))
 
     def _pose(self, row: int) -> Array:
@@ -131,11 +131,11 @@ class Measures:
         return torch.cat([center, pose[:, 3:]], dim=1)
 
     def up(self, key: int) -> Array:
-        """Return by which cosine (b,) a thing's upright axis still points up, as in the bundle."""
+        """Return the cosine (b,) of an object's tilt from its captured orientation."""
         return self.while_still(("up", key), (key,), lambda: component(self._turned(key, 2), 2))
 
     def yaw(self, key: int) -> Array:
-        """Return by which angle (b,) a thing is turned about +z from how it was captured."""
+        """Return the rotation (b,) (rad) of an object about +z from its captured orientation."""
         return self.while_still(("yaw", key), (key,), lambda: self._yaw(key))
 
     def _yaw(self, key: int) -> Array:
@@ -143,7 +143,7 @@ class Measures:
         return atan2(component(side, 1), component(side, 0))
 
     def speeds(self, key: int) -> tuple[Array, Array]:
-        """Return the linear (m/s) and angular (rad/s) speed (b,) of a thing."""
+        """Return the linear (m/s) and angular (rad/s) speed (b,) of an object."""
         name = ("speed", key)
         if name not in self._cache:
             if self._direct is not None:
@@ -154,7 +154,7 @@ class Measures:
         return self._cache[name]
 
     def at_rest(self, key: int, linear_m_s: float = 0.05, angular_rad_s: float = 0.6) -> Array:
-        """Return whether a thing hardly moves (b,)."""
+        """Return whether the speeds of an object are at most these (b,)."""
         linear, angular = self.speeds(key)
         return (linear <= linear_m_s) & (angular <= angular_rad_s)
 
@@ -162,7 +162,7 @@ class Measures:
 
     @property
     def tcp(self) -> Array:
-        """Return the pose (b, 7) of the point between the fingers."""
+        """Return the pose (b, 7) of the tool centre point (between the fingertips)."""
         if self._direct is not None:
             return self._direct.tcp
         if "tcp" not in self._cache:
@@ -171,13 +171,13 @@ class Measures:
 
     @property
     def tip(self) -> Array:
-        """Return where (b, 3) the point between the fingers is."""
+        """Return the position (b, 3) of the tool centre point."""
         if "tip" not in self._cache:
             self._cache["tip"] = self.tcp[:, :3]
         return self._cache["tip"]
 
     def tcp_distance(self, key: int) -> Array:
-        """Return how far (b,) the point between the fingers is from a thing's box centre."""
+        """Return the distance (b,) of the tool centre point from an object's box centre."""
         name = ("tcp_distance", key)
         if name not in self._cache:
             if self._direct is None:
@@ -190,7 +190,7 @@ class Measures:
 
     @property
     def joint_speed(self) -> Array:
-        """Return the speed (b,) of the robot's fastest joint, fingers left out."""
+        """Return the speed (b,) of the robot's fastest joint, without the fingers."""
         if "joint_speed" not in self._cache:
             if self._direct is not None:
                 self._cache["joint_speed"] = self._direct.joint_speed()
@@ -202,23 +202,23 @@ class Measures:
 
     @property
     def qvel(self) -> Array:
-        """Return the speeds (b, d) of the robot's joints (rad/s, m/s)."""
+        """Return the joint velocities (b, d) of the robot (rad/s, m/s)."""
         return self._env.agent.robot.get_qvel() if self._direct is None else self._direct.qvel()
 
     def link_pose(self, link: Any) -> Array:
-        """Return the pose (b, 7) of one of the robot's links."""
+        """Return the pose (b, 7) of a link of the robot."""
         return link.pose.raw_pose if self._direct is None else self._direct.link_pose(link)
 
     def _near_hand(self, key: int) -> Array:
-        """Return whether the hand is so near that it may hold a thing (b,)."""
+        """Return whether the hand is close enough to hold an object (b,)."""
         return self.tcp_distance(key) <= self._half_diagonal[key] + _GRASP_REACH_M
 
     def undisturbed(
         self, name: Hashable, subject: int, keys: tuple[int, ...], compute: Callable[[], Any]
     ) -> Any:
-        """Return what `compute` makes of things, once while they sleep and the hand is too far to hold the subject.
+        """Return `compute()`, cached while the objects `keys` sleep and the hand is too far to hold the subject.
 
-        Its result must not depend on anything that changes meanwhile. Of many environments it is always computed.
+        The result must not depend on anything else that changes meanwhile. Tensors are never cached.
         """
         bodies = () if self._direct is None else self._direct.bodies
         if bodies and not self._near_hand(subject) and all(bodies[self._row[k]].is_sleeping for k in keys):
@@ -227,7 +227,7 @@ class Measures:
         return compute()
 
     def held(self, key: int) -> Array:
-        """Return whether the robot holds a thing between its fingers (b,)."""
+        """Return whether the robot grasps an object (b,)."""
         name = ("held", key)
         if name not in self._cache:
             near, row = self._near_hand(key), self._row[key]
@@ -240,10 +240,10 @@ class Measures:
     # ---- Contacts.
 
     def supported(self, key: int, support: int) -> Array:
-        """Return whether a support carries a good part of a thing's weight (b,).
+        """Return whether a support carries at least a quarter of an object's weight (b,).
 
-        PhysX reports no contacts of bodies that sleep; what was so when they fell asleep still is. What sleeps since
-        the reset stands where it was captured.
+        PhysX reports no contacts of sleeping bodies: the result from before they fell asleep is kept. An object that
+        sleeps since the reset is on its captured support.
         """
         name = ("supported", key, support)
         if name not in self._cache:
@@ -260,16 +260,16 @@ class Measures:
         return self._cache[name]
 
     def _sleeps_on(self, key: int, support: int) -> bool:
-        """Tell whether nothing has moved a thing since a reset that left it sleeping on a support."""
+        """Return whether an object has been sleeping on its captured support since the reset."""
         facts = self._env.facts
         if self._direct is None or facts.parent[key] != support or facts.relation[key] != "supported_by":
             return False
         return all(body.is_sleeping for body in self._actors[self._row[key]]._bodies)
 
     def rests_on(self, key: int, support: int) -> Array:
-        """Return whether a thing is at rest, and carried by a support (b,).
+        """Return whether an object is at rest and carried by a support (b,).
 
-        What moves is not asked for its contacts, which is slow: nothing falls asleep before it was at rest for long.
+        Contact queries are slow, so moving objects are excluded first: no object falls asleep before it was at rest.
         """
         rest = self.at_rest(key)
         if self._direct is not None and not rest:
@@ -277,7 +277,7 @@ class Measures:
         return rest & self.supported(key, support)
 
     def _force_on(self, key: int, support: int) -> Array:
-        """Return with which force (b,) (N) a support pushes a thing up."""
+        """Return the upward force (b,) (N) of a support on an object."""
         others = self._env.builder.carrying_actors(support)
         if self._direct is not None:
             return self._direct.force(self._row[key], others)[2]
@@ -288,7 +288,7 @@ class Measures:
         return total[:, 2]
 
     def _turned(self, key: int, axis: int) -> Array:
-        """Return where (b, 3) what was the world's x or z (axis 0 or 2) when a thing was captured points now."""
+        """Return the world x or z axis (`axis` 0 or 2) at capture, rotated with the object since (b, 3)."""
         if (key, axis) not in self._axes:
             placed = self._env.builder.objects[key]
             item = next(o for o in self._env.bundle.objects if o.id == key)

@@ -1,27 +1,28 @@
-"""`SimRecon/Multi-v0`: another scene in every episode, drawn from a split of the registry."""
+"""`SimRecon/Multi-v0`: an environment that draws the scene of every episode from a split of the registry."""
 
 import hashlib
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 
 from registry import SceneRegistry, UsageError
 from simrecon_envs.registration import env_id, make_cpu, register_scenes
+from simrecon_envs.unwrapped import scene_of
 
 SPLITS = ("train", "test", "all")
 _TEST_PERCENT = 20
 
 
 class MultiSceneEnv(gym.Env):
-    """Plain Gymnasium (NumPy, no batch) over many scenes; environments are kept for the next time, a few of them.
+    """Unbatched NumPy environment over many scenes; keeps the environments of the most recently used scenes.
 
-    `info` of `reset` has "scene" and "instruction". `skipped` says which scenes cannot do the task, and why.
+    `info` of `reset` has "scene" and "instruction". `skipped` maps scenes without the task to the reason.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - Gymnasium's own way
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - as in Gymnasium
 
     def __init__(
         self,
@@ -34,20 +35,20 @@ class MultiSceneEnv(gym.Env):
         render_mode: str | None = None,
         **kwargs: Any,
     ) -> None:
-        """Choose the scenes; the first that can do the task is made at once, for the spaces.
+        """Choose the scenes; create the first one with the task, for the spaces.
 
         Args:
-            scenes: Ids of scenes, as a list or with commas; all of the registry where None.
-            split: "train" (four fifths), "test" (the others) or "all"; by the hash of the scene's id, so that a
-                scene keeps its side when others come or go.
-            task: A kind of task, or a task's name that all scenes have.
-            cache_size: How many environments are kept.
-            registry: The registry's folder; the default registry where None.
-            render_mode: As for `SceneEnv`.
-            **kwargs: As for `SceneEnv`; one robot, one observation mode.
+            scenes: Scene ids, as a list or comma-separated; None for all of the registry.
+            split: "train" (80 %), "test" (20 %) or "all". The split depends only on the hash of the scene's id, so it
+                does not change when scenes are added or removed.
+            task: A kind of task, or the name of a task that all scenes have.
+            cache_size: Number of environments kept.
+            registry: Folder of the registry; None for the default one.
+            render_mode: See `SceneEnv`.
+            **kwargs: Other arguments of `SceneEnv`.
 
         Raises:
-            UsageError: there is no such split, no scene in it, or none that can do the task.
+            UsageError: The split is unknown or has no scene, or no scene has the task.
         """
         if split not in SPLITS:
             raise UsageError(f"Multi-v0: split {split!r} is not one of {', '.join(SPLITS)}")
@@ -58,7 +59,7 @@ class MultiSceneEnv(gym.Env):
         wanted = scenes.split(",") if isinstance(scenes, str) else scenes
         missing = [scene for scene in wanted or () if scene not in known]
         if missing:
-            catalog.get(missing[0])  # says what there is, and the nearest
+            catalog.get(missing[0])  # raises SceneNotFound with suggestions
         self.scenes = [s for s in (wanted or known) if split in ("all", split_of(s))]
         if not self.scenes:
             raise UsageError(
@@ -71,21 +72,22 @@ class MultiSceneEnv(gym.Env):
         self.render_mode = render_mode
         self.skipped: dict[str, str] = {}
         self._made: OrderedDict[str, gym.Env] = OrderedDict()
-        self.observation_space = None
+        self._spaces: tuple[gym.Space[Any], gym.Space[Any]] | None = None
         self._env = self._first()
-        self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
+        self._spaces = self._env.observation_space, self._env.action_space
+        self.observation_space, self.action_space = self._spaces
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
-        """Draw a scene by the seed and reset it; `options={"scene": id}` chooses one."""
+        """Draw a scene and reset it; `options={"scene": id}` chooses the scene."""
         super().reset(seed=seed)
         wanted = (options or {}).get("scene")
         while True:
             if len(self.skipped) >= len(self.scenes):
                 raise UsageError(self._nothing())
-            # Drawn from all: what was found to be unsuitable before must not change what a seed means.
-            scene = (
-                wanted if wanted is not None else self.scenes[int(self.np_random.integers(len(self.scenes)))]
-            )
+            # Draw from all scenes: the meaning of a seed must not depend on the scenes skipped so far.
+            scene = wanted
+            if scene is None:
+                scene = self.scenes[int(self.np_random.integers(len(self.scenes)))]
             env = self._open(scene)
             if env is not None:
                 break
@@ -95,16 +97,16 @@ class MultiSceneEnv(gym.Env):
         obs, info = env.reset(seed=int(self.np_random.integers(2**31)))
         return obs, {**info, "scene": scene}
 
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
-        """Step the present scene."""
+    def step(self, action: np.ndarray) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step the current scene."""
         return self._env.step(action)
 
     def render(self) -> Any:
-        """Return a picture of the present scene."""
+        """Return an image of the current scene."""
         return self._env.render()
 
     def close(self) -> None:
-        """Close all environments that are kept."""
+        """Close all kept environments."""
         for env in self._made.values():
             env.close()
         self._made.clear()
@@ -121,7 +123,7 @@ class MultiSceneEnv(gym.Env):
         return f"Multi-v0: none of {len(self.scenes)} scenes can do the task {self._task!r}: {some}"
 
     def _open(self, scene: str) -> gym.Env | None:
-        """Return the environment of a scene, None where it cannot do the task."""
+        """Return the environment of a scene, or None if it does not have the task."""
         if scene in self.skipped:
             return None
         if scene not in self._made:
@@ -130,9 +132,10 @@ class MultiSceneEnv(gym.Env):
             except UsageError as error:
                 self.skipped[scene] = str(error)
                 return None
-            problem = env.unwrapped.task_note or ("" if env.unwrapped.task_object else "there is no task")
-            if not problem and self.observation_space not in (None, env.observation_space):
-                problem = f"its observations are {env.observation_space}, not {self.observation_space}"
+            inner = scene_of(env)
+            problem = inner.task_note or ("" if inner.task_object else "there is no task")
+            if not problem and self._spaces is not None and self._spaces[0] != env.observation_space:
+                problem = f"its observations are {env.observation_space}, not {self._spaces[0]}"
             if problem:
                 env.close()
                 self.skipped[scene] = problem
@@ -145,6 +148,6 @@ class MultiSceneEnv(gym.Env):
 
 
 def split_of(scene: str) -> str:
-    """Return "train" or "test" for a scene's id; one in five is "test"."""
+    """Return "train" or "test" for a scene id, by its hash; one in five is "test"."""
     number = int.from_bytes(hashlib.sha256(scene.encode()).digest()[:4], "big")
     return "test" if number % 100 < _TEST_PERCENT else "train"

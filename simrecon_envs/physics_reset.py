@@ -1,8 +1,7 @@
-"""A physics engine without a past, for the bodies that an environment has.
+"""Move the bodies of an environment to a fresh PhysX scene, for reproducible episodes.
 
-PhysX keeps what touched what, and in which order it found out, from one episode to the next: a run after other runs
-differs from a first one in its last digits, and soon altogether. All of that is the engine's; the bodies, their cooked
-meshes and what a renderer knows of them are not, and go on as they are.
+PhysX keeps contact pairs and their order across episodes, so a later episode differs from a first one in the last
+digits, and soon visibly. This state belongs to the PhysX scene. Bodies, cooked meshes and render data are reused.
 """
 
 from typing import Any
@@ -12,18 +11,17 @@ from sapien import physx
 
 
 def renew_physics(env: Any, entities: list[sapien.Entity] | None = None) -> None:
-    """Move everything of a `SceneEnv` with one environment on the CPU to a new PhysX scene, in the order of before.
+    """Move all entities of a `SceneEnv` to a new PhysX scene, in order (1 to 2 ms).
 
-    Takes a millisecond or two. Entities keep their ids, poses and components; velocities and who sleeps are the
-    caller's affair.
+    Entities keep their ids, poses and components. The caller sets velocities and sleep states.
 
     Args:
-        env: The environment.
-        entities: All of its entities in their order, where some were taken out of the scene.
+        env: One environment on the CPU.
+        entities: All of its entities in order, if some were removed from the scene; else None.
     """
     old = env.scene.sub_scenes[0]
     entities = list(old.entities) if entities is None else entities
-    env._set_scene_config()  # a default of the process, which another environment may have changed
+    env._set_scene_config()  # process-wide; another environment may have changed it
     engine = physx.PhysxCpuSystem()
     engine.timestep = env.scene.px.timestep
     renders = env.scene.can_render()

@@ -1,4 +1,4 @@
-"""What can be picked up, and what a robot's place is: bundle + robot -> targets. NumPy and SciPy only."""
+"""Rank the objects that a robot can pick up; types of targets and robot placements. NumPy and SciPy only."""
 
 from dataclasses import dataclass, replace
 
@@ -14,69 +14,69 @@ from simrecon_envs.robots import RobotTraits
 
 @dataclass(frozen=True)
 class PlacementConfig:
-    """How the robot's place is searched."""
+    """Parameters of the search for the robot's place and target."""
 
     directions: int = 36
-    """How many directions around the target are tried."""
+    """Number of directions around the target."""
     radii: int = 9
-    """How many distances between the least and the greatest reach are tried."""
+    """Number of distances between minimum and maximum reach."""
     clearance_m: float = 0.015
-    """Least distance of the robot at rest from everything."""
+    """Minimum distance of the robot at rest from all solids."""
     max_grip_mass_kg: float = 2.0
-    """Heavier objects are not chosen as targets."""
+    """Maximum mass of a target."""
     min_height_m: float = 0.02
-    """Lower objects cannot be gripped from above."""
+    """Minimum height of an object that can be gripped from above."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A candidate for picking up, all in world space."""
+    """An object to pick up, in world space at its captured pose."""
 
     id: int
     label: str
-    center: np.ndarray  # float64 (3,) of its box
+    center: np.ndarray  # float64 (3,) of its bounding box
     bottom_m: float
     top_m: float
-    grip_width_m: float  # its least horizontal width
-    grip_yaw_rad: float  # direction in which it is that wide
-    problem: str  # "" or why it can hardly be picked up
-    grasps: tuple[Grasp, ...] = ()  # the best first
+    grip_width_m: float  # minimum horizontal width
+    grip_yaw_rad: float  # direction of that width
+    problem: str  # reason why it can hardly be picked up, or ""
+    grasps: tuple[Grasp, ...] = ()  # best first
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the robot stands; `world_from_root` of the robot."""
+    """Place of the robot: `world_from_root`, upright."""
 
     position: np.ndarray  # float64 (3,)
     yaw_rad: float
-    pedestal_m: float  # height of the pedestal below it, 0 for none
+    pedestal_m: float  # height of the pedestal below it; 0 for none
     target: Target | None
-    note: str  # "" or what is not as it should be
+    note: str  # problem of this place, or ""
 
     @property
     def quat_wxyz(self) -> np.ndarray:
-        """Return its orientation as a quaternion (4,)."""
+        """Return its orientation as quaternion wxyz (4,)."""
         return np.array([np.cos(self.yaw_rad / 2), 0, 0, np.sin(self.yaw_rad / 2)])
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
-        """Take points (..., 3) from root to world space."""
+        """Transform points (..., 3) from root to world space."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + self.position
 
     def to_root(self, points: np.ndarray) -> np.ndarray:
-        """Take points (..., 3) from world to root space."""
+        """Transform points (..., 3) from world to root space."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return (points - self.position) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
     def reaches(self, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
-        """Return which world points (n, 3) are within the hand's reach (n,)."""
+        """Return whether world points (n, 3) are within reach (n,)."""
         return within_reach(self.position, np.array(self.yaw_rad), points, traits)
 
 
 def within_reach(root: np.ndarray, yaw: np.ndarray, points: np.ndarray, traits: RobotTraits) -> np.ndarray:
-    """Return which points (..., 3) a robot reaches whose root is at (..., 3), turned by yaw (...).
+    """Return whether points (..., 3) are within reach of a robot at `root` (..., 3) with `yaw` (...) (rad).
 
-    They are in a ring about it, before it, and at heights that it works at.
+    The reach is a ring about the root, limited to a sector in front of the robot and to its working heights.
     """
     away = np.linalg.norm(points[..., :2] - root[..., :2], axis=-1)
     height = points[..., 2] - root[..., 2]
@@ -88,7 +88,7 @@ def within_reach(root: np.ndarray, yaw: np.ndarray, points: np.ndarray, traits: 
 
 
 def describe_target(bundle: SceneBundle, item: BundleObject, solids: list[ConvexSolid]) -> Target:
-    """Measure an object as something to pick up (without regard to any robot)."""
+    """Measure the box, width and load of an object to pick up; independent of the robot."""
     cloud = np.concatenate([s.vertices for s in solids if s.owner == item.id])
     angles = np.arange(36) * np.pi / 36
     along = cloud[:, :2] @ np.stack([np.cos(angles), np.sin(angles)])
@@ -97,16 +97,8 @@ def describe_target(bundle: SceneBundle, item: BundleObject, solids: list[Convex
     loaded = any(e.parent == item.id for e in bundle.edges)
     problem = "" if not loaded else "something stands on it or hangs from it"
     narrow = int(np.argmin(widths))
-    return Target(
-        item.id,
-        item.label,
-        (low + high) / 2,
-        low[2],
-        high[2],
-        float(widths[narrow]),
-        float(angles[narrow]),
-        problem,
-    )
+    width, yaw = float(widths[narrow]), float(angles[narrow])
+    return Target(item.id, item.label, (low + high) / 2, low[2], high[2], width, yaw, problem)
 
 
 def candidate_targets(
@@ -116,8 +108,8 @@ def candidate_targets(
     traits: RobotTraits,
     config: PlacementConfig,
 ) -> list[Target]:
-    """Return the movable objects, best to pick up first; those with a problem come last."""
-    scored = []
+    """Return the movable objects with their grasps, best first; those with a problem come last."""
+    scored: list[tuple[int, float, int, Target]] = []
     entries = {entry["id"]: entry for entry in bundle.scene["objects"]}
     for item in bundle.objects:
         if item.id not in movable:
@@ -136,7 +128,7 @@ def candidate_targets(
             problems.append(f"only {1000 * (target.top_m - target.bottom_m):.0f} mm high")
         if not entries[item.id].get("assembly", {}).get("stable", True):
             problems.append("does not stand by itself")
-        # Prefer what can be gripped well, and was well seen.
+        # Prefer low grasp costs and a large observed share of the surface.
         score = grasps[0].cost if grasps else target.grip_width_m
         score += 1.0 - float(entries[item.id]["provenance"].get("observed_fraction", 1.0))
         described = replace(target, problem="; ".join(problems), grasps=tuple(grasps))
@@ -145,10 +137,10 @@ def candidate_targets(
 
 
 def choose_targets(candidates: list[Target], wanted: str | int, bundle: SceneBundle) -> list[Target]:
-    """Return the candidates that `wanted` means, in order: "auto", an id (number or text) or a label.
+    """Return the candidates that match `wanted`: "auto" (all), an id (int or text) or a label.
 
     Raises:
-        UsageError: names what could be picked up.
+        UsageError: No candidate matches; lists the movable objects.
     """
     if wanted == "auto":
         return candidates

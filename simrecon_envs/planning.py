@@ -1,4 +1,4 @@
-"""From what was asked for to a task and a place for the robot: SceneFacts + names -> Plan. Nothing is built yet."""
+"""Choose the task and the robot's place: SceneFacts + names -> Plan. Runs before the simulator is built."""
 
 from dataclasses import dataclass
 
@@ -9,29 +9,29 @@ from simrecon_envs.tasks import KINDS, kind_of, list_specs, parse_task, unknown_
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
 
-_TRIES = 8  # tasks of a kind that are tried before one out of reach is taken
-_HARD_TRIES = 2  # of those that something speaks against
+_TRIES = 8  # feasible tasks of a kind that are placed before one out of reach is accepted
+_HARD_TRIES = 2  # the same for tasks with problems
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What the robot shall do, and where it stands."""
+    """Task and place of the robot."""
 
     spec: TaskSpec | None
     placement: Placement | None  # None without a robot
-    note: str  # why the task is not what was asked for, or hard
+    note: str  # why the task is hard or not the requested one
 
 
 def plan_task(facts: SceneFacts, task: str, target: str | int) -> Plan:
     """Choose the task and the robot's place.
 
     Args:
-        facts: The scene, for the robot; its name is "none" where there is no robot.
-        task: A kind (the easiest of it is taken), a task's name, or "none".
-        target: "auto", or the id or label of what a kind shall be about.
+        facts: The scene and the robot; its name is "none" without a robot.
+        task: A kind (the easiest task of it is chosen), the name of a task, or "none".
+        target: "auto", or the id or label of the object that a kind of task is about.
 
     Raises:
-        UsageError: there is no such task or target; lists what there is.
+        UsageError: The task or target is unknown; lists the known ones.
     """
     if facts.robot == "none":
         return Plan(None, None, "there is no robot" if task != "none" else "")
@@ -47,17 +47,23 @@ def plan_task(facts: SceneFacts, task: str, target: str | int) -> Plan:
     specs = _of_kind(facts, task, target)
     if not specs:
         raise UsageError(unknown_task(facts, task))
-    plans = []
+    plans: list[Plan] = []
     feasible, hard = ([s for s in specs if s.feasible is wanted] for wanted in (True, False))
     for spec in feasible[:_TRIES] + hard[:_HARD_TRIES]:
         plans.append(place_task(facts, spec))
         if not plans[-1].note:
             return plans[-1]
-    return min(plans, key=lambda plan: len(plan.spec.problems) + bool(plan.placement.note))
+    return min(plans, key=_problems)
+
+
+def _problems(plan: Plan) -> int:
+    assert plan.spec is not None
+    assert plan.placement is not None
+    return len(plan.spec.problems) + bool(plan.placement.note)
 
 
 def without_grip(facts: SceneFacts, kind: str) -> tuple[str, ...]:
-    """Return why a robot cannot do a kind of task at all: it does not know what it holds."""
+    """Return why a robot cannot do a kind of task: it cannot detect grasps. Empty if it can."""
     if kind == "navigate" or robot_shape(facts.robot).has_gripper:
         return ()
     return (f"robot {facts.robot!r} cannot tell whether it grasps something",)
@@ -70,15 +76,19 @@ def _of_kind(facts: SceneFacts, kind: str, target: str | int) -> list[TaskSpec]:
     if kind == "navigate":
         wanted = {
             facts.names.get(str(target)),
-            *[o.id for o in facts.bundle.objects if str(o.id) == str(target)],
+            *(o.id for o in facts.bundle.objects if str(o.id) == str(target)),
         }
         return [spec for spec in specs if spec.subject in wanted]
-    ids = [found.id for found in choose_targets(facts.ranked, target, facts.bundle)]
+    ids: list[int | None] = [found.id for found in choose_targets(facts.ranked, target, facts.bundle)]
     return sorted((s for s in specs if s.subject in ids), key=lambda s: ids.index(s.subject))
 
 
 def place_task(facts: SceneFacts, spec: TaskSpec) -> Plan:
-    """Find where the robot stands for a task."""
+    """Find the robot's place for a task.
+
+    Raises:
+        UsageError: The robot cannot do the task, or its object is no target.
+    """
     if any(stage.kind == "navigate" for stage in spec.stages):
         raise UsageError(f"task {spec.name!r}: navigate cannot be a stage; make an environment of it alone")
     kind = kind_of(spec)
@@ -91,15 +101,15 @@ def place_task(facts: SceneFacts, spec: TaskSpec) -> Plan:
     else:
         subject = spec.subject if not spec.stages else spec.stages[0].subject
         interests = kind.interests(facts, spec)
-        if subject is None:  # about several things: the first of them leads
+        if subject is None:  # several objects: plan for the first
             targets = [facts.targets[key] for key in kind.things(facts)[:1]]
         else:
             targets = [facts.targets[subject]] if subject in facts.targets else []
         if not targets:
             raise UsageError(f"scene {facts.scene_id}: task {spec.name!r}: {'; '.join(spec.problems)}")
         placement = _stand(facts, targets, interests)
-    problems = list(dict.fromkeys([*spec.problems, *([placement.note] if placement.note else [])]))
-    return Plan(spec, placement, "; ".join(problems))
+    problems = [*spec.problems, *([placement.note] if placement.note else [])]
+    return Plan(spec, placement, "; ".join(dict.fromkeys(problems)))
 
 
 def _stand(facts: SceneFacts, targets: list, interests: list) -> Placement:

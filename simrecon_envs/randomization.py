@@ -1,11 +1,11 @@
-"""Domain randomization: what may differ from one reset to the next, all of it drawn from the reset's seed.
+"""Domain randomization at every reset, drawn from the reset's seed.
 
-Poses stay within the support: a thing and what stands on it move together, stay on the level they stand on, and
-touch nothing that they did not touch before, nor the robot (`layout_randomization`). Mass and friction stay within the
-bundle's `ranges`.
+An object and everything on it move together, stay on their support and touch neither new objects nor the robot
+(`layout_randomization`). Mass and friction stay within the bundle's `ranges`.
 """
 
 import zlib
+from collections.abc import Hashable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -14,41 +14,41 @@ import torch
 
 from registry import UsageError
 from simrecon_envs.layout_randomization import Group, about, group_things
-from simrecon_envs.reset_settling import rehearse
+from simrecon_envs.reset_settling import settle_check
 from simrecon_envs.robots import traits_of
 
-_TRIES = 6
-_TINTS = 4  # of each texture, made when they are first drawn
-_TINTED_PX = 512
-_ARM_M = 0.8
+_TRIES = 6  # draws of a pose per group before it stays
+_TINTS = 4  # variants of a texture, created on demand
+_TINTED_PX = 512  # bounds their width
+_ARM_M = 0.8  # length of an arm, for the displacement of the hand by joint noise
 
 
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
-    """How much differs. 0 is nothing; `all` is `Randomization.everything()`, `start` is `Randomization.start()`."""
+    """Amounts of randomization; 0 is none. "all" is `everything()`, "start" is `start()`."""
 
     shift_m: float = 0.0
-    """Greatest horizontal shift of a thing along x and y."""
+    """Maximum shift of an object along x and y."""
     turn_rad: float = 0.0
-    """Greatest turn about the vertical."""
+    """Maximum rotation about the vertical axis."""
     joints_rad: float = 0.0
-    """Greatest change of each of the robot's joints, fingers and driving base left out."""
+    """Maximum change of each joint of the robot, without fingers and mobile base."""
     mass: float = 0.0
-    """Which share of the bundle's range of masses is drawn from, on a logarithmic scale."""
+    """Share of the bundle's mass range that is used, on a logarithmic scale."""
     friction: float = 0.0
-    """Which share of the bundle's range of frictions is drawn from."""
+    """Share of the bundle's friction range that is used, on a logarithmic scale."""
     lights: float = 0.0
-    """Greatest relative change of the lights' brightness and color."""
+    """Maximum relative change of the brightness and color of lights."""
     textures: float = 0.0
-    """Greatest relative change of the things' colors."""
+    """Maximum relative change of the colors of objects."""
     camera_m: float = 0.0
-    """Standard deviation of the position of the cameras that stand still."""
+    """Standard deviation of the position of fixed cameras."""
     camera_rad: float = 0.0
-    """Standard deviation of their orientation."""
+    """Standard deviation of the orientation of fixed cameras."""
     image_noise: float = 0.0
-    """Standard deviation of a color value, of 255; at every step."""
+    """Standard deviation of a color value (0 to 255), at every step."""
     depth_noise: float = 0.0
-    """Standard deviation of depth at 1 m, in metres; it grows with the square of depth; at every step."""
+    """Standard deviation of depth at 1 m, in metres, at every step; proportional to the square of depth."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -60,21 +60,21 @@ class Randomization:
 
     @classmethod
     def everything(cls) -> "Randomization":
-        """Return a moderate amount of all."""
+        """Return moderate amounts of everything."""
         return cls(shift_m=0.05, turn_rad=0.5, joints_rad=0.05, mass=1.0, friction=1.0, lights=0.4, textures=0.3,
                    camera_m=0.02, camera_rad=0.03, image_noise=4.0, depth_noise=0.003)  # fmt: skip
 
     @classmethod
     def start(cls) -> "Randomization":
-        """Return a moderate amount of what an episode begins with: poses of the things and of the robot."""
+        """Return moderate amounts for the initial poses of objects and robot, and nothing else."""
         return cls(shift_m=0.05, turn_rad=0.5, joints_rad=0.05)
 
     @classmethod
     def parse(cls, value: "str | dict | Randomization | None") -> "Randomization":
-        """Return what an option means: None or "none", "start", "all", or a dict of the fields.
+        """Parse an option: None or "none", "start", "all", or a dict of the fields.
 
         Raises:
-            UsageError: lists the fields.
+            UsageError: The value is invalid; lists the fields.
         """
         if isinstance(value, cls):
             return value
@@ -93,33 +93,35 @@ class Randomization:
 
     @property
     def any(self) -> bool:
-        """Tell whether anything differs at all."""
+        """Return whether anything is randomized."""
         return any(asdict(self).values())
 
 
 class Randomizer:
-    """Draws and applies a `Randomization` in an environment."""
+    """Draw and apply a `Randomization` in an environment."""
 
     def __init__(self, env: Any, config: Randomization) -> None:
-        """Plan the groups that move together; `env` is a `SceneEnv` whose facts are known."""
+        """Find the groups that move together in a `SceneEnv` with its facts and placement."""
         self._env, self.config = env, config
         self._entries = {entry["id"]: entry for entry in env.bundle.scene["objects"]}
         self._groups: list[Group] = []
         self._moved: list[Group] = []
         self._places: dict[int, list[np.ndarray]] = {}
         self.returned: tuple[int, ...] = ()
-        """Ids of what would have fallen where this episode's draw had it, or was in its way: it stands as captured."""
+        """Ids of objects at their captured poses because the drawn poses failed the settle check of this episode."""
         if config.shift_m or config.turn_rad:
             robot = env.robot_points if env.placement is None else env.placement.to_world(env.robot_points)
-            # An arm's joints carry the hand about as far as its reach, turned by so much.
+            # The hand moves by about the arm's length times the change of a joint.
             self._groups = group_things(env.facts, robot, config.joints_rad * _ARM_M)
-        self._home: dict[str, np.ndarray] = {}
-        self._nominal: dict[int, tuple] = {}
+        self._home: dict[Hashable, Any] = {}  # nominal lights, colors and camera poses
+        self._nominal: dict[
+            tuple[int, int], tuple[float, np.ndarray, list[float]]
+        ] = {}  # by body and environment
 
     # ---- Poses.
 
     def poses(self, env_idx: torch.Tensor, rng: Any) -> None:
-        """Move the groups in the environments `env_idx`, which have their captured poses."""
+        """Draw new poses of the groups in the environments `env_idx`, whose objects are at their captured poses."""
         if not self._groups:
             return
         index = env_idx.cpu().numpy()
@@ -133,9 +135,9 @@ class Randomizer:
         ]
 
     def settle(self) -> None:
-        """Let stand what `poses` has moved; what falls, or is in its way back, stands as captured.
+        """Run the settle check on the moved groups; return those that fall to their captured poses.
 
-        One environment on the CPU; nothing is awake afterwards.
+        A group that blocks a captured pose returns, too. One environment on the CPU; all objects sleep afterwards.
         """
         self.returned = ()
         if not self._groups:
@@ -143,16 +145,16 @@ class Randomizer:
         moved = {key for group in self._moved for key in group.members}
         self._env.builder.rest(self._env.builder.movable_ids - moved)
         if moved:
-            fell = rehearse(self._env)
+            fell = settle_check(self._env)
             for group in self._fallen(fell):
                 self._place(group, [np.eye(4)])
                 self.returned += tuple(key for key in group.members if key in moved)
             self._env.builder.rest()
 
     def _fallen(self, fell: set[int]) -> list[Group]:
-        """Return the groups of what fell, and those that stand where it was captured."""
+        """Return the groups of fallen objects, and the groups that block their captured poses."""
         back = [group for group in self._groups if not fell.isdisjoint(group.members)]
-        for group in back:  # it grows
+        for group in back:  # grows during the loop
             self._places[id(group)] = group.outlines
             back += [
                 other
@@ -163,14 +165,14 @@ class Randomizer:
         return back
 
     def _place(self, group: Group, moves: list[np.ndarray]) -> None:
-        """Move a group from where it was captured by transforms (4, 4), one an environment."""
+        """Move a group from its captured pose by transforms (4, 4), one per environment."""
         for stack in group.stacks:
             for key, start in stack.start.items():
                 poses = np.stack([move @ start for move in moves])
                 self._env.builder.place(key, poses, self._env.device)
 
     def _moves(self, draws: np.ndarray) -> list[np.ndarray]:
-        """Return a transform (4, 4) a group from draws (groups, tries, 3) in [-1, 1]."""
+        """Return one transform (4, 4) per group from draws (groups, tries, 3) in [-1, 1]."""
         self._places = places = {id(group): group.outlines for group in self._groups}
         moves = [np.eye(4) for _ in self._groups]
         for number, group in enumerate(self._groups):
@@ -185,11 +187,11 @@ class Randomizer:
     # ---- The robot.
 
     def joints(self, env_idx: torch.Tensor, rng: Any, qpos: np.ndarray) -> np.ndarray:
-        """Return where the joints are (b, d) (rad, m) in the environments `env_idx`, from those at rest (d,)."""
+        """Draw joint positions (b, d) (rad, m) in the environments `env_idx`, about those at rest (d,)."""
         out = np.repeat(qpos[None], len(env_idx), axis=0)
         if not self.config.joints_rad:
             return out
-        base = 3 if traits_of(self._env.robot_uids).mobile else 0  # x, y and heading of whoever drives
+        base = 3 if traits_of(self._env.robot_uids).mobile else 0  # x, y and heading of a mobile base
         arm = slice(base, max(len(qpos) - 2, base))  # the last two are the fingers
         draws = np.asarray(rng[env_idx.cpu().numpy()].uniform(-1, 1, size=len(qpos)), np.float64)
         out[:, arm] += self.config.joints_rad * draws.reshape(out.shape)[:, arm]
@@ -209,15 +211,14 @@ class Randomizer:
             self._env.measures.scale_weight(body.root, env_idx, weight)
 
     def _factors(self, body: Any, env_idx: torch.Tensor, rng: Any) -> np.ndarray:
-        """Return the factors of mass and friction (b, 2) of a body, by the range of its root."""
+        """Draw factors of mass and friction (b, 2) of a body, from the ranges of its root object."""
         index = env_idx.cpu().numpy()
         draws = np.asarray(rng[index].uniform(size=2), np.float64).reshape(len(index), 2)
         entry = self._entries[body.root]
         ranges = entry.get("ranges", {})
         out = np.ones((len(index), 2))
-        for column, (name, share) in enumerate(
-            (("mass_kg", self.config.mass), ("friction", self.config.friction))
-        ):
+        shares = ("mass_kg", self.config.mass), ("friction", self.config.friction)
+        for column, (name, share) in enumerate(shares):
             low, high = np.maximum(ranges.get(name, [entry[name]] * 2), 1e-6) / max(entry[name], 1e-6)
             ends = np.log([low, high]) * share
             out[:, column] = np.exp(ends[0] + draws[:, column] * (ends[1] - ends[0]))
@@ -237,11 +238,11 @@ class Randomizer:
             shape.physical_material.dynamic_friction = value * friction
 
     def rebuilt(self) -> None:
-        """Forget the bodies of before: the scene was built anew."""
+        """Forget nominal values of the previous bodies; call after the scene was rebuilt."""
         self._nominal = {}
         self._home = {}
 
-    # ---- Looks.
+    # ---- Appearance.
 
     def looks(self, env_idx: torch.Tensor, rng: Any) -> None:
         """Draw lights, colors and the poses of the cameras in the environments `env_idx`."""
@@ -261,7 +262,7 @@ class Randomizer:
                     _draw_camera(name, sensor.camera, rng.rngs[0], self.config, self._home)
 
     def pictures(self, data: dict, rng: Any) -> dict:
-        """Return the sensors' pictures with noise, which is another one at every step."""
+        """Add noise to the sensors' images, drawn anew at every step."""
         if not (self.config.image_noise or self.config.depth_noise):
             return data
         for textures in data.values():
@@ -271,7 +272,7 @@ class Randomizer:
                     noisy = picture.float() + self.config.image_noise * noise
                     textures[name] = noisy.round().clamp(0, 255).to(picture.dtype)
                 elif name == "depth" and self.config.depth_noise:
-                    # Integers are millimetres.
+                    # Integer depth is in millimetres.
                     unit = 1.0 if picture.is_floating_point() else 1e-3
                     noise = torch.as_tensor(_noise(rng, picture.shape), device=picture.device)
                     depth = picture.float() * unit
@@ -281,7 +282,9 @@ class Randomizer:
         return data
 
 
-def _draw_lights(scene: Any, rng: np.random.RandomState, most: float, home: dict, number: int) -> None:
+def _draw_lights(
+    scene: Any, rng: np.random.RandomState, most: float, home: dict[Hashable, Any], number: int
+) -> None:
     import sapien
 
     found = [e.find_component_by_type(sapien.render.RenderDirectionalLightComponent) for e in scene.entities]
@@ -293,17 +296,16 @@ def _draw_lights(scene: Any, rng: np.random.RandomState, most: float, home: dict
         ]
     for place, start in enumerate(home["lights", number]):
         bright = 1 + most * rng.uniform(-1, 1)
-        color = np.clip(start * bright * (1 + 0.3 * most * rng.uniform(-1, 1, size=3)), 0, 4).astype(
-            np.float32
-        )
+        tint = 1 + 0.3 * most * rng.uniform(-1, 1, size=3)
+        color = np.clip(start * bright * tint, 0, 4).astype(np.float32)
         if place == 0:
             scene.ambient_light = color
         else:
             lights[place - 1].color = color
 
 
-def _draw_tint(entity: Any, rng: np.random.RandomState, most: float, home: dict) -> None:
-    """Give an entity one of a few tints; textures hide a material's own color, so they are tinted themselves."""
+def _draw_tint(entity: Any, rng: np.random.RandomState, most: float, home: dict[Hashable, Any]) -> None:
+    """Give an entity one of `_TINTS` tints; tints textures themselves, because they hide the material's color."""
     import sapien
 
     variant = int(rng.randint(_TINTS))
@@ -319,14 +321,14 @@ def _draw_tint(entity: Any, rng: np.random.RandomState, most: float, home: dict)
             if texture is None:
                 part.material.base_color = [*np.clip(color[:3] * tint, 0, 1), color[3]]
                 continue
-            place_of_it = (*key, variant)
-            if place_of_it not in home:
-                home[place_of_it] = _tinted(texture, tint)
-            part.material.base_color_texture = home[place_of_it]
+            tinted = (*key, variant)
+            if tinted not in home:
+                home[tinted] = _tinted(texture, tint)
+            part.material.base_color_texture = home[tinted]
 
 
 def _tinted(texture: Any, tint: np.ndarray) -> Any:
-    """Return a copy of a texture of 8 bits a color, at most 512 pixels wide, times a tint (3,)."""
+    """Return an 8-bit texture times a tint (3,), subsampled towards a width of 512 pixels."""
     import sapien
 
     pixels = texture.download()
@@ -337,7 +339,7 @@ def _tinted(texture: Any, tint: np.ndarray) -> Any:
 
 
 def _draw_camera(
-    name: str, camera: Any, rng: np.random.RandomState, config: Randomization, home: dict
+    name: str, camera: Any, rng: np.random.RandomState, config: Randomization, home: dict[Hashable, Any]
 ) -> None:
     import sapien
 
@@ -348,7 +350,8 @@ def _draw_camera(
     turn = np.linalg.norm(angles)
     axis = angles / turn if turn > 0 else np.array([1.0, 0, 0])
     quat = [np.cos(turn / 2), *(np.sin(turn / 2) * axis)]
-    camera.set_local_pose(start * sapien.Pose(config.camera_m * rng.normal(size=3), quat))
+    shift: Any = config.camera_m * rng.normal(size=3)
+    camera.set_local_pose(start * sapien.Pose(shift, quat))
 
 
 def _noise(rng: Any, shape: tuple[int, ...]) -> np.ndarray:

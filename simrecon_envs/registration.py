@@ -1,9 +1,8 @@
-"""Rows of the registry's index -> Gymnasium ids. Imports Gymnasium and the registry, nothing heavy.
+"""Register the scenes of the registry's index as Gymnasium ids. Imports only Gymnasium and the registry.
 
-`SimRecon/scene0001` is a scene: what changes is the bundle, which has a revision. The revision that was current at
-registration travels in the kwargs; `SceneEnv` says what it does when the scene has a newer one.
-`SimRecon/scene0001-pick_mug-v0` is a task in it. Scenes have a row in Gymnasium's table each; tasks are read from
-the id when it is made, and their version is that of the rules of success and reward.
+`SimRecon/scene0001` is a scene. Its spec holds the revision that was current at registration; `SceneEnv` defines what
+happens if the scene has a newer one. `SimRecon/scene0001-pick_mug-v0` is a task in it; its version is that of the rules
+of success and reward. Scenes have entries in Gymnasium's registry; specs of tasks are created on demand from the id.
 """
 
 import re
@@ -23,7 +22,13 @@ from simrecon_envs.errors import EnvNotFound
 NAMESPACE = "SimRecon"
 TASK_VERSION = 0
 MAX_EPISODE_STEPS = 200  # 1/20 s each
-_KIND_STEPS = {"reach": 100, "place": 250, "put": 250, "stack": 250, "rearrange": 600}  # others as above
+_KIND_STEPS = {
+    "reach": 100,
+    "place": 250,
+    "put": 250,
+    "stack": 250,
+    "rearrange": 600,
+}  # others: MAX_EPISODE_STEPS
 MULTI_ID = f"{NAMESPACE}/Multi-v0"
 _ENTRY_POINT = "simrecon_envs.scene_env:SceneEnv"
 _TASK_ID = re.compile(rf"{NAMESPACE}/(?P<scene>[a-z0-9_]+)-(?P<task>[A-Za-z0-9_-]+?)-v(?P<version>\d+)")
@@ -33,27 +38,26 @@ _WRAPPERS = (
 
 
 def env_id(scene: str, task: str | None = None) -> str:
-    """Return the Gymnasium id of a scene, or of a task in it; accepts `scene0001` and `SimRecon/scene0001`."""
+    """Return the Gymnasium id of a scene (`scene0001` or `SimRecon/scene0001`), or of a task in it."""
     name = f"{NAMESPACE}/{scene.removeprefix(NAMESPACE + '/')}"
     return name if task is None else f"{name}-{task}-v{TASK_VERSION}"
 
 
 def register_scenes(root: Path | str | None = None) -> list[str]:
-    """Register every scene of a registry; may be called again at any time, and after scenes came or went.
+    """Register every scene of a registry; call it again after scenes were added or removed.
 
-    Scenes that this function registered earlier from the same registry and that are gone are dropped. A scene
-    of the same name in another registry is replaced: the last call wins.
+    Removed scenes of the same registry are unregistered. A scene with the same id in another registry is replaced.
 
     Args:
-        root: The registry's folder; the default registry where left out.
+        root: Folder of the registry; None for the default one.
 
     Returns:
         The Gymnasium ids of this registry's scenes, in order.
 
     Raises:
-        SimReconError: the registry's index is damaged, or cannot be read.
+        SimReconError: The registry's index is damaged or cannot be read.
     """
-    # Absolute, because the working folder may be another one when the environment is made.
+    # Absolute, because the working folder may change before the environment is made.
     folder = str((default_registry_root() if root is None else Path(root).expanduser()).absolute())
     revisions = SceneRegistry(Path(folder)).revisions()
     ids = {env_id(scene): scene for scene in revisions}
@@ -61,16 +65,13 @@ def register_scenes(root: Path | str | None = None) -> list[str]:
         if known not in ids:
             del gym.registry[known]
     for name, scene in ids.items():
-        # Straight into the table: `gym.register` searches all of it on every call and warns when one is
-        # replaced.
+        # Not by `gym.register`, which searches the whole registry in every call and warns about replaced ids.
         gym.registry[name] = _spec(name, scene, revisions[scene], folder)
     return list(ids)
 
 
 def register_default_scenes() -> list[str]:
-    """Register the default registry's scenes; a damaged one gives a warning, because an import must
-    succeed.
-    """
+    """Register the scenes of the default registry; if it is damaged, only warn, so that the import succeeds."""
     gym.registry[MULTI_ID] = EnvSpec(id=MULTI_ID, entry_point="simrecon_envs.multi:MultiSceneEnv",
                                      disable_env_checker=True, order_enforce=False)  # fmt: skip
     try:
@@ -81,15 +82,15 @@ def register_default_scenes() -> list[str]:
 
 
 def make(scene: str, *, registry: Path | str | None = None, **kwargs: Any) -> gym.Env:
-    """Make the environment of a scene: `gym.make`, after looking for scenes that are new.
+    """Make the environment of a scene with `gym.make`; register new scenes first.
 
     Args:
         scene: `scene0001`, `SimRecon/scene0001` or `SimRecon/scene0001-pick_mug-v0`.
-        registry: The registry's folder; the default registry where left out.
-        **kwargs: As for `gym.make`; see `SceneEnv`.
+        registry: Folder of the registry; None for the default one.
+        **kwargs: Arguments of `gym.make` and `SceneEnv`.
 
     Raises:
-        EnvNotFound: names the scenes that exist, and the nearest.
+        EnvNotFound: The scene does not exist; names the closest and the existing ones.
     """
     name = env_id(scene)
     match = _TASK_ID.fullmatch(name)
@@ -102,10 +103,7 @@ def make(scene: str, *, registry: Path | str | None = None, **kwargs: Any) -> gy
 
 
 def make_cpu(scene: str, *, registry: Path | str | None = None, **kwargs: Any) -> gym.Env:
-    """Make the environment of a scene with the plain Gymnasium API: unbatched NumPy arrays, Python scalars.
-
-    Takes what `make` takes.
-    """
+    """Make the environment of a scene with unbatched NumPy arrays and Python scalars; arguments as for `make`."""
     env = make(scene, registry=registry, **kwargs)
     from simrecon_envs.wrappers import NumpyEnv
 
@@ -113,10 +111,10 @@ def make_cpu(scene: str, *, registry: Path | str | None = None, **kwargs: Any) -
 
 
 def find_spec(name: str) -> EnvSpec | None:
-    """Return the spec of an id in our namespace, or None where Gymnasium's own table has it or it is not ours.
+    """Return the spec of a task's id; None if the id is in Gymnasium's registry or outside our namespace.
 
     Raises:
-        EnvNotFound: names what exists, and the nearest.
+        EnvNotFound: The id is in our namespace and does not exist; names the closest and the existing ones.
     """
     if not name.startswith(NAMESPACE + "/") or name in gym.registry:
         return None
@@ -135,11 +133,10 @@ def find_spec(name: str) -> EnvSpec | None:
 
 
 def teach_gymnasium() -> None:
-    """Let `gym.make` and `gym.spec` find ids of tasks, and say what there is where an id of ours is wrong.
+    """Wrap Gymnasium's look-up, so that `gym.make` and `gym.spec` find ids of tasks and raise helpful errors.
 
-    Gymnasium has no way to ask for ids that are made on demand, so its look-up is wrapped; ids outside our namespace
-    go through as before. Where a version of Gymnasium has another look-up, scenes still work, and
-    `simrecon_envs.make` takes the ids of tasks by their spec.
+    Gymnasium has no hook for specs created on demand. Ids outside our namespace are passed on. If a version of
+    Gymnasium has another look-up, only scenes can be found.
     """
     if getattr(gym_registration, "_simrecon", False) or not hasattr(gym_registration, "_find_spec"):
         return
@@ -156,17 +153,17 @@ def teach_gymnasium() -> None:
     gym_registration.spec = spec
     if gym.spec is look_up_spec:
         gym.spec = spec
-    gym_registration._simrecon = True
+    gym_registration._simrecon = True  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def answer_running_look_up() -> None:
-    """Make `gym.make("simrecon_envs:SimRecon/scene0001-pick_mug-v0")` work in a process that has not imported us yet.
+    """Make `gym.make("simrecon_envs:SimRecon/scene0001-pick_mug-v0")` work if it imports this package.
 
-    Gymnasium imports the package in the midst of its own look-up, which began before ours was in place and reads the
-    table once more afterwards: the task that it looks for gets a row there.
+    Gymnasium then imports the package inside its own, still unwrapped look-up, and reads its registry afterwards. Find
+    the requested id in the call stack and register its spec.
 
     Raises:
-        EnvNotFound: there is no such scene or task's version; names what exists, and the nearest.
+        EnvNotFound: The scene or the version of the task does not exist; names the closest and the existing ones.
     """
     frame = sys._getframe()
     while frame is not None and frame.f_code is not _GYMNASIUM_CODE:
@@ -176,7 +173,7 @@ def answer_running_look_up() -> None:
         gym.registry[name] = spec
 
 
-# Of Gymnasium's own look-up; this module is imported once, before `teach_gymnasium` puts another in its place.
+# Code of Gymnasium's own look-up, before `teach_gymnasium` wraps it.
 _GYMNASIUM_CODE = getattr(getattr(gym_registration, "_find_spec", None), "__code__", None)
 
 _TEMPLATE = vars(
@@ -184,7 +181,7 @@ _TEMPLATE = vars(
         id=f"{NAMESPACE}/template",
         entry_point=_ENTRY_POINT,
         max_episode_steps=MAX_EPISODE_STEPS,
-        # ManiSkill's environments return batched tensors, which Gymnasium's checker does not know.
+        # Gymnasium's checker does not support ManiSkill's batched tensors.
         disable_env_checker=True,
         additional_wrappers=_WRAPPERS,
     )
@@ -192,7 +189,7 @@ _TEMPLATE = vars(
 
 
 def _spec(name: str, scene: str, revision: str, folder: str) -> EnvSpec:
-    # Without the constructor, which takes every id apart again: tens of thousands of scenes are registered at import.
+    # Skip the constructor, which parses the id: imports register up to tens of thousands of scenes.
     spec = object.__new__(EnvSpec)
     kwargs = {"scene_id": scene, "revision": revision, "registry": folder}
     spec.__dict__ = {**_TEMPLATE, "id": name, "name": scene, "kwargs": kwargs}
@@ -200,7 +197,7 @@ def _spec(name: str, scene: str, revision: str, folder: str) -> EnvSpec:
 
 
 def episode_steps(task: str) -> int:
-    """Return how long an episode of a task is; composites have the steps of all stages."""
+    """Return the maximum steps of a task's episode; composite tasks have the sum of their stages."""
     return sum(_KIND_STEPS.get(stage.split("_")[0], MAX_EPISODE_STEPS) for stage in task.split("-then-"))
 
 

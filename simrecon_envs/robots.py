@@ -1,49 +1,50 @@
-"""Which robots can be used here, and what shape they have at rest."""
+"""Usable robots, their reach and gripper sizes, and their collision geometry at rest."""
 
 import contextlib
 import functools
-import os
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from registry import EnvironmentMissing, UsageError
 from registry.errors import did_you_mean
 
-_SAMPLE_SPACING_M = 0.02
+_SAMPLE_SPACING_M = 0.02  # of surface points
 
 
 @dataclass(frozen=True)
 class HandShape:
-    """A gripper that points down, about the point between its fingers; lengths in metres."""
+    """Sizes (m) of a parallel gripper that points down, relative to its tool centre point (between the fingertips)."""
 
     opening_m: float
-    """Between the fingers when they are open."""
+    """Maximum distance between the fingers."""
     finger_m: tuple[float, float]
-    """A finger's width across and thickness along the closing direction."""
+    """Size of a finger across and along the closing direction."""
     tip_below_m: float
-    """How far the fingertips reach below the point between the fingers."""
+    """Distance of the fingertips below the tool centre point."""
     palm_above_m: float
-    """Where the palm is, above that point."""
+    """Height of the palm above the tool centre point."""
     palm_half_m: tuple[float, float]
-    """Half the palm's size along and across the closing direction."""
+    """Half size of the palm along and across the closing direction."""
 
 
 @dataclass(frozen=True)
 class RobotTraits:
-    """What placement needs to know of a robot; lengths in metres."""
+    """Properties of a robot for its placement; lengths in metres."""
 
     mobile: bool
-    """Stands on the floor and drives; others are mounted, at the height of what the target stands on."""
+    """Drives on the floor; others are mounted at the height of the target's support."""
     reach_m: tuple[float, float, float]
-    """Least, best and greatest horizontal distance from the root to something to grasp."""
+    """Minimum, best and maximum horizontal distance from the root to a grasp."""
     work_height_m: tuple[float, float]
-    """Least and greatest height of something to grasp above the root."""
+    """Minimum and maximum height of a grasp above the root."""
     hand: HandShape
     payload_kg: float
     footprint_radius_m: float
     aside_rad: float = np.pi
-    """How far aside of where the root faces it carries things: an arm turns on its foot, Fetch does not."""
+    """Maximum angle between the root's forward axis and a grasp; pi for an arm that turns on its foot."""
 
 
 _PANDA_HAND = HandShape(0.08, (0.022, 0.016), 0.0095, 0.037, (0.104, 0.032))
@@ -58,30 +59,29 @@ TRAITS = {
     "so100": _SMALL_ARM,
     "koch-v1.1": _SMALL_ARM,
 }
-"""Robots that were tried here. Others are treated as an arm like the panda."""
+"""Tested robots. Others get the traits of the panda."""
 
 
 @dataclass(frozen=True)
 class RobotShape:
-    """Collision geometry at the rest pose, in the robot's root space."""
+    """Collision geometry of a robot at rest, root space."""
 
     points: np.ndarray  # float64 (n, 3) on its surface
-    rest_qpos: np.ndarray  # float64 (d,)
-    has_gripper: bool  # it can tell whether it grasps an object
+    has_gripper: bool  # can detect grasps
     control_modes: tuple[str, ...] = ()
 
 
 def usable_robots() -> list[str]:
-    """Return the ManiSkill robots whose files are on this machine."""
+    """Return the names of ManiSkill robots whose files are installed."""
     return sorted(uid for uid, agent in _agents().items() if _file_of(agent) is not None)
 
 
 def check_robot(uid: str) -> None:
-    """Make sure that a robot can be built; ManiSkill itself would ask on the terminal and exit.
+    """Check that a robot can be built; ManiSkill itself would prompt on the terminal and exit.
 
     Raises:
-        UsageError: there is no such robot.
-        EnvironmentMissing: its files are not here.
+        UsageError: The robot is unknown.
+        EnvironmentMissing: Its files are not installed.
     """
     agents = _agents()
     listed = ", ".join(usable_robots())
@@ -96,13 +96,13 @@ def check_robot(uid: str) -> None:
 
 
 def traits_of(uid: str) -> RobotTraits:
-    """Return what is known of a robot."""
+    """Return the traits of a robot."""
     return TRAITS.get(uid, _ARM)
 
 
 @functools.lru_cache(maxsize=8)
 def robot_shape(uid: str) -> RobotShape:
-    """Build a robot alone in an empty scene, without rendering, and sample its collision shapes at rest."""
+    """Build a robot in an empty scene, without rendering, and sample points on its collision shapes at rest."""
     import sapien
     import torch
     from mani_skill.envs.scene import ManiSkillScene
@@ -113,8 +113,7 @@ def robot_shape(uid: str) -> RobotShape:
         [sapien.Scene([sapien.physx.PhysxCpuSystem()])], device=torch.device("cpu"), backend=backend
     )
     agent = _agents()[uid](scene, 20, initial_pose=sapien.Pose())
-    qpos = rest_qpos(agent)
-    agent.robot.set_qpos(torch.as_tensor(qpos, dtype=torch.float32)[None])
+    agent.robot.set_qpos(torch.as_tensor(rest_qpos(agent), dtype=torch.float32)[None])
     clouds = []
     for link in agent.robot.get_links():
         body = link._objs[0]
@@ -122,17 +121,17 @@ def robot_shape(uid: str) -> RobotShape:
             pose = body.entity.pose * shape.local_pose
             clouds.append(_surface_points(shape) @ pose.to_transformation_matrix()[:3, :3].T + pose.p)
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
-    # One point a cell is enough, and much less to test.
+    # Keep one point per cell.
     _, kept = np.unique(np.floor(points / _SAMPLE_SPACING_M), axis=0, return_index=True)
     grips = hasattr(agent, "is_grasping") and hasattr(agent, "tcp")
-    return RobotShape(points[np.sort(kept)], qpos, grips, tuple(agent.supported_control_modes))
+    return RobotShape(points[np.sort(kept)], grips, tuple(agent.supported_control_modes))
 
 
 def check_control_mode(uid: str, mode: str | None) -> None:
-    """Make sure that a robot can be controlled in a way; None is its first.
+    """Check that a robot has a control mode; None is its default.
 
     Raises:
-        UsageError: lists the robot's ways, and the nearest.
+        UsageError: The mode is unknown; lists the robot's modes.
     """
     modes = robot_shape(uid).control_modes
     if mode is not None and mode not in modes:
@@ -142,8 +141,8 @@ def check_control_mode(uid: str, mode: str | None) -> None:
         )
 
 
-def rest_qpos(agent: object) -> np.ndarray:
-    """Return the joint positions (d,) of a robot's rest keyframe, or of its first one, or zeros."""
+def rest_qpos(agent: Any) -> np.ndarray:
+    """Return the joint positions (d,) of a robot's keyframe "rest", else of its first keyframe, else zeros."""
     frames = agent.keyframes
     frame = frames.get("rest") or next(iter(frames.values()), None)
     if frame is None or frame.qpos is None:
@@ -151,8 +150,8 @@ def rest_qpos(agent: object) -> np.ndarray:
     return np.asarray(frame.qpos, dtype=np.float64)
 
 
-def _surface_points(shape: object) -> np.ndarray:
-    """Return points (n, 3) on a PhysX shape, in its own space, no farther apart than the sample spacing."""
+def _surface_points(shape: Any) -> np.ndarray:
+    """Sample points (n, 3) on a PhysX shape, in its own space, at most `_SAMPLE_SPACING_M` apart."""
     import trimesh
     from sapien import physx
 
@@ -161,7 +160,7 @@ def _surface_points(shape: object) -> np.ndarray:
     elif isinstance(shape, physx.PhysxCollisionShapeSphere):
         mesh = trimesh.creation.icosphere(radius=shape.radius, subdivisions=2)
     elif isinstance(shape, physx.PhysxCollisionShapeCapsule | physx.PhysxCollisionShapeCylinder):
-        # SAPIEN's cylinders lie along x; a capsule is a cylinder for this purpose, a little longer.
+        # SAPIEN's cylinders lie along x. A capsule is approximated by a cylinder of the same length.
         caps = 2 * shape.radius if isinstance(shape, physx.PhysxCollisionShapeCapsule) else 0.0
         mesh = trimesh.creation.cylinder(shape.radius, 2 * shape.half_length + caps)
         mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
@@ -171,21 +170,21 @@ def _surface_points(shape: object) -> np.ndarray:
         mesh = trimesh.Trimesh(
             np.asarray(shape.vertices) * np.asarray(shape.scale), shape.triangles, process=False
         )
-    vertices, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SAMPLE_SPACING_M, max_iter=12)
-    return np.asarray(vertices)
+    found = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SAMPLE_SPACING_M, max_iter=12)
+    return np.asarray(found[0])
 
 
-def _agents() -> dict[str, type]:
+def _agents() -> dict[str, Any]:
     import mani_skill.agents.robots  # noqa: F401 - importing it registers the robots
     from mani_skill.agents.registration import REGISTERED_AGENTS
 
     return {uid: spec.agent_cls for uid, spec in REGISTERED_AGENTS.items()}
 
 
-def _file_of(agent: type) -> str | None:
+def _file_of(agent: Any) -> str | None:
     from mani_skill import format_path
 
     path = agent.urdf_path or agent.mjcf_path
     with contextlib.suppress(KeyError, IndexError, ValueError):
         path = format_path(str(path)) if path else None
-    return path if path and os.path.exists(path) else None
+    return path if path and Path(path).exists() else None

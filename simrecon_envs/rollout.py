@@ -1,4 +1,4 @@
-"""Pictures and videos of an environment: for the demo, the command line and people."""
+"""Render images and record videos of an environment."""
 
 import contextlib
 import os
@@ -12,6 +12,7 @@ import numpy as np
 from registry import UsageError
 from simrecon_envs.oracle import CONTROL_MODE, Oracle
 from simrecon_envs.registration import make
+from simrecon_envs.unwrapped import scene_of
 
 POLICIES = ("scripted", "random", "still")
 
@@ -32,21 +33,22 @@ def record_rollout(
 
     Args:
         scene: `scene0001` or `SimRecon/scene0001`.
-        out_mp4: The video's file; written whole or not at all.
-        steps: Control steps, 1/20 s each; one picture a step.
-        policy: "scripted" (the oracle does the task), "random" or "still".
-        seed: Of the reset and of the random actions.
+        out_mp4: The video file; written atomically.
+        steps: Control steps of 1/20 s; one image per step.
+        policy: "scripted" (the scripted expert), "random" or "still".
+        seed: Seed of the reset and of random actions.
         robot: A robot of ManiSkill.
-        task: A kind of task or a task's name.
-        registry: The registry's folder; the default registry where None.
-        size_px: Width and height of the pictures.
+        task: A kind of task or the name of a task.
+        registry: Folder of the registry; None for the default one.
+        size_px: Width and height of the images.
 
     Returns:
-        {"steps", "success", "return", "target_id", "instruction", "task_note", "policy"}; `policy` is the one
-        that was used: "random" where there is no task.
+        {"steps", "success", "return", "target_id", "instruction", "task_note", "policy"}. `policy` is the one that was
+        used: "random" instead of "scripted" if there is no task.
 
     Raises:
-        EnvironmentMissing: nothing can render here.
+        UsageError: The policy is unknown.
+        EnvironmentMissing: There is no usable renderer.
     """
     if policy not in POLICIES:
         raise UsageError(f"policy {policy!r} is not one of {', '.join(POLICIES)}")
@@ -69,27 +71,28 @@ def record_rollout(
 
 @contextlib.contextmanager
 def open_video(out_mp4: Path, fps: int) -> Iterator[Callable[[np.ndarray], None]]:
-    """Yield what adds a picture (h, w, 3) uint8 to a video, which is written whole or not at all."""
+    """Yield a function that appends an image (h, w, 3) uint8 to a video, which is written atomically."""
     import imageio.v2 as imageio
 
     out_mp4.parent.mkdir(parents=True, exist_ok=True)
     partial = out_mp4.with_name(f".{out_mp4.stem}-{os.getpid()}.mp4")
     try:
-        with imageio.get_writer(partial, fps=fps, codec="libx264", macro_block_size=2) as video:
+        writer: Any = imageio.get_writer(partial, fps=fps, codec="libx264", macro_block_size=2)
+        with writer as video:
             yield video.append_data
-        os.replace(partial, out_mp4)
+        partial.replace(out_mp4)
     finally:
         partial.unlink(missing_ok=True)
 
 
 def _record(env: gym.Env, out_mp4: Path, steps: int, policy: str, seed: int) -> dict[str, Any]:
-    scene_env = env.unwrapped
+    scene_env = scene_of(env)
     env.reset(seed=seed)
     env.action_space.seed(seed)
     if policy == "scripted" and scene_env.task_object is None:
         policy = "random"
     script = Oracle(scene_env) if policy == "scripted" else None
-    still = np.zeros(env.action_space.shape, np.float32)
+    still = np.zeros(env.action_space.shape or (), np.float32)
     total, success = 0.0, False
     with open_video(out_mp4, scene_env.control_freq) as add:
         add(_picture(env))
@@ -121,26 +124,23 @@ def render_scene_picture(
     registry: Path | str | None = None,
     size_px: int = 768,
 ) -> Path:
-    """Render the assembled scene from a viewpoint that shows much of it; returns the picture's file.
+    """Render the assembled scene from the viewpoint of `cameras.room_view`; return the image file.
 
     Args:
         scene: `scene0001` or `SimRecon/scene0001`.
-        out_png: The picture's file.
-        robot: A robot of ManiSkill to show in it, or "none".
-        registry: The registry's folder; the default registry where None.
-        size_px: Width and height.
+        out_png: The image file.
+        robot: A robot of ManiSkill, or "none".
+        registry: Folder of the registry; None for the default one.
+        size_px: Width and height of the image.
 
     Raises:
-        EnvironmentMissing: nothing can render here.
+        EnvironmentMissing: There is no usable renderer.
     """
     import imageio.v2 as imageio
 
+    size = {"width": size_px, "height": size_px}
     env = make(
-        scene,
-        registry=registry,
-        render_mode="rgb_array",
-        robot_uids=robot,
-        human_render_camera_configs={"width": size_px, "height": size_px},
+        scene, registry=registry, render_mode="rgb_array", robot_uids=robot, human_render_camera_configs=size
     )
     try:
         env.reset(seed=0)
@@ -153,4 +153,5 @@ def render_scene_picture(
 
 
 def _picture(env: gym.Env) -> np.ndarray:
-    return np.asarray(env.render()[0].cpu(), dtype=np.uint8)
+    images: Any = env.render()
+    return np.asarray(images[0].cpu(), dtype=np.uint8)

@@ -1,18 +1,19 @@
-"""A scene bundle in a ManiSkill scene: actors are built once per reconfigure, posed once per reset.
+"""Build the actors of a scene bundle in a ManiSkill scene (once per reconfigure) and pose them (once per reset).
 
 | in the bundle                            | actor                                                    |
 |------------------------------------------|----------------------------------------------------------|
 | floor, wall, ceiling                     | static: convex slabs, or a box behind its plane          |
 | object, `dynamic: false`                 | static                                                   |
-| object attached to what is static        | static                                                   |
+| object attached to a static one          | static                                                   |
 | object attached to a dynamic one         | welded: its shapes, mass and inertia join the parent's actor |
 | other objects                            | dynamic: the bundle's mass, inertia, friction, restitution |
 
-Welding is the stiffest fixed joint there is: no drive that could stretch, on the CPU and on the GPU alike.
+Welded objects are one rigid body: there is no compliant joint, on the CPU and on the GPU.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import sapien
@@ -22,7 +23,7 @@ from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.pose import Pose
 from sapien import physx
 
-from registry import SceneBundle
+from registry import BundleObject, SceneBundle
 from registry.geometry import (
     WORLD_FROM_GLTF,
     invert_rigid,
@@ -32,27 +33,30 @@ from registry.geometry import (
 )
 from registry.rigid_groups import moving_ids, welded_to
 
-# The same shapes and masses as in the report card that the bundle carries.
-from registry.simulation import BodySpec, convex_shape, set_inertial
-from simrecon_envs.occupancy import ConvexSolid, base_slab, glb_vertices, read_obj_vertices, slab_corners
+# Shapes and masses are those of the bundle's physics report card.
+from registry.simulation import (
+    BASE_FRICTION,
+    BASE_RESTITUTION,
+    BodySpec,
+    base_spec,
+    convex_shape,
+    set_inertial,
+)
+from simrecon_envs.occupancy import ConvexSolid, base_parts, read_obj_vertices
 
-BASE_FRICTION = 0.5
-BASE_RESTITUTION = 0.0
-_GROUND_BELOW_FLOOR_M = 0.002
-_GROUND_MARGIN_M = 25.0
-# Fetch's wheels and base do not collide with what it drives on (bits as in mani_skill.agents.robots.fetch).
+_GROUND_BELOW_FLOOR_M = 0.002  # height of the ground plane below the floor
+_GROUND_MARGIN_M = 25.0  # of the visible ground plate around the scene
+# Fetch's wheels and base do not collide with floor and ground (bits as in mani_skill.agents.robots.fetch).
 _WHEEL_BIT, _BASE_BIT = 30, 31
 
 
 @dataclass(frozen=True)
 class Body:
-    """One actor to be: an object and what is welded to it. `specs` and `visuals` are in the root object's
-    space.
-    """
+    """Description of an actor: a root object and the objects welded to it."""
 
     root: int
     name: str
-    specs: tuple[BodySpec, ...]  # the root first
+    specs: tuple[BodySpec, ...]  # root first
     visuals: tuple[tuple[str, np.ndarray], ...]  # (file, root_from_object (4, 4))
     world_from_root: np.ndarray  # float64 (4, 4)
     dynamic: bool
@@ -60,20 +64,20 @@ class Body:
 
 @dataclass(frozen=True)
 class PlacedObject:
-    """Where to find an object of the bundle in the simulator."""
+    """An object of the bundle and its actor in the simulator."""
 
     id: int
     label: str
     actor: Actor
-    actor_from_object: np.ndarray  # float64 (4, 4); not the identity for what is welded to another object
+    actor_from_object: np.ndarray  # float64 (4, 4); the identity unless it is welded to another object
     dynamic: bool
 
 
 class SceneBuilder:
-    """Builds a bundle's actors (`build`) and poses them (`initialize`)."""
+    """Build the actors of a bundle (`build`) and pose them (`initialize`)."""
 
     def __init__(self, bundle: SceneBundle, extent: tuple[np.ndarray, np.ndarray]) -> None:
-        """Read what will be built; nothing is created in a simulator yet. `extent` is the scene's box."""
+        """Read the bodies; the simulator is not used yet. `extent` is (lower (3,), upper (3,)) of the scene."""
         self.bundle = bundle
         self.extent = extent
         self.bodies = bodies_of(bundle)
@@ -82,7 +86,7 @@ class SceneBuilder:
         self._base_actors: dict[int, list[Actor]] = {}
 
     def carrying_actors(self, key: int) -> list[Actor]:
-        """Return the actors of an object or base entity; the plane below a floor is a part of it."""
+        """Return the actors of an object or base entity; a floor includes the ground plane."""
         return self._base_actors[key] if key in self._base_actors else [self.objects[key].actor]
 
     @property
@@ -90,12 +94,12 @@ class SceneBuilder:
         """Return the dynamic actors, in the order of the bundle."""
         return [self.objects[body.root] for body in self.bodies if body.dynamic]
 
-    def build(self, scene: object, pedestal: tuple[np.ndarray, float, float] | None = None) -> None:
+    def build(self, scene: Any, pedestal: tuple[np.ndarray, float, float] | None = None) -> None:
         """Create all actors in a ManiSkill scene.
 
         Args:
             scene: The `ManiSkillScene`.
-            pedestal: (position (3,) of its top, height, radius) of a stand for the robot, or None.
+            pedestal: (position (3,) of its top, height, radius) of the robot's pedestal (m), or None.
         """
         self.objects = {}
         self._build_base(scene)
@@ -109,14 +113,14 @@ class SceneBuilder:
             _build_pedestal(scene, *pedestal)
 
     def initialize(
-        self, env_idx: torch.Tensor, device: torch.device, noise: tuple[float, float], rng: object
+        self, env_idx: torch.Tensor, device: torch.device, noise: tuple[float, float], rng: Any
     ) -> None:
-        """Put the dynamic actors of the environments `env_idx` (b,) where the bundle has them.
+        """Set the dynamic actors of the environments `env_idx` (b,) to their poses in the bundle.
 
         Args:
-            env_idx: Which parallel environments are reset.
-            device: Where the simulator's tensors live.
-            noise: Standard deviations of a random shift (m, horizontal) and turn (rad, about +z).
+            env_idx: Indices of the parallel environments that are reset.
+            device: Device of the simulator's tensors.
+            noise: Standard deviations of a random horizontal shift (m) and a rotation about +z (rad).
             rng: ManiSkill's batched generator; `rng[env_idx].normal(size=...)`.
         """
         for body in self.bodies:
@@ -130,69 +134,52 @@ class SceneBuilder:
                 position[:, :2] += noise[0] * np.clip(draws[:, :2], -2, 2)
                 half = 0.5 * noise[1] * np.clip(draws[:, 2], -2, 2)
                 zero = np.zeros(count)
-                rotation = (
-                    matrix_from_quat(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)) @ rotation
-                )
+                turn = matrix_from_quat(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1))
+                rotation = turn @ rotation
             self._set_pose(body.root, position, quat_from_matrix(rotation), device)
 
     def rest(self, keys: Iterable[int] | None = None) -> None:
-        """Let everything, or the objects `keys`, sleep until something touches or moves it; one environment on the CPU.
+        """Put all movable objects, or those in `keys`, to sleep until a contact or move wakes them; CPU only.
 
-        It rests as it was captured, and the assembly let it settle there, or as it came to rest in a rehearsal. PhysX
-        adds up forces in another order when anything else in the scene stands elsewhere, and a thing that is balanced
-        on another could tip over by that.
+        Their poses are settled, by the assembly or by the settle check. Awake objects could still tip: PhysX adds up
+        forces in another order when any other object of the scene moves.
         """
         for key in self.movable_ids if keys is None else keys:
             self.objects[key].actor._bodies[0].put_to_sleep()
 
     def shift(self, key: int, env_idx: torch.Tensor, moved: np.ndarray, device: torch.device) -> None:
-        """Move an object of the environments `env_idx` (b,) by (b, 3) from where the bundle has it."""
+        """Move an object of the environments `env_idx` (b,) by (b, 3) from its pose in the bundle."""
         body = next(body for body in self.bodies if body.root == key)
         poses = np.repeat(body.world_from_root[None], len(env_idx), axis=0)
         poses[:, :3, 3] += moved
         self.place(key, poses, device)
 
     def place(self, key: int, poses: np.ndarray, device: torch.device) -> None:
-        """Put an object where poses (b, 4, 4) say, in the environments that are being reset."""
+        """Set the poses (b, 4, 4) of an object in the environments that are being reset."""
         self._set_pose(key, poses[:, :3, 3], quat_from_matrix(poses[:, :3, :3]), device)
 
     def _set_pose(self, key: int, position: np.ndarray, quat: np.ndarray, device: torch.device) -> None:
         p, q = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in (position, quat))
         self.objects[key].actor.set_pose(Pose.create_from_pq(p, q))
 
-    def _build_base(self, scene: object) -> None:
+    def _build_base(self, scene: Any) -> None:
+        """Build floors, walls, ceilings and an infinite ground plane below."""
         ground = scene.create_actor_builder()
         material = physx.PhysxMaterial(BASE_FRICTION, BASE_FRICTION, BASE_RESTITUTION)
-        # Below everything, so that nothing falls for ever where the reconstructed floor ends.
-        ground.add_plane_collision(
-            sapien.Pose([0, 0, -_GROUND_BELOW_FLOOR_M], [0.7071068, 0, -0.7071068, 0]), material
-        )
+        # It stops objects that leave the reconstructed floor.
+        plane = sapien.Pose([0, 0, -_GROUND_BELOW_FLOOR_M], [0.7071068, 0, -0.7071068, 0])
+        ground.add_plane_collision(plane, material)
         if scene.can_render():
-            # A plain plate around the scene; well below a reconstructed floor that may lie a little under z =
-            # 0.
+            # The visible plate is lower, because a reconstructed floor may lie a little below z = 0.
             lower, upper = self.extent
             half = [*((upper - lower)[:2] / 2 + _GROUND_MARGIN_M), 0.01]
             center = [*((upper + lower)[:2] / 2), -0.06]
-            ground.add_box_visual(
-                sapien.Pose(center), half_size=half, material=_matte([0.55, 0.55, 0.55, 1.0])
-            )
+            gray = _matte([0.55, 0.55, 0.55, 1.0])
+            ground.add_box_visual(sapien.Pose(center), half_size=half, material=gray)
         ground.initial_pose = sapien.Pose()
         drivable = [ground.build_static(name="ground")]
         for base in self.bundle.base:
-            clouds = base_clouds(self.bundle, base)
-            spec = BodySpec(
-                id=base.id,
-                name=f"{base.label}_{base.id}",
-                parts=tuple(clouds),
-                mass_kg=0.0,
-                center_of_mass=np.zeros(3),
-                inertia=None,
-                friction=BASE_FRICTION,
-                restitution=BASE_RESTITUTION,
-                world_from_object=np.eye(4),
-                dynamic=False,
-                base=True,
-            )
+            spec = base_spec(base.id, base.label, base_parts(self.bundle, base))
             visual = ((str(self.bundle.resolve(base.mesh)), np.eye(4)),)
             body = Body(base.id, spec.name, (spec,), visual, np.eye(4), False)
             actor = _BodyBuilder(scene, body).build(name=spec.name)
@@ -205,12 +192,12 @@ class SceneBuilder:
 
 
 class _BodyBuilder(ActorBuilder):
-    """An actor builder whose PhysX component is made of a `Body`'s convex parts.
+    """Actor builder for the convex parts of a `Body`.
 
-    ManiSkill's own drops a part that PhysX cannot cook without a word; this one raises.
+    It raises an error if PhysX cannot cook a part; ManiSkill's builder silently drops the part.
     """
 
-    def __init__(self, scene: object, body: Body) -> None:
+    def __init__(self, scene: Any, body: Body) -> None:
         super().__init__()
         self.set_scene(scene)
         self._body = body
@@ -220,10 +207,11 @@ class _BodyBuilder(ActorBuilder):
             for file, root_from_object in body.visuals:
                 self.add_visual_from_file(file, pose=_pose(root_from_object @ WORLD_FROM_GLTF))
 
-    def build_physx_component(self, link_parent: object = None) -> physx.PhysxBaseComponent:
-        """Create the rigid body with its shapes."""
+    def build_physx_component(self, link_parent: Any = None) -> physx.PhysxBaseComponent:
+        """Create the rigid body with its collision shapes."""
         body = self._body
-        component = physx.PhysxRigidDynamicComponent() if body.dynamic else physx.PhysxRigidStaticComponent()
+        kind: Any = physx.PhysxRigidDynamicComponent if body.dynamic else physx.PhysxRigidStaticComponent
+        component = kind()
         for spec in body.specs:
             root_from_object = invert_rigid(body.world_from_root) @ spec.world_from_object
             material = physx.PhysxMaterial(spec.friction, spec.friction, spec.restitution)
@@ -240,7 +228,7 @@ class _BodyBuilder(ActorBuilder):
 
 
 def bodies_of(bundle: SceneBundle) -> list[Body]:
-    """Group the bundle's objects into actors: what is attached to a dynamic object belongs to its actor."""
+    """Group the objects of a bundle into actors: objects attached to a dynamic object join its actor."""
     items = {item.id: item for item in bundle.objects}
     moving, welds = moving_ids(bundle), welded_to(bundle)
 
@@ -257,30 +245,18 @@ def bodies_of(bundle: SceneBundle) -> list[Body]:
         keys = [root, *(key for key in members[root] if key != root)]
         world_from_root = items[root].world_from_object
         specs = tuple(_spec(bundle, items[key]) for key in keys)
+        root_from_world = invert_rigid(world_from_root)
         visuals = tuple(
-            (
-                str(bundle.resolve(items[key].visual)),
-                invert_rigid(world_from_root) @ items[key].world_from_object,
-            )
+            (str(bundle.resolve(items[key].visual)), root_from_world @ items[key].world_from_object)
             for key in keys
         )
-        bodies.append(
-            Body(
-                root,
-                f"{items[root].label}_{root}",
-                specs,
-                visuals,
-                np.asarray(world_from_root),
-                root in moving,
-            )
-        )
+        name = f"{items[root].label}_{root}"
+        bodies.append(Body(root, name, specs, visuals, np.asarray(world_from_root), root in moving))
     return bodies
 
 
 def merged_mass(body: Body) -> BodySpec:
-    """Return a spec in the root's space whose mass, centre of mass and inertia are those of all specs
-    together.
-    """
+    """Combine mass, centre of mass and inertia of all specs (parallel axis theorem) into one spec in root space."""
     if len(body.specs) == 1:
         return replace(body.specs[0], world_from_object=np.eye(4))
     total = sum(spec.mass_kg for spec in body.specs)
@@ -298,21 +274,14 @@ def merged_mass(body: Body) -> BodySpec:
     )
 
 
-def base_clouds(bundle: SceneBundle, base: object) -> list[np.ndarray]:
-    """Return the convex parts (v, 3) of a base entity in world space."""
-    if base.collision:
-        return [read_obj_vertices(bundle.resolve(path)) for path in base.collision]
-    return [slab_corners(base_slab(base.plane, glb_vertices(bundle.resolve(base.mesh))))]
-
-
 def scene_extent(solids: list[ConvexSolid]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box (lower (3,), upper (3,)) of everything."""
+    """Return the bounding box (lower (3,), upper (3,)) of all solids."""
     if not solids:
         return np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0])
     return np.min([s.lower for s in solids], axis=0), np.max([s.upper for s in solids], axis=0)
 
 
-def _spec(bundle: SceneBundle, item: object) -> BodySpec:
+def _spec(bundle: SceneBundle, item: BundleObject) -> BodySpec:
     return BodySpec(
         id=item.id,
         name=f"{item.label}_{item.id}",
@@ -332,7 +301,7 @@ def _box_inertia(spec: BodySpec) -> np.ndarray:
     return spec.mass_kg / 12 * np.diag(size @ size - size**2)
 
 
-def _build_pedestal(scene: object, top: np.ndarray, height: float, radius: float) -> None:
+def _build_pedestal(scene: Any, top: np.ndarray, height: float, radius: float) -> None:
     builder = scene.create_actor_builder()
     half = [radius, radius, height / 2]
     builder.add_box_collision(half_size=half)
@@ -347,7 +316,6 @@ def _matte(color: list[float]) -> "sapien.render.RenderMaterial":
 
 
 def _pose(matrix: np.ndarray) -> sapien.Pose:
-    return sapien.Pose(matrix[:3, 3].astype(np.float32), quat_from_matrix(matrix[:3, :3]).astype(np.float32))
-
-
-__all__ = ["Body", "PlacedObject", "SceneBuilder", "bodies_of", "merged_mass", "scene_extent"]
+    p: Any = matrix[:3, 3].astype(np.float32)
+    q: Any = quat_from_matrix(matrix[:3, :3]).astype(np.float32)
+    return sapien.Pose(p, q)

@@ -1,9 +1,9 @@
-"""Where a robot stands to reach a target and its goals: solids + robot -> Placement. NumPy only.
+"""Find a collision-free robot base from which a target and its goals are in reach: solids + robot -> Placement.
 
-A mounted arm stands on a pedestal whose top is at the height of what the target stands on (as in most tabletop tasks),
-or on the support itself where there is no room beside it; a mobile robot stands on the floor. Candidates lie on circles
-around the target; the first one in order of preference wins where the robot's rest pose touches nothing. Where there is
-none, an arm may stand higher, or look past the target.
+A mounted arm stands on a pedestal at the height of the target's support (as in most tabletop tasks), or on the support
+itself if there is no space beside it. A mobile robot stands on the floor. Candidates lie on circles around the target;
+the first collision-free one in order of preference is chosen. If there is none, an arm may be raised or turned aside.
+NumPy only.
 """
 
 from collections.abc import Iterator
@@ -15,13 +15,13 @@ from simrecon_envs.occupancy import ConvexSolid, OccupancyGrid
 from simrecon_envs.placement import Placement, PlacementConfig, Target, within_reach
 from simrecon_envs.robots import RobotShape, RobotTraits
 
-_RAISED_M = (0.0, 0.12, 0.24)
-_GOAL_CELL_M = 0.06
-_ASIDE_RAD = (0.0, 0.5, -0.5)
+_RAISED_M = (0.0, 0.12, 0.24)  # heights of an arm above the support, in order of preference
+_GOAL_CELL_M = 0.06  # goals are thinned to one per cell
+_ASIDE_RAD = (0.0, 0.5, -0.5)  # yaws of an arm relative to the target
 
 
 class Places:
-    """The places of one robot in one scene; what was found for a target is kept for its other tasks."""
+    """Placement search for one robot in one scene; caches results per target."""
 
     def __init__(
         self,
@@ -32,15 +32,15 @@ class Places:
         traits: RobotTraits,
         config: PlacementConfig,
     ) -> None:
-        """Fill the grids.
+        """Fill the occupancy grids.
 
         Args:
-            solids: Everything in the scene.
-            floor_ids: Which of them are floors.
-            wall_ids: Which of them are walls.
+            solids: All convex solids of the scene.
+            floor_ids: Owners that are floors.
+            wall_ids: Owners that are walls.
             shape: The robot at rest.
-            traits: What the robot can do.
-            config: How the place is searched.
+            traits: The robot's reach and size.
+            config: Parameters of the search.
         """
         self._solids = [s for s in solids if s.owner not in floor_ids]
         self._shape, self._traits, self._config = shape, traits, config
@@ -52,16 +52,16 @@ class Places:
         self._things = OccupancyGrid(self._solids, *window, margin_m=0.0)
         self._walls = OccupancyGrid([s for s in self._solids if s.owner in wall_ids], *window, margin_m=0.0)
         self._rings: dict[int, np.ndarray] = {}
-        self._pedestals: dict[tuple, float | None] = {}
+        self._pedestals: dict[tuple[float, ...], float | None] = {}
 
     def find(self, targets: list[Target], interests: list[np.ndarray]) -> Placement:
-        """Return a place that is free and from where a target is reached; the earlier targets are preferred.
+        """Return a collision-free place within reach of a target; earlier targets are preferred.
 
-        Where none can be reached, the robot stands free as near as can be, and the placement's note says so.
+        If no target can be reached, return the nearest free place, with a note.
 
         Args:
-            targets: What to reach, the best first.
-            interests: Places (k, 3) each; of every array one must be within reach, too.
+            targets: Targets, best first.
+            interests: Arrays of goals (k, 3), world; one goal of each array must be within reach, too.
         """
         for target in sorted(targets, key=lambda target: bool(target.problem)):
             near = 2 * self._traits.reach_m[2]
@@ -78,7 +78,7 @@ class Places:
         return self._anywhere(targets[0] if targets else None)
 
     def _tries(self, target: Target, interests: list[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield root positions (n, 3) and yaws (n,) to try, best first."""
+        """Yield batches of root positions (n, 3) and yaws (n,), best first."""
         if self._traits.mobile:
             low, high = self._traits.work_height_m
             heights = [0.0] if low - 0.3 <= target.center[2] <= high else []
@@ -86,7 +86,7 @@ class Places:
         else:
             heights, raised, aside = [max(target.bottom_m, 0.0)], _RAISED_M, _ASIDE_RAD
             for goals in interests:
-                # Between two heights, where one of them is too far up or down from the other.
+                # If target and goals differ in height, try the mean height, too.
                 between = (target.bottom_m + float(np.median(goals[:, 2]))) / 2
                 if abs(between - target.bottom_m) > 0.1:
                     heights.append(max(between, 0.0))
@@ -101,7 +101,7 @@ class Places:
                 yield positions, yaw + turn
 
     def _ring(self, target: Target) -> np.ndarray:
-        """Return places around a target (n, 3), best first: x, y, and the yaw that faces it."""
+        """Return places around a target (n, 3), best first: x, y, yaw towards the target."""
         if target.id not in self._rings:
             least, best, most = self._traits.reach_m
             radius, direction = (
@@ -110,7 +110,7 @@ class Places:
             )  # fmt: skip
             angle = 2 * np.pi * direction / self._config.directions
             outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            # The hand comes from the robot's side, above the target: that way should be free.
+            # Prefer a free approach path of the hand, from the robot's side above the target.
             along = np.linspace(0.06, radius, 12, axis=1)
             way = target.center[:2] + along[..., None] * outward[:, None]
             way = np.concatenate([way, target.top_m + 0.10 + 0.3 * along[..., None]], axis=2)
@@ -121,7 +121,7 @@ class Places:
         return self._rings[target.id]
 
     def _stands(self, target: Target, placement: Placement) -> float | None:
-        """Return the height of the pedestal, None where the robot does not stand free or a wall is in between."""
+        """Return the height of the pedestal; None if the robot collides or a wall separates it from the target."""
         key = (target.id, *placement.position.tolist(), placement.yaw_rad)
         if key not in self._pedestals:
             sees = _sees_over_walls(self._walls, placement, target)
@@ -130,7 +130,7 @@ class Places:
         return self._pedestals[key]
 
     def _anywhere(self, target: Target | None) -> Placement:
-        """Stand free as near to the target (or the middle of the scene) as can be, on the floor."""
+        """Return the collision-free place on the floor nearest to the target, or to the middle of the scene."""
         lower, upper = self._box
         goal = target.center if target is not None else (lower + upper) / 2
         lower, upper = np.minimum(lower, 0) - 1.0, np.maximum(upper, 2.0) + 1.0
@@ -143,19 +143,19 @@ class Places:
                 placement = Placement(position, angle + np.pi, 0.0, target, note)
                 if not self._grid.occupied(placement.to_world(self._shape.points)).any():
                     return placement
-        # Outside the box of everything nothing is filled, and the last circle lies outside.
+        # The last circle lies outside the grid, which is free.
         raise AssertionError("no free place, not even outside the scene")
 
 
 def _thinned(goals: np.ndarray, center: np.ndarray, near_m: float) -> np.ndarray:
-    """Return goals (k, 3) no farther than `near_m` from a centre, one of each cell of 6 cm."""
+    """Return the goals (k, 3) within `near_m` of a centre, one per grid cell."""
     goals = goals[np.linalg.norm(goals[:, :2] - center[:2], axis=1) <= near_m]
     _, first = np.unique(np.floor(goals / _GOAL_CELL_M).astype(int), axis=0, return_index=True)
     return goals[np.sort(first)]
 
 
 def _sees_over_walls(walls: OccupancyGrid, placement: Placement, target: Target) -> bool:
-    """Tell whether no wall is between the robot and the target, so that both are in the same room."""
+    """Return whether the robot and the target are in the same room: two line-of-sight tests against walls."""
     shares = np.linspace(0, 1, 40)[:, None]
     for lift in (0.1, 0.5):
         start = placement.position + np.array([0, 0, lift])
@@ -171,10 +171,10 @@ def _pedestal(
     shape: RobotShape,
     traits: RobotTraits,
 ) -> float | None:
-    """Return the height of the pedestal under a robot that stands free there, or None where it does not."""
+    """Return the height of the pedestal under a robot, or None if robot or pedestal collide."""
     points = shape.points
     high = points[points[:, 2] > 0.05]
-    if grid.occupied(placement.to_world(high[::16])).any():  # soon said of most places
+    if grid.occupied(placement.to_world(high[::16])).any():  # rejects most places fast
         return None
     below, floor = placement.position[2], 0.0
     if not traits.mobile:
@@ -185,21 +185,21 @@ def _pedestal(
             top = _support_top(solids, placement.to_world(disk), below)
             if top is None:
                 return None
-            # It stands on the support: what is below 5 cm is its foot, which touches on purpose.
+            # It stands on the support: ignore its lowest 5 cm, the foot in contact.
             floor = top
             points = points[points[:, 2] > 0.05]
             foot = placement.to_world(disk + np.array([0, 0, 0.05]))
             if grid.occupied(foot).any():
                 return None
     world = placement.to_world(points)
-    # The grid leaves out the floor; a mobile robot's wheels touch it on purpose.
+    # The grid has no floor, which a mobile robot's wheels touch.
     if grid.occupied(world).any() or (not traits.mobile and (world[:, 2] < -0.005).any()):
         return None
     return max(below - floor, 0.0)
 
 
 def _disk(radius: float) -> np.ndarray:
-    """Return points (n, 3) that cover a disk at z = 0, no farther apart than 3 cm."""
+    """Sample points (n, 3) of a disk at z = 0, at most 3 cm apart."""
     axis = np.arange(-radius, radius + 1e-9, radius / max(int(np.ceil(radius / 0.03)), 1))
     x, y = np.meshgrid(axis, axis)
     inside = x**2 + y**2 <= radius**2 + 1e-9
@@ -207,9 +207,7 @@ def _disk(radius: float) -> np.ndarray:
 
 
 def _support_top(solids: list[ConvexSolid], disk: np.ndarray, height: float) -> float | None:
-    """Return the height of the level surface just below `height` that carries all of the disk (n, 3), or
-    None.
-    """
+    """Return the height of the horizontal surface just below `height` that supports the whole disk (n, 3), or None."""
     carried = np.zeros(len(disk), bool)
     tops = []
     corners = disk[:, :2].min(axis=0), disk[:, :2].max(axis=0)

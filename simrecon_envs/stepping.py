@@ -1,7 +1,7 @@
-"""A control step of one environment on the CPU: action -> physics -> observation, reward, info.
+"""Control step of one environment on the CPU: action -> physics -> observation, reward, info.
 
-What ManiSkill's own step does, computed in NumPy and made tensors once, at the end: right after the physics, when the
-caches are cold, each operation of torch takes tens of microseconds.
+Equivalent to ManiSkill's step, but computed in NumPy and converted to tensors at the end: right after the physics, with
+cold caches, a torch operation takes tens of microseconds.
 """
 
 import math
@@ -20,30 +20,30 @@ _HOOKS = ("_before_control_step", "_after_control_step", "_before_simulation_ste
 
 
 class DirectStep:
-    """Steps of a `SceneEnv` that is built, until its controller or its simulation is another one."""
+    """Control steps of a built `SceneEnv`; replace it when `current` is false."""
 
     def __init__(self, env: Any) -> None:
-        """Look at what the environment has now."""
+        """Read the current controller and simulation of the environment."""
         self._env = env
         self._scene, agent = env.scene, env.agent
         self._controller = None if agent is None else agent.controller
         self._drive = None if agent is None else DirectDrive(agent)
         self._hooked = any(getattr(type(env), name) is not getattr(BaseEnv, name) for name in _HOOKS)
-        # Numbers of the observation that need no dict of tensors on the way.
+        # Whether the observation can be concatenated directly, without a dict of tensors.
         plain = agent is not None and type(agent).get_proprioception is BaseAgent.get_proprioception
-        self._flat = env.obs_mode == "state" and plain and not agent.controller.get_state()
+        self._flat = env.obs_mode == "state" and plain and not env.agent.controller.get_state()
         self._robot = None if agent is None else agent.robot._objs[0]
-        # Written to at every step: to make a tensor anew costs more than to fill it.
-        self._action = None if agent is None else torch.zeros((1, *agent.single_action_space.shape))
-        self._numbers = None if agent is None else self._action.numpy()[0]
-        self._shapes = () if agent is None else (self._numbers.shape, tuple(self._action.shape))
+        # Reused in every step: filling a tensor is faster than creating one.
+        self._action = torch.zeros((1, *(() if agent is None else agent.single_action_space.shape)))
+        self._numbers = self._action.numpy()[0]
+        self._shapes = (self._numbers.shape, tuple(self._action.shape))
         self._laid_out = False
         self._elapsed = env._elapsed_steps
         self._count = self._elapsed.numpy()
 
     @property
     def current(self) -> bool:
-        """Return whether it was made for what the environment has now."""
+        """Return whether the environment still has the controller and simulation that this was created for."""
         env = self._env
         agent = env.agent
         controller = None if agent is None else agent.controller
@@ -55,18 +55,25 @@ class DirectStep:
 
     @property
     def steps(self) -> int:
-        """Return how many steps the episode has had."""
+        """Return the number of steps in this episode."""
         return self._count.item()
 
     def simulate(self, action: np.ndarray | torch.Tensor) -> torch.Tensor:
-        """Simulate one control step with an action (k,) or (1, k); return it as (1, k), valid until the next step.
+        """Simulate one control step.
+
+        Args:
+            action: (k,) or (1, k).
+
+        Returns:
+            The action (1, k), valid until the next step.
 
         Raises:
-            UsageError: as `check_action`.
+            UsageError: See `check_action`.
         """
         env, drive, batched = self._env, self._drive, self._action
         if drive is None or action.shape not in self._shapes:
             check_action(env, action)
+        assert drive is not None  # checked above
         self._numbers[:] = action if isinstance(action, np.ndarray) else action.numpy(force=True)
         listed = self._numbers.tolist()
         if not math.isfinite(sum(listed)):
@@ -88,9 +95,9 @@ class DirectStep:
         return batched
 
     def outcome(self, action: torch.Tensor | None) -> tuple:
-        """Return observation, reward, terminated, truncated and info after the simulation."""
+        """Return (observation, reward, terminated, truncated, info) after the simulation."""
         env = self._env
-        self._count[0] = self._count.item() + 1  # in place, but not by NumPy's slow "+="
+        self._count[0] = self._count.item() + 1  # in place; faster than NumPy's "+="
         info = env.get_info()
         flat = self._observe() if self._flat else None
         obs = env.get_obs(info, unflattened=True) if flat is None else flat
@@ -100,23 +107,23 @@ class DirectStep:
         return obs, reward, torch.from_numpy(np.array([ended])), torch.from_numpy(np.array([False])), info
 
     def _observe(self) -> torch.Tensor | None:
-        """Return the observation "state" (1, n); None where a task observes something else than rows of numbers."""
+        """Return the observation "state" (1, n); None if the task observes an array that is not 2D."""
         known = list(self._env.known().values())
         if not self._laid_out:
             if any(part.ndim != 2 for part in known):
                 self._flat = False
                 return None
             self._laid_out = True
-        robot = self._robot
+        robot: Any = self._robot
         rows = [robot.qpos, robot.qvel, *[part[0] for part in known]]
         return torch.from_numpy(np.concatenate(rows, dtype=np.float32)[None])
 
 
 def check_action(env: Any, action: np.ndarray | torch.Tensor) -> None:
-    """Make sure that an action can be given to an environment's robot.
+    """Check an action for the robot of a `SceneEnv`.
 
     Raises:
-        UsageError: there is no robot, or the action has another shape than the action space, or is not finite.
+        UsageError: There is no robot, the action does not have the shape of the action space, or it is not finite.
     """
     if env.agent is None:
         raise UsageError("this environment has no robot: step(None)")
@@ -133,7 +140,7 @@ def check_action(env: Any, action: np.ndarray | torch.Tensor) -> None:
 
 
 def flatten(obs: dict) -> torch.Tensor | None:
-    """Return an observation of rows (1, k) on the CPU as one row (1, n); None where it has something else."""
+    """Concatenate an observation of CPU tensors (1, k) to (1, n); return None if it has another tensor."""
     leaves = list(_leaves(obs))
     if not leaves or any(leaf.ndim != 2 for leaf in leaves):
         return None

@@ -1,52 +1,53 @@
-"""Where things can be put down: convex parts -> height maps -> free level spots and the insides of containers.
+"""Height maps of convex solids; free horizontal spots on supports and the insides of containers.
 
-NumPy and SciPy only; decided before anything is built in a simulator.
+NumPy and SciPy only; used before the simulator is built.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from simrecon_envs.occupancy import ConvexSolid
 
 CELL_M = 0.015
-_FINE_CELL_M = 0.006  # of the insides of containers
-_LEVEL_M = 0.006  # how uneven a spot may be
-_KEEP_OFF_M = 0.02  # free space around what is put down
-_RIM_M = 0.015  # least depth of a container
-_MAX_WINDOW_M = 2.4  # of a floor, around what matters
+_FINE_CELL_M = 0.006  # for the insides of containers
+_LEVEL_M = 0.006  # maximum height range within a spot
+_KEEP_OFF_M = 0.02  # free distance around a spot
+_RIM_M = 0.015  # minimum depth of a container
+_MAX_WINDOW_M = 2.4  # side of the searched window of a large support
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """The highest point above each cell, -inf where there is nothing."""
+    """Grid of surface heights in top view; -inf in empty cells."""
 
     lower: np.ndarray  # float64 (2,)
     top: np.ndarray  # float64 (nx, ny) world z
     cell_m: float
 
     def centers(self) -> np.ndarray:
-        """Return the cells' centres (nx, ny, 2)."""
+        """Return the cell centres (nx, ny, 2)."""
         axes = [self.lower[a] + (np.arange(self.top.shape[a]) + 0.5) * self.cell_m for a in range(2)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 @dataclass(frozen=True)
 class Container:
-    """The inside of an open container, in world space as it was captured."""
+    """The inside of an open container, in world space at its captured pose."""
 
     id: int
-    cells: np.ndarray  # float64 (k, 2) xy of the inside's cells
+    cells: np.ndarray  # float64 (k, 2) xy of inner cells
     floor_m: float
     rim_m: float
-    center: np.ndarray  # float64 (3,) on the floor, where there is most room
-    radius_m: float  # free around the centre
+    center: np.ndarray  # float64 (3,) on its floor, farthest from the wall
+    radius_m: float  # distance of the centre from the wall
 
 
 def height_map(
     solids: list[ConvexSolid], lower: np.ndarray, upper: np.ndarray, cell_m: float = CELL_M
 ) -> HeightMap:
-    """Return the heights of solids over the rectangle between `lower` and `upper` (2,)."""
+    """Rasterize the heights of solids over the rectangle from `lower` (2,) to `upper` (2,)."""
     shape = np.maximum(np.ceil((np.asarray(upper) - lower) / cell_m).astype(int), 1)
     out = HeightMap(np.asarray(lower, np.float64), np.full(tuple(shape), -np.inf), cell_m)
     for solid in solids:
@@ -60,9 +61,10 @@ def height_map(
             level = (nx * x)[:, None] + (ny * y)[None, :] + d
             if abs(nz) > 1e-6:
                 bound = -level / nz
-                above, below = (
-                    (np.minimum(above, bound), below) if nz > 0 else (above, np.maximum(below, bound))
-                )
+                if nz > 0:
+                    above = np.minimum(above, bound)
+                else:
+                    below = np.maximum(below, bound)
             else:
                 above = np.where(level > 1e-9, -np.inf, above)
         inside = np.where(above >= below - 1e-9, above, -np.inf)
@@ -78,14 +80,14 @@ def free_spots(
     ignored: frozenset[int] = frozenset(),
     around: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return level spots (k, 3) of a support's top where a disk stands free, the roomiest first.
+    """Return horizontal spots (k, 3) on top of a support where a disk is free, those with most space first.
 
     Args:
-        solids: Everything in the scene.
+        solids: All convex solids of the scene.
         support: Id of the object or base entity.
-        radius_m: Of the disk.
-        ignored: Ids that do not count as being in the way (what is to be moved itself).
-        around: Middle (2,) of the window that is looked at where the support is large; its own where None.
+        radius_m: Radius of the disk.
+        ignored: Ids that are no obstacles, such as the object to be moved.
+        around: Middle (2,) of the searched window of a large support; None for the whole support.
     """
     from scipy import ndimage
 
@@ -107,20 +109,20 @@ def free_spots(
     with np.errstate(invalid="ignore"):
         level = np.isfinite(low) & np.isfinite(high) & (high - low <= _LEVEL_M)
     taken = rest > mine.top + 0.003
-    room = ndimage.distance_transform_edt(~taken) * CELL_M
+    room = np.asarray(ndimage.distance_transform_edt(~taken)) * CELL_M
     free = level & (room > radius_m + _KEEP_OFF_M)
     spots = np.column_stack([mine.centers()[free], high[free]])
-    # Where the most room is, up to a hand's width; more does not make a spot better.
+    # Order by free distance, capped 10 cm beyond the radius.
     order = np.lexsort((np.arange(len(spots)), -np.minimum(room[free], radius_m + 0.10).round(3)))
     return spots[order]
 
 
 def find_container(solids: list[ConvexSolid], owner: int) -> Container | None:
-    """Return the inside of an object that is open at the top and closed around, or None."""
+    """Return the inside of an object with a closed wall and an open top, or None if it is no container."""
     from scipy import ndimage
 
     own = [s for s in solids if s.owner == owner]
-    if len(own) < 3:  # convex things hold nothing
+    if len(own) < 3:  # too few convex parts for a container
         return None
     lower, upper = np.min([s.lower for s in own], axis=0), np.max([s.upper for s in own], axis=0)
     if (upper - lower)[2] < _RIM_M or (upper - lower).max() > 1.0:
@@ -128,16 +130,16 @@ def find_container(solids: list[ConvexSolid], owner: int) -> Container | None:
     margin = 3 * _FINE_CELL_M
     heights = height_map(own, lower[:2] - margin, upper[:2] + margin, _FINE_CELL_M)
     for rim in np.linspace(upper[2] - 0.004, lower[2] + _RIM_M + 0.004, 8):
-        # A wall thinner than a cell may lie between the cells' centres.
-        wall = ndimage.binary_dilation(heights.top >= rim)
-        inside = ndimage.binary_fill_holes(wall) & ~wall
+        # Dilate: a wall thinner than a cell may lie between cell centres.
+        wall = np.asarray(ndimage.binary_dilation(heights.top >= rim), bool)
+        inside = np.asarray(ndimage.binary_fill_holes(wall)) & ~wall
         inside &= np.isfinite(heights.top) & (heights.top < rim - _RIM_M + 0.004)
-        distance = ndimage.distance_transform_edt(inside) * _FINE_CELL_M
+        distance = np.asarray(ndimage.distance_transform_edt(inside)) * _FINE_CELL_M
         best = np.unravel_index(np.argmax(distance), distance.shape)
         if distance[best] < 0.02:
             continue
-        labels, _ = ndimage.label(inside)
-        inside = labels == labels[best]
+        components: Any = ndimage.label(inside)
+        inside = components[0] == components[0][best]
         floor = float(np.median(heights.top[inside]))
         xy = heights.centers()
         center = np.array([*xy[best], floor])

@@ -1,7 +1,7 @@
-"""Several environments at once.
+"""Vectorized environments on the CPU.
 
-With CUDA, one environment simulates all of them: `simrecon_envs.make(scene, num_envs=1024)`. On the CPU, PhysX
-takes one scene a process: `make_vec` starts the processes.
+With CUDA, one environment simulates many scenes: `simrecon_envs.make(scene, num_envs=1024)`. On the CPU, ManiSkill
+simulates one environment per process: `make_vec` starts the processes.
 """
 
 import functools
@@ -26,22 +26,22 @@ def make_vec(
     """Make several environments of a scene with NumPy observations.
 
     Args:
-        scene: As for `make`.
-        num_envs: How many; one process each, but for "sync".
+        scene: See `make`.
+        num_envs: Number of environments; one process each, except for "sync".
         kind: "async" and "sync" are Gymnasium's `AsyncVectorEnv` and `SyncVectorEnv`, "sb3" is
             stable-baselines3's `SubprocVecEnv` (`DummyVecEnv` for one environment) with its `VecMonitor`.
-        seed: Seeds "sb3" environments, one number each from here; Gymnasium's are seeded at `reset`.
-        registry: The registry's folder; the default registry where left out.
-        **kwargs: As for `make`.
+        seed: Seed of the first "sb3" environment, increasing by 1; Gymnasium's are seeded by `reset`.
+        registry: Folder of the registry; None for the default one.
+        **kwargs: See `make`.
 
     Raises:
-        UsageError: there is no such kind, or fewer than one environment.
+        UsageError: The kind is unknown, or `num_envs` is below 1.
     """
     if kind not in KINDS:
         raise UsageError(f"make_vec: kind {kind!r} is not one of {', '.join(KINDS)}")
     if num_envs < 1:
         raise UsageError(f"make_vec: num_envs={num_envs} is not at least 1")
-    # A picklable function: a simulator must not be forked, so every process starts afresh.
+    # Picklable, for the start method "spawn": a simulator must not be forked.
     makers = [functools.partial(make_one, scene, registry, kwargs)] * num_envs
     if kind == "sb3":
         from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
@@ -55,7 +55,7 @@ def make_vec(
 
 
 def make_one(scene: str, registry: Path | str | None, kwargs: dict[str, Any]) -> Any:
-    """Make one of the environments, in a process of its own with one thread."""
+    """Make one environment in its own process, and limit torch to one thread."""
     import torch
 
     torch.set_num_threads(1)

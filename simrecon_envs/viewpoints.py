@@ -1,6 +1,7 @@
-"""Which cameras observe: names -> ManiSkill's camera configs."""
+"""Create ManiSkill camera configs from names of observing cameras."""
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,14 @@ from simrecon_envs.placement import Placement
 
 NAMES = ("workspace", "overview", "wrist", "capture", "capture:N")
 SIZE_PX = 128
-_DEFAULT_CAPTURES = 3
+_DEFAULT_CAPTURES = 3  # video frames of "capture"
 
 
-def parse_cameras(value: str | list | tuple) -> tuple[str, ...]:
-    """Return the names of an option such as "workspace,wrist" or ("overview", "capture:4").
+def parse_cameras(value: str | Sequence[str]) -> tuple[str, ...]:
+    """Parse an option such as "workspace,wrist" or ("overview", "capture:4") into names.
 
     Raises:
-        UsageError: lists the names.
+        UsageError: A name is unknown; lists the known names.
     """
     names = tuple(value.split(",")) if isinstance(value, str) else tuple(value)
     names = tuple(str(name).strip() for name in names)
@@ -32,7 +33,7 @@ def parse_cameras(value: str | list | tuple) -> tuple[str, ...]:
 
 
 def observing_cameras(env: Any, names: tuple[str, ...]) -> list[CameraConfig]:
-    """Return the cameras of a `SceneEnv` whose robot is built."""
+    """Return the camera configs of a `SceneEnv` with a built robot."""
     out = []
     for name in names:
         if name == "workspace":
@@ -51,22 +52,26 @@ def observing_cameras(env: Any, names: tuple[str, ...]) -> list[CameraConfig]:
 
 
 def camera(uid: str, view: Viewpoint, size_px: int) -> CameraConfig:
-    """Return a square camera at a viewpoint."""
-    pose = sapien.Pose(view.eye, view.quat_wxyz)
+    """Return the config of a square camera at a viewpoint."""
+    pose = _pose(view.eye, view.quat_wxyz)
     return CameraConfig(
         uid=uid, pose=pose, width=size_px, height=size_px, fov=view.fov_rad, near=0.01, far=100
     )
 
 
+def _pose(position: Any, quat_wxyz: Any) -> Any:
+    return sapien.Pose(position, quat_wxyz)
+
+
 def _wrist(env: Any) -> list[CameraConfig]:
-    """Return a camera on the hand that looks where the fingers point; none where the robot has one already."""
+    """Return a hand camera that looks along the fingers; empty if the robot has a hand camera."""
     if env.agent is None or not hasattr(env.agent, "tcp"):
         raise UsageError(f"cameras: 'wrist' needs a robot with a hand, {env.robot_uids!r} has none")
     carried = [config.uid for config in np.ravel(env.agent._sensor_configs).tolist()]
     if any("hand" in uid for uid in carried):
         return []
-    # Beside the hand; the hand's axis is +z between its fingers, a camera's +x.
-    pose = sapien.Pose([0.07, 0.0, -0.10], [np.cos(np.pi / 4), 0, -np.sin(np.pi / 4), 0])
+    # Beside the hand. The hand points along +z, a camera along +x.
+    pose = _pose([0.07, 0.0, -0.10], [np.cos(np.pi / 4), 0, -np.sin(np.pi / 4), 0])
     return [
         CameraConfig(
             uid="hand_camera", pose=pose, width=SIZE_PX, height=SIZE_PX, fov=1.4, near=0.01, far=100,
@@ -76,7 +81,7 @@ def _wrist(env: Any) -> list[CameraConfig]:
 
 
 def _captured(bundle: Any, count: int) -> list[CameraConfig]:
-    """Return cameras of the video: evenly spread frames, their own lens, as high as the others."""
+    """Return cameras of evenly spread video frames, with their intrinsics scaled to a height of `SIZE_PX`."""
     cameras = bundle.cameras
     total = len(cameras.indices)
     if not total:
@@ -91,7 +96,7 @@ def _captured(bundle: Any, count: int) -> list[CameraConfig]:
         quat = quat_from_matrix(pose[:3, :3] @ SAPIEN_CAMERA_FROM_OPENCV[:3, :3].T)
         out.append(
             CameraConfig(
-                uid=f"capture_{int(cameras.indices[row])}", pose=sapien.Pose(pose[:3, 3], quat),
+                uid=f"capture_{int(cameras.indices[row])}", pose=_pose(pose[:3, 3], quat),
                 width=round(cameras.width * scale), height=SIZE_PX, intrinsic=lens, near=0.01, far=100,
             )
         )  # fmt: skip

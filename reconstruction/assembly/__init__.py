@@ -1,12 +1,13 @@
-"""Stage 9: assets and graph -> a scene at rest in SAPIEN, with its physics report card.
+"""Stage 9, assembly: assets and graph in, a scene at rest in SAPIEN out, with its physics report card.
 
-Base static; breadth first from it each object is placed clear of everything, let go, and held where it
-settles; then all of them are let go together, settled and measured as CONTRACT section 4 says. Whatever does
-not stand is repaired in bounded ways, and what was done is written into `PlacedObject.repair`.
+Objects are placed on the static base, parents first: each is moved out of collisions, simulated until it rests, and
+held there. Then all are simulated together and measured (CONTRACT section 4). Unstable objects are repaired within
+bounds; `PlacedObject.repair` says how.
 """
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +31,8 @@ from registry.report_card import (
 )
 from registry.simulation import TIMESTEP_S, BodySpec, build_physics, pose_change
 
-_MARGIN = 0.5  # of each bound of the report card: what moves more than this share of it is repaired
-_FREE_S = 0.5  # without damping, after all have settled together
+_MARGIN = 0.5  # share of each bound of the report card beyond which an object is repaired
+_FREE_S = 0.5  # of simulation without damping, after the damped joint settling
 
 
 def assemble(
@@ -42,14 +43,14 @@ def assemble(
     movable: dict[int, bool] | None = None,
     progress: Progress = NO_PROGRESS,
 ) -> AssembledScene:
-    """Build the scene in physics, parents first, and leave it at rest.
+    """Assemble a scene at rest.
 
     Args:
-        assets: Base surfaces and objects.
-        graph: One parent for every object.
-        config: The method, and the bounds of what it may do.
-        movable: By object, the user's word on whether it can move.
-        progress: Told of every object, and of those that do not stand.
+        assets: base surfaces and objects.
+        graph: one parent for every object.
+        config: method and bounds.
+        movable: by object id, whether it is dynamic, where the user says so.
+        progress: receives steps and objects that do not stand.
 
     Raises:
         SimReconError: an object has no path to the base.
@@ -67,11 +68,10 @@ def assemble(
     if config.method == "hierarchical":
         found, report = _build_up(assets, edges, movable, config, progress)
     else:
-        found = (
-            in_situ(assets, edges, movable, config)
-            if config.method == "in-situ"
-            else mcmc(assets, edges, movable, config, progress)
-        )
+        if config.method == "in-situ":
+            found = in_situ(assets, edges, movable, config)
+        else:
+            found = mcmc(assets, edges, movable, config, progress)
         report = _report(assets, found, base)
     stable = {entry["id"]: entry["stable"] for entry in report["objects"]}
     placed = tuple(_finish(found[o.id], stable.get(o.id, True)) for o in assets.objects)
@@ -81,7 +81,7 @@ def assemble(
 def _build_up(
     assets: AssetSet, edges: list[Edge], movable: dict[int, bool], config: AssemblyConfig, progress: Progress
 ) -> tuple[dict[int, Placement], dict]:
-    """Place every object after its parent, then settle all of them together."""
+    """Place every object after its parent, then settle all together."""
     by_id = {o.id: o for o in assets.objects}
     progress.start(len(edges) + config.joint_rounds, "placing objects")
     placer = Placer(assets, edges, config, movable)
@@ -98,13 +98,15 @@ def _build_up(
 
 
 def _report(assets: AssetSet, placed: dict[int, Placement], base: list[BodySpec]) -> dict:
-    """Measure the placed scene: bodies in the order of the bundle, so that who reads it measures the same."""
+    """Measure the placed scene, with bodies in the order of the bundle, as its readers will."""
     in_order = [placed[o.id] for o in assets.objects]
-    return physics_report(scene_specs(in_order, base), [p.edge for p in in_order])
+    # GraphEdge declares writable fields, but edges are frozen.
+    edges: Any = [p.edge for p in in_order]
+    return physics_report(scene_specs(in_order, base), edges)
 
 
 def scene_specs(placements: Iterable[Placement], base: list[BodySpec]) -> list[BodySpec]:
-    """Describe the placed scene to the physics, as the bundle will."""
+    """Return the bodies of the placed scene, as the bundle describes them."""
     specs = list(base)
     for p in placements:
         fixed_to = p.edge.parent if p.edge.relation == "attached_to" and p.dynamic else None
@@ -113,34 +115,28 @@ def scene_specs(placements: Iterable[Placement], base: list[BodySpec]) -> list[B
 
 
 def _lowest_first(edges: list[Edge], by_id: dict) -> list[Edge]:
-    """Order edges by depth in the graph, then by height, so that stacks and crowds fill from below."""
+    """Order edges by depth in the graph, then by height, so that stacks are built from below."""
     depth: dict[int, int] = {}
     for edge in edges:
         depth[edge.child] = depth.get(edge.parent, 0) + 1
-    return sorted(
-        edges, key=lambda e: (depth[e.child], float(by_id[e.child].world_from_object[2, 3]), e.child)
-    )
+    heights = {i: float(asset.world_from_object[2, 3]) for i, asset in by_id.items()}
+    return sorted(edges, key=lambda e: (depth[e.child], heights[e.child], e.child))
 
 
 def _settle_together(
     placer: Placer, base: list[BodySpec], config: AssemblyConfig, progress: Progress
 ) -> dict:
-    """Let everything go at once, take the poses at rest, measure; repair what moves, and again."""
+    """Alternate joint simulation and repair of moving objects; keep the best round, fix the rest in place."""
     best: tuple[tuple, dict[int, Placement], dict] | None = None
     for round_number in range(config.joint_rounds):
-        # What still creeps is given as long as it is measured for.
-        _joint_settle(
-            placer, base, config.joint_settle_s, _FREE_S if round_number == 0 else VERIFY_DURATION_S
-        )
+        # Later rounds run free for as long as stability is verified: objects may creep.
+        free_s = _FREE_S if round_number == 0 else VERIFY_DURATION_S
+        _joint_settle(placer, base, config.joint_settle_s, free_s)
         report = _report(placer.assets, placer.placed, base)
         progress.advance()
         restless = _restless(report)
-        key = (
-            -report["stable_rate"],
-            report["floating_rate"],
-            report["spawn_penetration_mm"] > _MARGIN * MOST_PENETRATION_MM,
-            len(restless),
-        )
+        deep = report["spawn_penetration_mm"] > _MARGIN * MOST_PENETRATION_MM
+        key = (-report["stable_rate"], report["floating_rate"], deep, len(restless))
         if best is None or key < best[0]:
             best = key, dict(placer.placed), report
         if key == (-1.0, 0.0, False, 0) or round_number == config.joint_rounds - 1:
@@ -150,14 +146,14 @@ def _settle_together(
     placer.placed = best[1]
     report = best[2]
     for placement in list(placer.placed.values()):
-        placer.commit(placement)  # the workbench may hold what a worse round came to
+        placer.commit(placement)  # the workbench may hold the poses of a worse round
     return _hold_the_rest(placer, base, report, config, progress)
 
 
 def _hold_the_rest(
     placer: Placer, base: list[BodySpec], report: dict, config: AssemblyConfig, progress: Progress
 ) -> dict:
-    """Make immovable what no repair helped, clear of all else; return the report of what that comes to."""
+    """Fix unstable objects in place, clear of their neighbors, until none is left; return the report."""
     held: set[int] = set()
     while faults := _faults(placer, base, report, held):
         done = "it was made immovable" if config.freeze_unstable else "it was left as it is"
@@ -168,21 +164,21 @@ def _hold_the_rest(
         for i, fault in faults.items():
             placer.hold(i, f"made immovable: it {fault}")
         held |= set(faults)
-        # What leant on them may need a moment, or fall now.
+        # Objects that leaned on them may move now.
         _joint_settle(placer, base, config.joint_settle_s, _FREE_S)
         report = _report(placer.assets, placer.placed, base)
     return report
 
 
 def _faults(placer: Placer, base: list[BodySpec], report: dict, held: set[int]) -> dict[int, str]:
-    """Return what is wrong with objects that are not held yet."""
+    """Describe overlaps, floating and instability, by object id; overlaps only of objects not in `held`."""
     found: dict[int, str] = {}
     if report["spawn_penetration_mm"] > MOST_PENETRATION_MM:
         order = {i: number for number, i in enumerate(placer.placed)}
         specs = scene_specs(placer.placed.values(), base)
         names = {spec.id: spec.name.replace("_", " ") for spec in specs}
         for contact in spawn_contacts(specs, -1e-3 * MOST_PENETRATION_MM):
-            # Who came later was to be clear of who was there.
+            # The object placed later is at fault.
             first, second = sorted((contact.first, contact.second), key=lambda i: order.get(i, -1))
             if second not in held:
                 found[second] = f"overlaps {names[first]}"
@@ -195,18 +191,14 @@ def _faults(placer: Placer, base: list[BodySpec], report: dict, held: set[int]) 
 
 
 def _restless(report: dict) -> set[int]:
-    """Return the objects that come nearer to the bounds of what is stable than the margin allows."""
-    return {
-        o["id"]
-        for o in report["objects"]
-        if o["floating"]
-        or o["moved_m"] > _MARGIN * STABLE_MOVE_M
-        or o["turned_deg"] > _MARGIN * STABLE_TURN_DEG
-    }
+    """Return the ids of floating objects and of those beyond the margin of the stability bounds."""
+    most_m, most_deg = _MARGIN * STABLE_MOVE_M, _MARGIN * STABLE_TURN_DEG
+    objects = report["objects"]
+    return {o["id"] for o in objects if o["floating"] or o["moved_m"] > most_m or o["turned_deg"] > most_deg}
 
 
 def _joint_settle(placer: Placer, base: list[BodySpec], damped_s: float, free_s: float) -> None:
-    """Let all objects go from where they are, damped, then free, and take over where they come to rest."""
+    """Simulate all objects from their poses, damped, then free, and commit the poses at rest."""
     physics = build_physics(scene_specs(list(placer.placed.values()), base))
     moving = [i for i, p in placer.placed.items() if p.dynamic]
     chunk = round(0.1 / TIMESTEP_S)
@@ -222,14 +214,13 @@ def _joint_settle(placer: Placer, base: list[BodySpec], damped_s: float, free_s:
     for i in moving:
         pose = physics.pose(i)
         moved, turned = pose_change(placer.placed[i].pose, pose)
-        # What flies off in this phase is left where it was placed: the report will say that it does not
-        # stand.
+        # Objects that move far stay where they were placed: the report finds them unstable.
         if np.isfinite(pose).all() and moved < 0.05 and turned < 15:
             placer.commit(replace(placer.placed[i], pose=pose))
 
 
 def _repair_movers(placer: Placer, moved: set[int]) -> None:
-    """Give what moved a flatter foot; what stands on a mover is given a chance without repair."""
+    """Flatten the undersides of objects that moved; not of those whose parent moved, which may be the only cause."""
     for i in [i for i, p in placer.placed.items() if i in moved and p.edge.parent not in moved]:
         placer.again(i)
 

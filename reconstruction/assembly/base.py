@@ -1,4 +1,4 @@
-"""Floor, walls and ceiling as convex slabs that things can stand on and lean against."""
+"""Collision shapes of floor, walls and ceiling: convex slabs."""
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -6,29 +6,27 @@ from scipy.spatial import ConvexHull
 from reconstruction.core.types import BaseAsset, ConvexPart
 
 SLAB_THICKNESS_M = 0.2
-FLOOR_MARGIN_M = 4.0  # beyond what was seen, so that nothing falls off the world
-_UNSEEN_HALF_EXTENT_M = 3.0
+FLOOR_MARGIN_M = 4.0  # beyond the visual mesh, so that nothing falls off the floor
+_UNSEEN_HALF_EXTENT_M = 3.0  # of surfaces without a mesh
 
 
 def base_slabs(base: BaseAsset) -> tuple[ConvexPart, ...]:
-    """Return the collision of a base surface in world space: one box whose face lies exactly on the plane.
+    """Return the collision shape of a base surface in world space: one box with a face exactly on the plane.
 
-    The box covers the surface's visual mesh and reaches `SLAB_THICKNESS_M` behind it; a floor goes on for
-    `FLOOR_MARGIN_M` beyond.
+    The box covers the visual mesh and is `SLAB_THICKNESS_M` thick; that of a floor extends `FLOOR_MARGIN_M` beyond.
     """
     normal = np.asarray(base.plane[:3], np.float64)
     length = np.linalg.norm(normal)
     normal, offset = normal / length, float(base.plane[3]) / length
-    # Upright in-plane axes, so that a wall's box follows the wall's outline.
+    # Upright in-plane axes align a wall's box with its outline.
     helper = np.array([1.0, 0, 0]) if abs(normal[2]) > 0.7 else np.array([0, 0, 1.0])
     second = helper - normal * (helper @ normal)
     second /= np.linalg.norm(second)
     first = np.cross(second, normal)
     vertices = np.asarray(base.visual.vertices, np.float64)
     if len(vertices) < 3:
-        vertices = _UNSEEN_HALF_EXTENT_M * np.array(
-            [first + second, first - second, -first - second, second - first]
-        )
+        corners = [first + second, first - second, -first - second, second - first]
+        vertices = _UNSEEN_HALF_EXTENT_M * np.array(corners)
     along = np.stack([vertices @ first, vertices @ second], axis=1)
     margin = FLOOR_MARGIN_M if base.label == "floor" else 0.0
     low, high = along.min(axis=0) - margin, along.max(axis=0) + margin
@@ -43,7 +41,7 @@ def base_slabs(base: BaseAsset) -> tuple[ConvexPart, ...]:
 
 
 def convex_part(points: np.ndarray) -> ConvexPart:
-    """Return the convex hull of points (n, 3), faces counter-clockwise from outside."""
+    """Return the convex hull of points (n, 3); faces are counter-clockwise seen from outside."""
     hull = ConvexHull(points)
     index = np.full(len(points), -1)
     index[hull.vertices] = np.arange(len(hull.vertices))

@@ -1,7 +1,7 @@
-"""What the paper compares assembly with: nothing at all, and a collision search after the fact.
+"""Assembly baselines of the paper: reconstructed poses as they are, and MCMC search for collision-free poses.
 
-Both leave collision shapes as they are and make the same things movable as assembly does. Nothing is settled, repaired
-or made immovable afterwards: what the physics makes of them is in the report card.
+Both keep collision shapes and make the same objects dynamic as assembly does. Nothing is simulated or repaired; the
+report card measures the result.
 """
 
 from collections.abc import Sequence
@@ -17,33 +17,32 @@ from reconstruction.core.types import AssetSet, Edge
 from registry.geometry import matrix_from_quat
 from registry.simulation import Contact, pose_change
 
-_REACH_M = 0.015  # how far gaps are looked for; wider ones count as this much
-_GAP_WEIGHT, _MOVED_WEIGHT = 1.0, 0.3  # beside a metre of penetration: of gap, of displacement
-_TURN_M = 0.1  # a radian of turn counts as this displacement
-_HOT_M, _COLD_M = 5e-4, 1e-5  # temperatures of the annealing
+_REACH_M = 0.015  # largest gap that is measured; wider ones count as this
+_GAP_WEIGHT, _MOVED_WEIGHT = 1.0, 0.3  # energy of a metre of gap and of displacement; of penetration it is 1
+_TURN_M = 0.1  # displacement that a radian of rotation counts as
+_HOT_M, _COLD_M = 5e-4, 1e-5  # first and last temperature of the annealing
 _STEP_M, _STEP_RAD = (5e-3, 3e-4), (0.02, 1e-3)  # 1-sigma of proposals, hot and cold
-_TILT_SHARE = 0.3  # of the turn, about level axes
+_TILT_SHARE = 0.3  # of the rotation, about horizontal axes
 
 
 def in_situ(
     assets: AssetSet, edges: Sequence[Edge], movable: dict[int, bool], config: AssemblyConfig
 ) -> dict[int, Placement]:
-    """Leave every object where and as it was reconstructed.
+    """Place every object at its reconstructed pose.
 
     Args:
-        assets: All objects.
-        edges: Parents before children.
-        movable: By object, the user's word on whether it can move.
-        config: Rules on what cannot.
+        assets: base surfaces and objects.
+        edges: parents before children.
+        movable: by object id, whether it is dynamic, where the user says so.
+        config: rules on furniture.
     """
     objects, base = {o.id: o for o in assets.objects}, {b.id for b in assets.base}
     out: dict[int, Placement] = {}
     for edge in edges:
         asset = objects[edge.child]
         carrier = out.get(edge.parent)
-        moves = moves_by_rule(
-            asset, edge, edge.parent in base, carrier is not None and carrier.dynamic, config
-        )
+        parent_moves = carrier is not None and carrier.dynamic
+        moves = moves_by_rule(asset, edge, edge.parent in base, parent_moves, config)
         pose = np.asarray(asset.world_from_object, np.float64)
         parts = asset.collision
         if edge.relation != "attached_to":
@@ -65,10 +64,10 @@ def mcmc(
     config: AssemblyConfig,
     progress: Progress,
 ) -> dict[int, Placement]:
-    """Search poses without overlap near the reconstructed ones: Metropolis-Hastings over SE(3), annealed, seeded.
+    """Search collision-free poses near the reconstructed ones by annealed Metropolis-Hastings over SE(3).
 
-    The energy is the depth of overlaps, the gaps to parent and children, and the displacement. Time is bounded by the
-    number of proposals, so that results do not depend on the machine.
+    The energy sums penetration depths, gaps to parent and children, and displacement. The number of proposals is fixed,
+    so that results do not depend on the speed of the machine. Arguments as in `in_situ`.
     """
     placed = in_situ(assets, edges, movable, config)
     bench = Workbench(base_specs(assets))
@@ -89,7 +88,7 @@ def mcmc(
             proposal = _proposal(rng, poses[i], cooled)
             then = _energy(bench.probe(i, proposal, -_REACH_M), around[i], seen, proposal)
             temperature = _HOT_M * (_COLD_M / _HOT_M) ** cooled
-            # Drawn in any case: what is drawn must not depend on energies that differ in their last bits.
+            # Drawn in any case: the random sequence must not depend on the last bits of energies.
             chance = rng.uniform()
             if then < now or chance < np.exp((now - then) / temperature):
                 poses[i] = proposal
@@ -99,7 +98,7 @@ def mcmc(
 
 
 def _energy(contacts: list[Contact], around: _Neighbors, seen: np.ndarray, pose: np.ndarray) -> float:
-    """Return the energy (metres) of one object's pose (4, 4); `contacts` are its own, it first in each."""
+    """Return the energy (metres) of an object's pose (4, 4); `seen` is the reconstructed one."""
     nearest: dict[int, float] = {}
     for c in contacts:
         nearest[c.second] = min(nearest.get(c.second, np.inf), c.separation_m)
@@ -110,7 +109,7 @@ def _energy(contacts: list[Contact], around: _Neighbors, seen: np.ndarray, pose:
 
 
 def _proposal(rng: np.random.Generator, pose: np.ndarray, cooled: float) -> np.ndarray:
-    """Return a pose nearby, turned about the object's origin."""
+    """Draw a pose nearby, rotated about the object's origin; `cooled` is the progress of annealing, 0 to 1."""
     step, turn = (hot * (cold / hot) ** cooled for hot, cold in (_STEP_M, _STEP_RAD))
     axis = rng.normal(size=3) * turn * np.array([_TILT_SHARE, _TILT_SHARE, 1.0])
     angle = max(float(np.linalg.norm(axis)), 1e-12)

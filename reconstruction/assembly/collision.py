@@ -1,4 +1,4 @@
-"""Edits of collision shapes: cut by a plane, give a flat foot (reconstructed undersides are bumpy)."""
+"""Edit collision shapes: cut convex parts by a plane, flatten bumpy undersides, add legs."""
 
 import numpy as np
 from scipy.spatial import QhullError
@@ -6,14 +6,14 @@ from scipy.spatial import QhullError
 from reconstruction.assembly.base import convex_part
 from reconstruction.core.types import ConvexPart
 
-_MIN_THICKNESS_M = 5e-4
-_LEG_M = 0.008
-_LEG_REACH_M = 0.02  # a leg ends at the lowest piece this near
-_MIN_LEG_M = 0.01
+_MIN_THICKNESS_M = 5e-4  # of a part that is kept by a cut
+_LEG_M = 0.008  # side of a leg's square section
+_LEG_REACH_M = 0.02  # a leg ends at the lowest vertex this near
+_MIN_LEG_M = 0.01  # height
 
 
 def cut(parts: tuple[ConvexPart, ...], normal: np.ndarray, offset: float) -> tuple[ConvexPart, ...]:
-    """Keep what lies at normal . x + offset >= 0 of every piece; pieces wholly behind vanish."""
+    """Clip convex parts to the half-space normal . x + offset >= 0; parts outside are dropped."""
     out = []
     for part in parts:
         points = np.asarray(part.vertices, np.float64)
@@ -36,15 +36,15 @@ def cut(parts: tuple[ConvexPart, ...], normal: np.ndarray, offset: float) -> tup
 
 
 def flatten_foot(parts: tuple[ConvexPart, ...], up: np.ndarray, band_m: float) -> tuple[ConvexPart, ...]:
-    """Give the shape a level foot: bumps in the lowest half band go, the band above is filled in.
+    """Flatten the underside: cut off the lower half of a band above the lowest point, fill up its upper half.
+
+    The shape sinks by at most half a band and its underside keeps its outline. A sphere of radius r gets a flat patch
+    of radius sqrt(2 r band).
 
     Args:
-        parts: convex pieces, object space.
-        up: (3,) unit, the world's up in object space at the pose that the shape shall stand in.
-        band_m: how uneven the underside is taken to be.
-
-    Cutting and filling meet in the middle, so that the shape sinks by at most half a band and its foot keeps
-    its outline. A sphere of radius r gets a flat patch of radius sqrt(2 r band).
+        parts: convex parts, object space.
+        up: (3,) unit, world up in object space at the pose that the shape shall stand in.
+        band_m: assumed unevenness of the underside.
     """
     heights = [np.asarray(part.vertices, np.float64) @ up for part in parts]
     level = min(h.min() for h in heights) + 0.5 * band_m
@@ -65,10 +65,10 @@ def flatten_foot(parts: tuple[ConvexPart, ...], up: np.ndarray, band_m: float) -
 
 
 def with_legs(parts: tuple[ConvexPart, ...]) -> tuple[ConvexPart, ...]:
-    """Add slim legs below the four corners of a shape that stand in the air, object space (+z up).
+    """Add slim legs under those of the four corners of a shape that do not reach down, object space (+z up).
 
-    They reach from the shape's lowest height to its underside at the corner, and stay within its outline. A shape
-    whose corners all reach down is returned as it is.
+    Legs reach from the lowest height of the shape to its underside at the corner, inside of its outline. `parts` itself
+    is returned if there is no such corner.
     """
     points = np.concatenate([np.asarray(part.vertices, np.float64) for part in parts])
     low, middle = points[:, 2].min(), 0.5 * (points.min(axis=0) + points.max(axis=0))[:2]
@@ -87,7 +87,7 @@ def with_legs(parts: tuple[ConvexPart, ...]) -> tuple[ConvexPart, ...]:
 
 
 def _hull(points: np.ndarray) -> ConvexPart | None:
-    """Return the hull, or None where what is left has no volume worth keeping."""
+    """Return the convex hull; None if it is flat."""
     if len(points) < 4 or np.linalg.svd(points - points.mean(0), compute_uv=False)[-1] < 1e-5:
         return None
     try:

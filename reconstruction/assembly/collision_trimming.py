@@ -1,7 +1,7 @@
-"""Things that overlap sideways by less than they are known: their collision shapes give way, nothing moves.
+"""Cut collision shapes of objects that overlap, by separating axes between convex parts.
 
-Both were seen where they stand, and shapes are off by a centimetre, mostly where no frame looked: between them. Each
-of the two convex pieces is cut off at the middle of the overlap.
+Where objects overlap sideways by less than the accuracy of reconstruction, both keep their poses: shapes are off by a
+centimetre, mostly between objects, where no frame looked. Both parts are cut at the middle of the overlap.
 """
 
 from dataclasses import dataclass
@@ -13,29 +13,29 @@ from reconstruction.assembly.collision import cut
 from reconstruction.core.types import ConvexPart
 from registry.geometry import transform_points
 
-_STEEPEST = 0.5  # z of a normal that is still sideways
-_GAP_M = 2e-4  # left between the two
-_MOST_OF_A_PIECE = 0.35  # of its extent that a piece may lose
+_STEEPEST = 0.5  # largest z of a sideways normal
+_GAP_M = 2e-4  # left between the two parts
+_MOST_OF_A_PART = 0.35  # of its extent along the normal that a part may lose
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """How far a piece of one thing is in a piece of another."""
+    """The overlap of two convex parts along the axis of least penetration."""
 
-    normal: np.ndarray  # (3,) world, the shortest way out for the first
-    low: float  # where along the normal the first piece begins, metres
-    high: float  # and where the second one ends
-    first_extent: float
+    normal: np.ndarray  # (3,) world, direction in which the first part leaves the second
+    low: float  # lower end of the first part along the normal, metres
+    high: float  # upper end of the second part
+    first_extent: float  # along the normal
     second_extent: float
 
     @property
     def depth(self) -> float:
-        """In metres."""
+        """Return the penetration depth, metres."""
         return self.high - self.low
 
     @property
     def sideways(self) -> bool:
-        """Tell whether the way out is rather level."""
+        """Tell whether the normal is rather horizontal."""
         return abs(self.normal[2]) < _STEEPEST
 
 
@@ -49,19 +49,20 @@ def give_way(
     most_m: float,
     rests_on: bool,
 ) -> tuple[tuple[ConvexPart, ...], tuple[ConvexPart, ...], float]:
-    """Cut the pieces of two things where they overlap sideways.
+    """Cut the parts of two objects where they overlap sideways.
 
     Args:
-        first: convex pieces, object space.
-        first_pose: (4, 4).
-        second: of the other thing.
-        second_pose: (4, 4).
-        tolerance_m: overlap that counts as touching.
-        most_m: how much each of the two may lose; what overlaps by more than both give is left as it is.
-        rests_on: one carries the other; then only what is shortest to leave sideways counts.
+        first: convex parts, object space.
+        first_pose: world_from_object (4, 4).
+        second: parts of the other object.
+        second_pose: world_from_object (4, 4).
+        tolerance_m: depth that counts as contact.
+        most_m: largest depth that each of two parts may lose; deeper overlaps are left.
+        rests_on: one object supports the other: only parts whose axis of least penetration is sideways are cut. Else
+            that axis is chosen among the sideways ones.
 
     Returns:
-        The pieces of both, and the deepest overlap that was taken away (0: nothing was cut).
+        The parts of both, and the largest depth that was removed (0: nothing was cut).
     """
     one, other, deepest = list(first), list(second), 0.0
     ours = [in_world(part, first_pose) for part in one]
@@ -90,18 +91,18 @@ def cut_out(
     tolerance_m: float,
     clearance_m: float = 0.0,
 ) -> tuple[tuple[ConvexPart, ...], float]:
-    """Cut off all of the first thing's pieces that is in the second one: (what is left, the deepest overlap).
+    """Cut the first object's parts where they overlap the second's; arguments as in `give_way`.
 
-    With a clearance pieces that are nearer to each other than that are in each other, too, by how much nearer they are.
+    Returns:
+        The parts left, and the largest depth; with a clearance, parts nearer than that overlap too.
     """
     theirs = [in_world(part, second_pose) for part in second]
     left, deepest = [], 0.0
     for part in first:
         kept: ConvexPart | None = part
         for their in theirs:
-            found = overlap_of(
-                in_world(kept, first_pose), their, sideways_only=False, clearance_m=clearance_m
-            )
+            our = in_world(kept, first_pose)
+            found = overlap_of(our, their, sideways_only=False, clearance_m=clearance_m)
             if found is None or found.depth <= tolerance_m:
                 continue
             deepest = max(deepest, found.depth)
@@ -119,37 +120,37 @@ def overlap_of(
     sideways_only: bool,
     clearance_m: float = 0.0,
 ) -> Overlap | None:
-    """Return how two convex pieces overlap, None where they do not: separating axes over the normals of their faces.
+    """Return the overlap of two convex parts by the separating axis test over their face normals; None if apart.
 
     Args:
-        first: (v, 3) corners and (f, 3) outward normals of its faces, world space.
-        second: of the other one.
-        sideways_only: the way out must be rather level.
-        clearance_m: the second one is thicker by this on all sides.
+        first: vertices (v, 3) and outward face normals (f, 3) in world space, from `in_world`.
+        second: those of the other part.
+        sideways_only: only use axes that are rather horizontal.
+        clearance_m: the second part is dilated by this.
     """
     (a, a_normals), (b, b_normals) = first, second
     if np.any(a.min(axis=0) > b.max(axis=0) + clearance_m):
         return None
     if np.any(a.max(axis=0) < b.min(axis=0) - clearance_m):
         return None
-    ways = np.concatenate([-a_normals, b_normals])  # directions in which the first one may leave
-    along_a, along_b = a @ ways.T, b @ ways.T
+    axes = np.concatenate([-a_normals, b_normals])  # directions in which the first part may leave
+    along_a, along_b = a @ axes.T, b @ axes.T
     depth = along_b.max(axis=0) + clearance_m - along_a.min(axis=0)
     if depth.min() <= 0:
         return None
     if sideways_only:
-        depth = np.where(np.abs(ways[:, 2]) < _STEEPEST, depth, np.inf)
+        depth = np.where(np.abs(axes[:, 2]) < _STEEPEST, depth, np.inf)
     k = int(np.argmin(depth))
     if not np.isfinite(depth[k]):
         return None
     low, high = float(along_a[:, k].min()), float(along_b[:, k].max()) + clearance_m
-    return Overlap(ways[k], low, high, float(np.ptp(along_a[:, k])), float(np.ptp(along_b[:, k])))
+    return Overlap(axes[k], low, high, float(np.ptp(along_a[:, k])), float(np.ptp(along_b[:, k])))
 
 
 def _middle(found: Overlap, most_m: float) -> float | None:
-    """Return where along the normal the two shall meet, None where they cannot give enough."""
-    most_first = min(most_m, _MOST_OF_A_PIECE * found.first_extent)
-    most_second = min(most_m, _MOST_OF_A_PIECE * found.second_extent)
+    """Return the position along the normal at which to cut both parts; None if the overlap is too deep."""
+    most_first = min(most_m, _MOST_OF_A_PART * found.first_extent)
+    most_second = min(most_m, _MOST_OF_A_PART * found.second_extent)
     if found.depth > most_first + most_second:
         return None
     of_first = min(max(0.5 * found.depth, found.depth - most_second), most_first)
@@ -157,21 +158,21 @@ def _middle(found: Overlap, most_m: float) -> float | None:
 
 
 def _behind(part: ConvexPart, pose: np.ndarray, normal: np.ndarray, level: float) -> ConvexPart | None:
-    """Keep what lies at normal . x >= level (world) of a piece."""
+    """Clip a part to normal . x >= level, in world space; None if nothing is left."""
     made = cut((part,), pose[:3, :3].T @ normal, float(normal @ pose[:3, 3]) - level)
     return made[0] if made else None
 
 
 def in_world(part: ConvexPart, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices (v, 3) and distinct outward face normals (n, 3) of a part in world space."""
     vertices, faces = np.asarray(part.vertices, np.float32), np.asarray(part.faces, np.int32)
-    return transform_points(pose, vertices), _face_normals(vertices.tobytes(), faces.tobytes()) @ pose[
-        :3, :3
-    ].T
+    normals = _face_normals(vertices.tobytes(), faces.tobytes())
+    return transform_points(pose, vertices), normals @ pose[:3, :3].T
 
 
 @lru_cache(maxsize=4096)
 def _face_normals(vertices: bytes, faces: bytes) -> np.ndarray:
-    """Return the outward normals (n, 3) of a piece's faces, each direction once."""
+    """Return the outward face normals (n, 3) of a part, each direction once."""
     corners = np.frombuffer(vertices, np.float32).reshape(-1, 3).astype(np.float64)
     a, b, c = (corners[np.frombuffer(faces, np.int32).reshape(-1, 3)[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)

@@ -1,4 +1,4 @@
-"""How the scene is put together: limits and rules of stage 9."""
+"""Settings of the assembly stage."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,53 +6,53 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class AssemblyConfig:
-    """Bounds of every move that assembly may make. Friction and mass are never touched."""
+    """Bounds of all changes by assembly; friction and mass stay as they are."""
 
     method: Literal["hierarchical", "in-situ", "mcmc"] = "hierarchical"
-    """From the floor up in physics, with repairs; or, to compare with, everything left where it was reconstructed, or
-    searched for poses without overlap after the fact (docs/assembly.md)."""
+    """`hierarchical`: bottom up in physics, with repairs. Baselines (docs/assembly.md): `in-situ`, reconstructed poses;
+    `mcmc`, a search for collision-free poses."""
     fixed_extent_m: float = 0.6
-    """Things on the floor larger than this are furniture: they do not move in the simulation."""
+    """Larger objects on the floor are furniture: static in the simulation."""
     fixed_mass_kg: float = 15.0
-    """Heavier things do not move either."""
+    """Heavier objects are static too."""
     upright_tilt_deg: float = 6.0
-    """Poses tilted by less than this are set upright before they are let go."""
+    """Largest tilt of a pose that is set upright before simulation."""
     penetration_mm: float = 0.3
-    """Overlap that counts as touching."""
+    """Penetration depth that counts as contact."""
     max_give_m: float = 0.012
-    """How much of its collision shape each of two things gives up where they overlap sideways, before one is moved."""
+    """Largest depth by which each of two collision shapes that overlap sideways is cut, before one is moved."""
     max_lift_m: float = 0.06
-    """How far an object is lifted out of what it was reconstructed in."""
+    """Largest lift out of a penetration."""
     max_shift_m: float = 0.03
-    """How far an object is shifted sideways out of its neighbors."""
+    """Largest sideways shift out of a penetration."""
     max_snap_m: float = 0.02
-    """How far furniture is moved down to meet the floor, and a movable thing out of a wall."""
+    """Largest move of furniture down to the floor, and of a dynamic object out of a wall."""
     max_wall_snap_m: float = 0.12
-    """How far a hanging thing is moved along a wall's normal to touch it."""
+    """Largest move of an attached object along the wall's normal to touch it."""
     settle_s: float = 2.0
-    """Time an object is given to come to rest."""
+    """Simulated time in which an object must come to rest."""
     max_turn_deg: float = 8.0
-    """An object that turns more has tipped."""
+    """Largest rotation of an object while it settles; it has tipped if it turns more."""
     max_slide_m: float = 0.015
-    """An object that slides farther has slipped."""
+    """Largest horizontal displacement of an object while it settles."""
     max_drop_m: float = 0.05
-    """An object that drops farther (from clear of its parent) has missed its parent."""
+    """Largest drop of an object while it settles, from a pose clear of its parent."""
     max_fall_m: float = 0.15
-    """What falls over or down, but no farther than this, is left where it came to rest, and that is said."""
+    """Largest displacement of an object that tips or falls, and still is left where it came to rest."""
     foot_bands_mm: tuple[float, ...] = (2.0, 5.0, 10.0)
-    """Unevenness taken off the underside, tried in this order, when an object does not stand by itself."""
+    """Bands of the underside to flatten, tried in this order, if an object does not stand by itself."""
     search_shifts_m: tuple[float, ...] = (0.006, 0.012)
-    """Sideways offsets tried when an object still does not stand."""
+    """Sideways offsets to try if an object still does not stand."""
     joint_settle_s: float = 3.0
-    """Time all objects together are given to come to rest."""
+    """Simulated time in which all objects together must come to rest."""
     joint_rounds: int = 4
-    """How often the whole scene is settled, measured and repaired."""
+    """Largest number of rounds of joint settling, measuring and repair."""
     mcmc_sweeps: int = 150
-    """For `mcmc`: how often a new pose is proposed for every object."""
+    """For `mcmc`: number of proposals per object."""
     seed: int = 0
     """For `mcmc`: seed of the proposals."""
     freeze_unstable: bool = True
-    """Make what cannot be made to stand immovable (said in its `repair`), instead of leaving it unstable."""
+    """Make objects that no repair stabilizes static (noted in their `repair`), instead of leaving them unstable."""
 
 
 ASSEMBLY_PRESETS = {

@@ -1,7 +1,7 @@
-"""Where the collision shape of one thing fills the place of another: that place is cut out of it.
+"""Hollow out collision shapes where they fill the place of another object.
 
-The convex pieces of a large thing span the niches in it and the air above it: of a counter four metres long they reach
-15 cm beyond its surface. What was seen to stand there proves that the place is not the counter's.
+The convex parts of a large object span its niches and the air above it: those of a counter four metres long reach 15 cm
+beyond its surface. An object seen there shows that the place is free.
 """
 
 from dataclasses import dataclass
@@ -19,92 +19,90 @@ from registry.geometry import transform_points
 if TYPE_CHECKING:
     import manifold3d
 
-_GAP_M = 2e-4  # left around the thing
-_FILLS_AIR = 0.5  # of the overlap that is within the visible surface: with less, the pieces are what is wrong
+_GAP_M = 2e-4  # left around the object
+_FILLS_AIR = 0.5  # share of the overlap inside of the visible surface below which the parts fill air
 
 
 @dataclass(frozen=True)
 class _Place:
-    """An upright prism around what is in a piece: normals . x <= levels, in the space of the piece."""
+    """An upright prism around the intruding parts: normals . x <= levels, in the space of `part`."""
 
-    piece: ConvexPart
+    part: ConvexPart
     normals: np.ndarray  # (10, 3) unit
     levels: np.ndarray  # (10,) metres
-    points: np.ndarray  # (n, 3) corners of what is in the piece
+    points: np.ndarray  # (n, 3) vertices of the intruding parts
 
 
 def hollowed(
     other: Placement, item: Placement, tolerance_m: float, clearance_m: float = 0.0
 ) -> tuple[ConvexPart, ...]:
-    """Cut the place of a thing out of the pieces of another one: what is left of these.
+    """Cut the place of `item` out of the parts of `other`; return the parts left.
 
-    The place is the octagonal prism, in the thing's own axes, around those of its pieces that are in the other's
-    piece. Below and above it the piece is whole, so that it carries what it carried.
+    The place is the octagonal prism, in the item's axes, around those of its parts that overlap the other's part. The
+    part stays whole below and above it, and supports what it supported.
 
     Args:
-        other: whose pieces fill the place.
-        item: who is there.
-        tolerance_m: overlap that counts as touching.
-        clearance_m: by how much the place is larger than the thing on all sides.
+        other: the object whose parts fill the place.
+        item: the object in the place.
+        tolerance_m: depth that counts as contact.
+        clearance_m: margin of the place around the item.
     """
-    places = {id(place.piece): place for place in _places(other, item, tolerance_m, clearance_m)}
+    places = {id(place.part): place for place in _places(other, item, tolerance_m, clearance_m)}
     left: tuple[ConvexPart, ...] = ()
-    for piece in other.parts:
-        left += _around(places[id(piece)]) if id(piece) in places else (piece,)
+    for part in other.parts:
+        left += _around(places[id(part)]) if id(part) in places else (part,)
     return left
 
 
 def fills_air(other: Placement, item: Placement, tolerance_m: float) -> bool:
-    """Tell whether the pieces of a thing are in another one where its own visible surface is not."""
+    """Tell whether the overlap of `other` with `item` is mostly outside of the visible surface of `other`."""
     places = _places(other, item, tolerance_m, 0.0)
     visual = other.asset.visual
     body = manifold_of(Solid(np.asarray(visual.vertices, np.float64), np.asarray(visual.faces)))
     if body is None or not places:
         return False
-    both = [_hull(np.asarray(place.piece.vertices)) ^ _hull(place.points) for place in places]
+    both = [_hull(np.asarray(place.part.vertices)) ^ _hull(place.points) for place in places]
     common = sum(part.volume() for part in both)
     return common > 0 and sum((part ^ body).volume() for part in both) < _FILLS_AIR * common
 
 
 def volume(parts: tuple[ConvexPart, ...]) -> float:
-    """Return the volume of pieces, one by one, in cubic metres."""
+    """Return the sum of the volumes of parts, cubic metres."""
     return sum(_hull(np.asarray(part.vertices)).volume() for part in parts)
 
 
 def _places(other: Placement, item: Placement, tolerance_m: float, clearance_m: float) -> list[_Place]:
-    """Return the place of a thing in each of the other's pieces that it is in."""
+    """Return the place of the item in each part of `other` that it overlaps."""
     other_from_item = np.linalg.inv(other.pose) @ item.pose
     ours = [in_world(part, item.pose) for part in item.parts]
     found = []
-    for piece in other.parts:
-        their = in_world(piece, other.pose)
+    for part in other.parts:
+        their = in_world(part, other.pose)
         overlaps = [overlap_of(our, their, sideways_only=False, clearance_m=clearance_m) for our in ours]
-        inside = [
-            part for part, one in zip(item.parts, overlaps) if one is not None and one.depth > tolerance_m
-        ]
+        inside = [p for p, one in zip(item.parts, overlaps) if one is not None and one.depth > tolerance_m]
         if inside:
-            points = np.concatenate([np.asarray(part.vertices, np.float64) for part in inside])
+            points = np.concatenate([np.asarray(p.vertices, np.float64) for p in inside])
             levels = (points @ _WAYS.T).max(axis=0) + clearance_m + _GAP_M
             normals = _WAYS @ other_from_item[:3, :3].T
             moved = transform_points(other_from_item, points)
-            found.append(_Place(piece, normals, levels + normals @ other_from_item[:3, 3], moved))
+            found.append(_Place(part, normals, levels + normals @ other_from_item[:3, 3], moved))
     return found
 
 
 def _around(place: _Place) -> tuple[ConvexPart, ...]:
-    """Return the parts of a piece around a place; the piece itself where it is not in it after all."""
+    """Split a part around its place; returned whole if they do not overlap after all."""
     out: tuple[ConvexPart, ...] = ()
-    rest: tuple[ConvexPart, ...] = (place.piece,)
+    rest: tuple[ConvexPart, ...] = (place.part,)
     for normal, level in zip(place.normals, place.levels):
         out += cut(rest, normal, -level)
         rest = cut(rest, -normal, level)
         if not rest:
-            return (place.piece,)
+            return (place.part,)
     return out
 
 
 def _ways() -> np.ndarray:
-    """Return below, above, four sides and the four between them, (10, 3)."""
+    """Return the normals (10, 3) of the prism: below, above, four sides, the four between them."""
     turn = np.arange(8) * np.pi / 4
     around = np.stack([np.cos(turn), np.sin(turn), np.zeros(8)], axis=1)
     return np.concatenate([[[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], around[::2], around[1::2]])

@@ -1,4 +1,4 @@
-"""Place one object: furniture on the floor, hanging things at their wall, the rest by letting it settle."""
+"""Place one object: furniture on the floor, attached objects at their wall, all others by simulation."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,12 +19,11 @@ from reconstruction.assembly.placement import (
 )
 from reconstruction.assembly.settle import Settler
 from reconstruction.assembly.tops import level_tops
-from reconstruction.assembly.workbench import object_spec
 from reconstruction.core.types import AssetSet, Edge, ObjectAsset
 from reconstruction.scene_graph.surfaces import sample_object
 from registry.report_card import MOST_GAP_MM
 
-_FIXED_SHIFT_M = 0.01  # of what is not let go, out of its neighbors; what is in them deeper is cut
+_FIXED_SHIFT_M = 0.01  # largest shift of static objects out of their neighbors; deeper ones are cut
 
 
 class Placer(Settler):
@@ -33,14 +32,14 @@ class Placer(Settler):
     def __init__(
         self, assets: AssetSet, edges: Sequence[Edge], config: AssemblyConfig, movable: dict[int, bool]
     ) -> None:
-        """Start with the base; `movable` is the user's word on what can move."""
+        """Start with the base; `movable` overrides by object id whether it is dynamic."""
         super().__init__(assets, edges, config)
         self._movable = movable
         self._edges = {edge.child: edge for edge in edges}
         self._samples = {o.id: sample_object(o) for o in assets.objects}
 
     def place(self, asset: ObjectAsset, edge: Edge) -> Placement:
-        """Place an object whose parent is placed already."""
+        """Place and commit an object whose parent is placed already."""
         on_base = edge.parent in self.base
         children = [self._samples[i] for i in sorted(self._carried.get(asset.id, []))]
         parts, depth = level_tops(asset.collision, self._samples[asset.id], asset.world_from_object, children)
@@ -60,7 +59,7 @@ class Placer(Settler):
         return placement
 
     def _seen(self, asset: ObjectAsset, edge: Edge) -> np.ndarray:
-        """Return the pose (4, 4) at which an object was seen; a parent that was moved takes along what stands on it."""
+        """Return the reconstructed pose (4, 4), set upright, moved along with its parent."""
         pose = upright(asset.world_from_object, self.config.upright_tilt_deg).copy()
         parent = self.placed.get(edge.parent)
         if parent is not None:
@@ -68,7 +67,7 @@ class Placer(Settler):
         return pose
 
     def again(self, asset_id: int) -> Placement:
-        """Settle a placed object once more from where it stands, with a flatter foot than it has."""
+        """Simulate a placed object again from its pose, with the next flatter underside; keep it if it stands."""
         old = self.placed[asset_id]
         bands = [b for b in self.config.foot_bands_mm if b > old.band_mm]
         if not bands or not old.stands or old.edge.relation == "attached_to":
@@ -79,7 +78,7 @@ class Placer(Settler):
         return placement
 
     def hold(self, asset_id: int, note: str) -> Placement:
-        """Make a placed thing immovable where it was seen; where it reaches into its neighbors it is cut."""
+        """Make a placed object static, at its reconstructed pose unless it carries others, cut clear of neighbors."""
         old = self.placed[asset_id]
         if not old.parts:
             return old
@@ -89,34 +88,31 @@ class Placer(Settler):
             pose, parts = self._seen(old.asset, edge), old.unflattened
             self.placed.pop(asset_id)
             old = self.out_of_walls(replace(old, edge=edge, pose=pose, parts=parts))
-        # Whether it stands by itself is another question, answered before.
+        # Whether it stands by itself was determined before.
         held = replace(self.let_down(self.keep_clear(old, shift_m=_FIXED_SHIFT_M)), stands=old.stands)
         self.commit(held)
         return held
 
-    # Furniture and hanging things: moved as little as possible, never let go.
-
     def _stand_furniture(self, item: Placement) -> Placement:
+        """Place furniture without simulation: moved to its floor, cut off below it and behind walls."""
         floor = self.base[item.edge.parent]
         item = replace(item, dynamic=False)
         gap = float(distance_to(floor, world_points(item.parts, item.pose)).min())
         if gap < 0:
-            # What was seen of it stays where it was; its shape ends at the floor.
             item = self.cut_behind(item, floor)
             if gap < -WORTH_SAYING_M:
-                item = item.noted(
-                    f"its collision shape was cut off {-gap * 100:.1f} cm inside the {floor.label}"
-                )
+                inside = f"{-gap * 100:.1f} cm inside the {floor.label}"
+                item = item.noted(f"its collision shape was cut off {inside}")
         elif gap <= self.config.max_snap_m:
             item = moved_by(item, (TOUCH_GAP_M - gap) * normal_of(floor))
         else:
-            item = item.noted(
-                f"its lowest part is {gap * 100:.0f} cm above the {floor.label}; left where it was seen"
-            )
+            above = f"{gap * 100:.0f} cm above the {floor.label}"
+            item = item.noted(f"its lowest part is {above}; left where it was seen")
         item = self.out_of_walls(item)
         return self.keep_clear(item, shift_m=_FIXED_SHIFT_M)
 
     def _hang(self, item: Placement) -> Placement:
+        """Place an attached object without simulation, moved along the normal of its wall to touch it."""
         parent = self.base.get(item.edge.parent)
         if parent is None:
             carrier = self.placed[item.edge.parent]
@@ -124,7 +120,7 @@ class Placer(Settler):
             hung = self.keep_clear(held, shift_m=_FIXED_SHIFT_M, at_any_cost=False)
             if hung.stands:
                 return hung
-            # It cannot hang there without being inside something: let gravity find what carries it.
+            # It cannot hang there without penetration: simulation finds its support.
             standing = replace(item.edge, relation="supported_by")
             return self.let_settle(replace(item, edge=standing).noted("stands: no place to hang was free"))
         item = replace(item, dynamic=False)
@@ -132,18 +128,16 @@ class Placer(Settler):
         if abs(gap) <= self.config.max_wall_snap_m:
             item = moved_by(item, (TOUCH_GAP_M - gap) * normal_of(parent))
             if abs(gap) > 0.01:
-                item = item.noted(
-                    f"moved {abs(gap) * 100:.1f} cm {'to' if gap > 0 else 'out of'} the {parent.label}"
-                )
+                way = "to" if gap > 0 else "out of"
+                item = item.noted(f"moved {abs(gap) * 100:.1f} cm {way} the {parent.label}")
         else:
-            item = item.noted(
-                f"{abs(gap) * 100:.0f} cm {'off' if gap > 0 else 'inside'} the {parent.label}; left there"
-            )
+            where = "off" if gap > 0 else "inside"
+            item = item.noted(f"{abs(gap) * 100:.0f} cm {where} the {parent.label}; left there")
         return self._hung_on(self.keep_clear(item, shift_m=0.0))
 
     def _hung_on(self, item: Placement) -> Placement:
-        """Keep the wall, unless what hangs there, too, is all that a thing touches: then it hangs on that."""
-        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        """Keep the parent, unless the object touches only objects attached to it: then the nearest of these."""
+        self.put(item)
         near = self.bench.probe(item.asset.id, item.pose, -1e-3 * MOST_GAP_MM)
         touched = {c.second: c.separation_m for c in sorted(near, key=lambda c: -c.separation_m)}
         between = {i for i in touched if i in self.placed and self.placed[i].edge.parent == item.edge.parent}

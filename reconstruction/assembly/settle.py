@@ -1,4 +1,4 @@
-"""Let one object settle, in the way that leaves it nearest to where it was seen."""
+"""Place one object by simulating it until it rests, with the repair that keeps it nearest to its reconstructed pose."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,24 +17,24 @@ from reconstruction.assembly.placement import (
 )
 from reconstruction.assembly.surroundings import Surroundings
 from reconstruction.assembly.tops import seat
-from reconstruction.assembly.workbench import Settled, object_spec, support_margin
+from reconstruction.assembly.workbench import Settled, support_margin
 from reconstruction.core.types import AssetSet, Edge, ObjectAsset
 from registry.geometry import transform_points
 from registry.simulation import pose_change
 
-# What a pose costs, in millimetres from where it was seen; a degree of turn, a millimetre of foot taken off.
+# Costs in millimetres of displacement: of a degree of rotation, a millimetre of flattened underside, a failure.
 _TURN_MM, _BAND_MM, _FAILED_MM = 1.0, 0.3, 1000.0
-_SAFE_MARGIN_MM, _EDGE_MM = 4.0, 3.0
-_NEAR_ENOUGH_MM = 2.0  # no other way is tried
-_FAR_MM = 10.0  # it is moved sideways, or gets legs, where that costs less
+_SAFE_MARGIN_MM, _EDGE_MM = 4.0, 3.0  # support margin that costs nothing; cost of a millimetre less
+_NEAR_ENOUGH_MM = 2.0  # cost below which no repair is tried
+_FAR_MM = 10.0  # cost from which legs, seats and shifts are tried
 
 
 @dataclass(frozen=True)
 class Tried:
-    """One way to place an object."""
+    """A simulated placement of an object."""
 
-    cost_mm: float  # how far from where it was seen; `_FAILED_MM` and more: it does not stand
-    clear: bool  # nothing was inside it
+    cost_mm: float  # distance to the reconstructed pose, with penalties; `_FAILED_MM` or more: it fell
+    clear: bool  # free of penetration before simulation
     placement: Placement
 
     def better(self, other: "Tried") -> "Tried":
@@ -43,10 +43,10 @@ class Tried:
 
 
 class Settler(Surroundings):
-    """Lets objects go, one at a time, and repairs those that do not stand."""
+    """Simulates objects, one at a time, and repairs those that do not stand."""
 
     def __init__(self, assets: AssetSet, edges: Sequence[Edge], config: AssemblyConfig) -> None:
-        """Start with the base; `edges` say what each object will carry."""
+        """Start with the base; `edges` tell what each object supports."""
         super().__init__(assets, config)
         self._assets = {o.id: o for o in assets.objects}
         self._carried: dict[int, list[int]] = {}
@@ -55,11 +55,12 @@ class Settler(Surroundings):
                 self._carried.setdefault(edge.parent, []).append(edge.child)
 
     def let_settle(self, item: Placement) -> Placement:
+        """Simulate an object until it rests, and try repairs, mildest first, until one costs little enough."""
         item = self.give_way_to_neighbors(self.out_of_walls(item))
         seen = item.pose
         best = self._try(item, seen)
         if not best.clear:
-            # No place nearby is free, whatever its foot is like.
+            # No pose nearby is free of penetration: cut shapes.
             before = dict(self.placed)
             opened = self.cut_clear(item)
             cleared = best.better(self._try(opened, seen)) if opened.stands else best
@@ -78,17 +79,18 @@ class Settler(Surroundings):
         if best.cost_mm >= _FAR_MM:
             best = self._seat(item, best)
         for moved in self._shifted(item):
-            # Moving an object away from where it was seen is worth it only where it would fall otherwise.
+            # A shift is worth it only if the object would fall otherwise.
             if best.cost_mm < _FAR_MM:
                 break
             best = best.better(self._try(moved, seen))
         return best.placement
 
     def settle_flattened(self, item: Placement, band_mm: float) -> Placement:
+        """Simulate an object from its pose, with its underside flattened by `band_mm`."""
         return self._try(flattened(item, band_mm), item.pose).placement
 
     def _seat(self, item: Placement, best: Tried) -> Tried:
-        """Try its carrier's shape made level under the thing, where it was seen to stand; nobody saw the top there."""
+        """Try with the carrier's shape leveled under the object, where its top is hidden."""
         carrier = self.placed.get(item.edge.parent)
         if carrier is None:
             return best
@@ -100,7 +102,7 @@ class Settler(Surroundings):
             return best
         said = f"its collision shape was made level under {item.asset.label} {item.asset.id}"
         before = self.met(carrier) - {item.asset.id}
-        changed = replace(carrier, parts=parts, unflattened=parts).noted(said)
+        changed = carrier.noted(said, parts=parts, unflattened=parts)
         self.commit(changed)
         if self.met(changed) - {item.asset.id} <= before:
             found = self._try(item, item.pose)
@@ -110,7 +112,7 @@ class Settler(Surroundings):
         return best
 
     def _in_cleared_air(self, item: Placement, best: Tried) -> Tried:
-        """Try the place where a thing was seen, once what others' pieces fill there in air is hollowed out."""
+        """Try with neighbors hollowed out whose parts fill air in the place of the object."""
         before = dict(self.placed)
         if self.clear_air(item):
             found = self._try(item, item.pose)
@@ -120,7 +122,7 @@ class Settler(Surroundings):
         return best
 
     def _shifted(self, item: Placement) -> Iterator[Placement]:
-        """Yield a small search around the pose."""
+        """Yield flattened placements shifted sideways around the pose."""
         flat = flattened(item, self.config.foot_bands_mm[len(self.config.foot_bands_mm) // 2])
         for radius in self.config.search_shifts_m:
             for angle in np.arange(8) * np.pi / 4:
@@ -128,16 +130,16 @@ class Settler(Surroundings):
                 yield moved.noted(f"shifted {radius * 1000:.0f} mm to where it stands")
 
     def _try(self, item: Placement, seen: np.ndarray) -> Tried:
-        """Clear, let go and judge against the pose `seen`: what it costs, in millimetres, and where it ends."""
+        """Move an object out of penetration, simulate it, and rate the result against the pose `seen`."""
         config, body = self.config, item.asset.id
-        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        self.put(item)
         pose, clear = make_clear(
             self.bench,
             body,
             item.pose,
             max_lift_m=config.max_lift_m,
             max_shift_m=config.max_shift_m,
-            tolerance_m=config.penetration_mm * 1e-3,
+            tolerance_m=self.tolerance_m,
         )
         lift = pose[2, 3] - item.pose[2, 3]
         shift = float(np.hypot(*(pose[:2, 3] - item.pose[:2, 3])))
@@ -153,42 +155,36 @@ class Settler(Surroundings):
             notes = (*notes, f"came to rest on {edge.parent} instead of {item.edge.parent}")
         fell = pose_change(pose, end.pose)[0]
         if cost >= _FAILED_MM and clear and end.at_rest and fell < config.max_fall_m:
-            # In the simulation it would fall at once; at rest it is at least near and harmless.
-            left = replace(item, pose=end.pose, edge=edge, notes=(*notes, _why(end, clear)), stands=True)
-            return Tried(cost, clear, left)
-        if cost >= _FAILED_MM:
-            # Where it was cleared is closer to the truth than where it tumbled to.
-            return Tried(
-                cost, clear, replace(item, pose=pose, notes=(*notes, _why(end, clear)), stands=False)
-            )
+            # It would fall in any simulation; here it is at rest and near its reconstructed pose.
+            notes = (*notes, _why(end, clear))
+        elif cost >= _FAILED_MM:
+            # The pose before simulation is nearer to the reconstructed one than where it tumbled to.
+            notes = (*notes, _why(end, clear))
+            return Tried(cost, clear, replace(item, pose=pose, notes=notes, stands=False))
         return Tried(cost, clear, replace(item, pose=end.pose, edge=edge, notes=notes, stands=True))
 
     def _cost(self, item: Placement, end: Settled, clear: bool, seen: np.ndarray) -> float:
-        """Return how far, in millimetres, a thing ends from where it was seen: its middle, turns, a lost foot."""
+        """Return the cost (mm) of displacement of the center of mass, rotation, flattening, a small margin, failure."""
         config = self.config
-        failed = (
-            not clear
-            or not end.at_rest
-            or end.turned_deg > config.max_turn_deg
-            or end.lateral_m > config.max_slide_m
-            or end.drop_m > config.max_drop_m + config.max_lift_m
-        )
+        tipped = end.turned_deg > config.max_turn_deg or end.lateral_m > config.max_slide_m
+        fell = end.drop_m > config.max_drop_m + config.max_lift_m
+        failed = not clear or not end.at_rest or tipped or fell
         middle = np.append(item.asset.physics.center_of_mass, 1.0)
         moved_mm = 1e3 * float(np.linalg.norm(((end.pose - seen) @ middle)[:3]))
-        # What stands on the edge of its support stands until something else is put on it.
+        # An object at the edge of its support may tip once something is put on it.
         edge_mm = min(max(_SAFE_MARGIN_MM - self._margin_mm(item, end), 0.0), 2 * _SAFE_MARGIN_MM)
         cost = moved_mm + _TURN_MM * end.turned_deg + _BAND_MM * item.band_mm + _EDGE_MM * edge_mm
         return cost + _FAILED_MM * failed
 
     def _margin_mm(self, item: Placement, end: Settled) -> float:
-        """Return how far inside its support a thing's center of mass is, alone and with all that it will carry."""
+        """Return the support margin (mm) of the center of mass: the least of alone and with all that it will carry."""
         alone = (end.pose @ np.append(item.asset.physics.center_of_mass, 1.0))[:2]
         shift = end.pose[:2, 3] - item.asset.world_from_object[:2, 3]
         _, loaded = self._load(item.asset)
         return 1e3 * min(support_margin(end.support, center) for center in (alone, loaded[:2] + shift))
 
     def _load(self, asset: ObjectAsset) -> tuple[float, np.ndarray]:
-        """Return the mass (kg) and the center (3,) of an object and of all that stands on it, as reconstructed."""
+        """Return mass (kg) and center of mass (3,) of an object and of all that it carries, as reconstructed."""
         mass = float(asset.physics.mass_kg)
         center = transform_points(asset.world_from_object, asset.physics.center_of_mass[None])[0]
         for i in self._carried.get(asset.id, []):
@@ -197,13 +193,12 @@ class Settler(Surroundings):
         return mass, center
 
     def _seen_parent(self, edge: Edge, end: Settled) -> Edge:
-        """Keep the parent unless the object touches it nowhere and rests wholly on something else."""
+        """Keep the parent, unless the object rests on other bodies only; then the strongest of these."""
         if not end.carriers or edge.parent in end.carriers:
             return edge
         evidence = f"rests on it in the simulation; before: {edge.parent}, {edge.evidence}"
-        return replace(
-            edge, parent=end.carriers[0], confidence=round(0.5 * edge.confidence, 3), evidence=evidence
-        )
+        confidence = round(0.5 * edge.confidence, 3)
+        return replace(edge, parent=end.carriers[0], confidence=confidence, evidence=evidence)
 
 
 def _why(end: Settled, clear: bool) -> str:

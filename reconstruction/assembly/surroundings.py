@@ -1,4 +1,4 @@
-"""What stands around an object, and how it is freed of it: moved by the least, or collision shapes cut."""
+"""Separate an object from the base and placed objects: move it by the least, or cut collision shapes."""
 
 from dataclasses import replace
 
@@ -24,15 +24,15 @@ from reconstruction.assembly.workbench import STANDING, Workbench, object_spec
 from reconstruction.core.types import AssetSet, BaseAsset
 from registry.simulation import pose_change
 
-_MAX_CUTS = 6
-_MORE_CLEARANCE_M = 5e-4  # each time
-_LEAST_LEFT = 0.25  # of a shape: of which less would be left is in the other thing rather than beside it
-_MUCH_LEFT = 0.75
-_NEAR_M = 0.01
+_MAX_CUTS = 6  # rounds of cutting
+_MORE_CLEARANCE_M = 5e-4  # added in each round
+_LEAST_LEFT = 0.25  # share of the volume that a cut must leave
+_MUCH_LEFT = 0.75  # share of the volume below which hollowing is tried instead of cutting
+_NEAR_M = 0.01  # largest gap closed by `let_down`
 
 
 class Surroundings:
-    """The base and all that is placed already, on the workbench."""
+    """The base and the placed objects on the workbench, and operations that separate an object from them."""
 
     def __init__(self, assets: AssetSet, config: AssemblyConfig) -> None:
         """Start with the base."""
@@ -41,19 +41,23 @@ class Surroundings:
         self.base = {b.id: b for b in assets.base}
         self.bench = Workbench(base_specs(assets))
         self.placed: dict[int, Placement] = {}
+        self.tolerance_m = config.penetration_mm * 1e-3  # penetration that counts as contact
+
+    def put(self, item: Placement) -> None:
+        """Put an object on the workbench as its placement says, or replace it there."""
+        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
 
     def commit(self, placement: Placement) -> None:
-        """Hold an object still where its placement says."""
+        """Record a placement, and put the object on the workbench."""
         self.placed[placement.asset.id] = placement
-        self.bench.put(object_spec(placement.asset, placement.parts, placement.pose, dynamic=True))
+        self.put(placement)
 
     def met(self, item: Placement) -> set[int]:
-        """Return what an object on the workbench overlaps where it stands."""
-        tolerance_m = self.config.penetration_mm * 1e-3
-        return {c.second for c in self.bench.probe(item.asset.id, item.pose, tolerance_m)}
+        """Return the ids of the bodies that an object on the workbench penetrates."""
+        return {c.second for c in self.bench.probe(item.asset.id, item.pose, self.tolerance_m)}
 
     def out_of_walls(self, item: Placement) -> Placement:
-        """Cut off what reaches into a wall; what is let go is moved out of it if it would lose too much."""
+        """Cut off the collision shape behind walls; a dynamic object is first moved out if too much would be cut."""
         for wall in self.base.values():
             depth = -float(distance_to(wall, world_points(item.parts, item.pose)).min())
             if wall.label == "floor" or depth <= 0 or not beside(wall, item):
@@ -68,6 +72,7 @@ class Surroundings:
         return item
 
     def cut_behind(self, item: Placement, base: BaseAsset, clearance_m: float = 0.0) -> Placement:
+        """Cut off the collision shape behind a base surface, unless nothing would be left."""
         normal = normal_of(base)
         offset = float(distance_to(base, item.pose[:3, 3][None])[0]) - TOUCH_GAP_M - clearance_m
         inward = item.pose[:3, :3].T @ normal
@@ -75,23 +80,23 @@ class Surroundings:
         return replace(item, parts=parts, unflattened=unflattened) if parts and unflattened else item
 
     def keep_clear(self, item: Placement, *, shift_m: float, at_any_cost: bool = True) -> Placement:
-        """Free a thing that will not be let go of its neighbors: shifted, or the shapes of both cut.
+        """Separate a static object from its neighbors: shift it, or cut the shapes of both.
 
         Args:
-            item: Where it was seen.
-            shift_m: How far it may be shifted before shapes are cut.
-            at_any_cost: A neighbor that takes all of its place is hollowed out; where nothing else is left, the
-                thing has no collision shape. Otherwise it does not stand then.
+            item: the object at its reconstructed pose.
+            shift_m: largest shift before shapes are cut.
+            at_any_cost: hollow out a neighbor that fills all of its place; if that fails, the object loses its
+                collision shape. Otherwise it does not stand then.
         """
         item = self.give_way_to_neighbors(item)
-        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        self.put(item)
         pose, clear = make_clear(
             self.bench,
             item.asset.id,
             item.pose,
             max_lift_m=0.0,
             max_shift_m=shift_m,
-            tolerance_m=self.config.penetration_mm * 1e-3,
+            tolerance_m=self.tolerance_m,
             settles=False,
         )
         if not clear:
@@ -106,16 +111,15 @@ class Surroundings:
         return replace(item, pose=pose, stands=True)
 
     def let_down(self, item: Placement) -> Placement:
-        """Let a thing that is held touch what carries it, where that is less than a centimetre below."""
-        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        """Move a static object down to its support, if that is less than a centimetre below."""
+        self.put(item)
         near = self.bench.probe(item.asset.id, item.pose, -_NEAR_M)
         gap = min((c.separation_m for c in near if c.normal[2] > STANDING), default=0.0)
         return moved_by(item, np.array([0.0, 0.0, TOUCH_GAP_M - gap])) if gap > TOUCH_GAP_M else item
 
     def give_way_to_neighbors(self, item: Placement) -> Placement:
-        """Where a thing overlaps its neighbors sideways by less than they are known, cut both shapes, not move it."""
-        tolerance_m, most_m = self.config.penetration_mm * 1e-3, self.config.max_give_m
-        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+        """Cut the shapes of an object and its neighbors where they overlap sideways by little."""
+        self.put(item)
         for i in sorted(self.met(item) & set(self.placed)):
             other = self.placed[i]
             parts, others, depth = give_way(
@@ -123,31 +127,29 @@ class Surroundings:
                 item.pose,
                 other.parts,
                 other.pose,
-                tolerance_m=tolerance_m,
-                most_m=most_m,
+                tolerance_m=self.tolerance_m,
+                most_m=self.config.max_give_m,
                 rests_on=i == item.edge.parent or other.edge.parent == item.asset.id,
             )
             if depth > 0:
                 said = f"its collision shape gave way by up to {depth * 500:.0f} mm to"
-                item = replace(item, parts=parts, unflattened=parts).noted(f"{said} {other.asset.label} {i}")
-                self.commit(
-                    replace(other, parts=others, unflattened=others).noted(
-                        f"{said} {item.asset.label} {item.asset.id}"
-                    )
-                )
+                item = item.noted(f"{said} {other.asset.label} {i}", parts=parts, unflattened=parts)
+                name = f"{item.asset.label} {item.asset.id}"
+                self.commit(other.noted(f"{said} {name}", parts=others, unflattened=others))
         return item
 
     def cut_clear(self, item: Placement, *, at_any_cost: bool = False) -> Placement:
-        """Cut the collision shapes of a thing, where it was seen, and of what it is in, until they are apart.
+        """Cut the collision shapes of an object and of the bodies that it penetrates, until they are apart.
 
-        A neighbor that fills air there is hollowed out; of what is in its visible surface, the thing is cut off. Where
-        that would leave little of it, the thing does not stand, or, at any cost, the neighbor is hollowed out even so,
-        or the thing has no collision shape.
+        A neighbor whose parts fill air there is hollowed out; otherwise the object is cut. If that would leave little
+        of it, the object does not stand or, at any cost, the neighbor is hollowed out even so, or the object loses its
+        collision shape.
         """
         before = dict(self.placed)
-        opened, removed_m, clearance_m = item, 0.0, 0.0
+        opened, removed_m, clearance_m, whole_m3 = item, 0.0, 0.0, volume(item.parts)
+        met: set[int] = set()
         for _ in range(_MAX_CUTS):
-            self.bench.put(object_spec(opened.asset, opened.parts, opened.pose, dynamic=True))
+            self.put(opened)
             met = self.met(opened)
             if not met:
                 said = f"its collision shape was cut off {removed_m * 100:.1f} cm inside a neighbor"
@@ -156,28 +158,26 @@ class Surroundings:
                 if i in self.base:
                     opened = self.cut_behind(opened, self.base[i], clearance_m)
                     continue
-                made = self._apart(opened, self.placed[i], volume(item.parts), clearance_m, at_any_cost)
-                opened, removed_m = made[0], max(removed_m, made[1])
-            # PhysX merges faces that are nearly level with each other, so that its hulls are up to millimetres larger.
+                opened, depth_m = self._apart(opened, self.placed[i], whole_m3, clearance_m, at_any_cost)
+                removed_m = max(removed_m, depth_m)
+            # PhysX merges nearly coplanar faces, so that its hulls are up to millimetres larger.
             clearance_m += _MORE_CLEARANCE_M
         self.back_to(before)
         if at_any_cost:
             names = ", ".join(self._name_of(i) for i in sorted(met))
             said = f"left without a collision shape: no place is free of {names}"
-            return replace(item.noted(said), parts=(), unflattened=(), dynamic=False, stands=True)
-        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
+            return item.noted(said, parts=(), unflattened=(), dynamic=False, stands=True)
+        self.put(item)
         return item.noted("still overlaps a neighbor", stands=False)
 
     def _apart(
         self, item: Placement, other: Placement, whole_m3: float, clearance_m: float, at_any_cost: bool
     ) -> tuple[Placement, float]:
-        """Cut a thing or what it is in: the thing, and how deep it was in what it was cut off at."""
-        tolerance_m = 0.5 * self.config.penetration_mm * 1e-3
-        if fills_air(other, item, tolerance_m) and self._make_room(other, item, clearance_m):
+        """Cut an object or its neighbor: the object, and the depth that was cut off it."""
+        if fills_air(other, item, 0.5 * self.tolerance_m) and self._make_room(other, item, clearance_m):
             return item, 0.0
-        parts, depth = cut_out(
-            item.parts, item.pose, other.parts, other.pose, tolerance_m, clearance_m=clearance_m
-        )
+        tolerance_m = 0.5 * self.tolerance_m
+        parts, depth = cut_out(item.parts, item.pose, other.parts, other.pose, tolerance_m, clearance_m)
         left = volume(parts)
         if left < _MUCH_LEFT * whole_m3:
             around = hollowed(item, other, tolerance_m, clearance_m)
@@ -190,16 +190,15 @@ class Surroundings:
         return replace(item, parts=parts, unflattened=parts), depth
 
     def clear_air(self, item: Placement) -> bool:
-        """Hollow out the neighbors whose pieces fill air where a thing was seen; tell whether there was one."""
-        self.bench.put(object_spec(item.asset, item.parts, item.pose, dynamic=True))
-        tolerance_m = 0.5 * self.config.penetration_mm * 1e-3
+        """Hollow out neighbors whose parts fill air where an object was seen; tell whether there was one."""
+        self.put(item)
         met = [self.placed[i] for i in sorted(self.met(item)) if i in self.placed]
-        filling = [other for other in met if fills_air(other, item, tolerance_m)]
+        filling = [other for other in met if fills_air(other, item, 0.5 * self.tolerance_m)]
         return any([self._make_room(other, item, 0.0) for other in filling])
 
     def _make_room(self, other: Placement, item: Placement, clearance_m: float) -> bool:
-        """Hollow out what is placed already where a thing is; False where little would be left of it."""
-        parts = hollowed(other, item, 0.5 * self.config.penetration_mm * 1e-3, clearance_m)
+        """Hollow out a placed object in the place of another; False if little would be left of it."""
+        parts = hollowed(other, item, 0.5 * self.tolerance_m, clearance_m)
         if volume(parts) < _LEAST_LEFT * volume(other.parts):
             return False
         said = f"its collision shape was hollowed out where {item.asset.label} {item.asset.id} is"
@@ -208,7 +207,7 @@ class Surroundings:
         return True
 
     def back_to(self, before: dict[int, Placement]) -> None:
-        """Take back what was done to neighbors since."""
+        """Restore placements of neighbors that changed since `before`."""
         for i, placement in before.items():
             if self.placed.get(i) is not placement:
                 self.commit(placement)

@@ -1,4 +1,4 @@
-"""The scene while it is built: what is placed stands still, one object at a time is let go."""
+"""Physics scene of assembly: placed objects are kinematic, one object at a time is simulated."""
 
 from dataclasses import dataclass
 
@@ -9,20 +9,20 @@ from reconstruction.assets.gltf import written_corners
 from reconstruction.core.types import ConvexPart, ObjectAsset
 from registry.simulation import TIMESTEP_S, BodySpec, Contact, Physics, pose_change
 
-STANDING = 0.7  # of the upward part of a contact's normal
+STANDING = 0.7  # least z of the normal of a supporting contact
 
 
 @dataclass(frozen=True)
 class Settled:
-    """How an object came to rest after it was let go."""
+    """Result of simulating an object until it rests."""
 
     pose: np.ndarray  # (4, 4)
-    lateral_m: float  # from where it was let go
+    lateral_m: float  # horizontal displacement from the initial pose
     drop_m: float
     turned_deg: float
     at_rest: bool
-    carriers: tuple[int, ...]  # bodies that push it up, strongest first
-    support: np.ndarray  # (n, 2) world, where it is carried from below
+    carriers: tuple[int, ...]  # ids of bodies that push it up, strongest first
+    support: np.ndarray  # (n, 2) world, supporting contact points
 
 
 def object_spec(
@@ -33,7 +33,7 @@ def object_spec(
     dynamic: bool,
     fixed_to: int | None = None,
 ) -> BodySpec:
-    """Describe an object to the physics, its pieces as the bundle will hold them."""
+    """Return the body of an object, with its parts as the bundle stores them."""
     physics = asset.physics
     return BodySpec(
         id=asset.id,
@@ -51,9 +51,9 @@ def object_spec(
 
 
 class Workbench:
-    """A physics scene in which at most one object moves."""
+    """A physics scene in which at most one object is dynamic."""
 
-    # Quasi-static: a body sinks at 0.25 m/s and tips slowly instead of bouncing. Only while settling.
+    # Quasi-static: while settling, a body falls at 0.25 m/s and tips slowly instead of bouncing.
     _DAMPING = 40.0
 
     def __init__(self, base: list[BodySpec]) -> None:
@@ -63,18 +63,18 @@ class Workbench:
             self.physics.add(spec)
 
     def put(self, spec: BodySpec) -> None:
-        """Add an object, or replace it (its shape may have changed), held still at its pose."""
+        """Add an object or replace it, as a kinematic body."""
         if spec.id in self.physics.specs:
             self.physics.remove(spec.id)
         self.physics.add(spec, kinematic=True)
 
     def freeze(self, body_id: int, pose: np.ndarray) -> None:
-        """Hold an object still at a pose."""
+        """Make an object kinematic at a pose."""
         self.physics.set_kinematic(body_id, True)
         self.physics.set_pose(body_id, pose)
 
     def probe(self, body_id: int, pose: np.ndarray, tolerance_m: float) -> list[Contact]:
-        """Return the object's contacts deeper than the tolerance at a pose, normals pushing it out."""
+        """Return contacts deeper than the tolerance of an object at a pose; it is `first`, normals push it out."""
         physics = self.physics
         physics.set_kinematic(body_id, False)
         physics.set_gravity(body_id, False)
@@ -85,21 +85,20 @@ class Workbench:
             if c.first == body_id:
                 found.append(c)
             elif c.second == body_id:
-                # The pair was first met when the other one was free: ids are in that order, and yet the normal is
-                # of the one that is free now.
+                # Ids are in the order of when the pair first met; the normal is that of the dynamic body.
                 found.append(Contact(body_id, c.first, c.separation_m, c.normal, c.position, c.impulse))
         self.freeze(body_id, pose)
         physics.set_gravity(body_id, True)
         return found
 
     def settle(self, body_id: int, pose: np.ndarray, limit_s: float) -> Settled:
-        """Let an object go at a pose until it rests: damped first, then free for a moment."""
+        """Simulate an object from a pose until it rests, damped for up to `limit_s`, then undamped for up to 0.5 s."""
         physics = self.physics
         physics.set_kinematic(body_id, False)
         physics.set_pose(body_id, pose)
         at_rest = False
         chunk = round(0.1 / TIMESTEP_S)
-        # The free phase shows whether damping alone held the object in place.
+        # The undamped phase reveals objects that only damping held in place.
         for damping, seconds in ((self._DAMPING, limit_s), (0.0, 0.5)):
             physics.set_damping(body_id, damping, damping)
             at_rest = False
@@ -129,9 +128,9 @@ class Workbench:
 
 
 def support_margin(points: np.ndarray, center: np.ndarray) -> float:
-    """Return how far (m) a center of mass (2,) is inside the hull of what carries it, (n, 2); negative: outside.
+    """Return the distance (m) of a center of mass (2,) to the border of the support polygon of points (n, 2).
 
-    What touches in a line or a point has no inside: 0 at best.
+    Negative outside, and without an area; -inf without points.
     """
     if len(points) == 0:
         return -np.inf

@@ -1,4 +1,4 @@
-"""Stage 7, assets: complete, textured, simulation-ready objects, and floor and walls with their looks."""
+"""Stage 7, assets: closed, textured objects with collision shapes and masses; textured floor, walls and ceiling."""
 
 from pathlib import Path
 
@@ -15,12 +15,12 @@ def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
     views: SceneViews | None = None, keep: Path | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
-    """Build every asset; see `reconstruction.assets.build.build_assets` (compiled code is imported on use)."""
+    """Build every asset; see `reconstruction.assets.build.build_assets`, whose compiled code is imported on use."""
     from reconstruction.assets.build import build_assets as build
 
     return build(posed, depth, surface, instances, config, views=views, keep=keep, progress=progress)
 
 
 def wants_views(config: AssetsConfig) -> bool:
-    """Tell whether objects are shown to anyone: a generator, or a vision-language model."""
-    return config.generator != "none" or config.physics == "vlm"
+    """Tell whether a generator or a vision-language model needs views of the objects."""
+    return config.generator != "none" or config.physics != "table"

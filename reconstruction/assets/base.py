@@ -1,22 +1,29 @@
-"""Floor, walls and ceiling: rectangles that reach as far as the room was seen, with looks baked from the frames."""
+"""Floor, walls and ceiling: rectangles as large as the seen room, with textures baked from the frames."""
 
 import cv2
 import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.texture import Texels, collect_colors, prepare_looks, push_pull, textured
+from reconstruction.assets.texture import (
+    Texels,
+    collect_colors,
+    push_pull,
+    texture_side,
+    texture_views,
+    textured,
+)
 from reconstruction.assets.views import ScenePixels
 from reconstruction.core.types import BaseAsset, BaseEntity, DepthMaps, InstanceSet, ObjectAsset, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
-_MARGIN_M = 0.05
+_MARGIN_M = 0.05  # of the floor beyond what was seen
 
 
 def build_base(
     posed: PosedFrames, depth: DepthMaps, found: InstanceSet, objects: tuple[ObjectAsset, ...], pixels: ScenePixels,
     config: AssetsConfig,
 ) -> tuple[BaseAsset, ...]:  # fmt: skip
-    """Build every base entity; the floor carries all objects and meets the walls, walls reach down to the floor."""
+    """Build every base entity: the floor extends below all objects and to the walls, walls extend down to the floor."""
     frames = {b.id: _plane_frame(b) for b in found.base}
     floor = next((b for b in found.base if b.label == "floor"), None)
     out = []
@@ -36,8 +43,7 @@ def build_base(
         flat = transform_points(plane_from_world, np.concatenate(points))[:, :2]
         low, high = flat.min(axis=0), flat.max(axis=0)
         if entity.label == "floor":
-            low, high = low - _MARGIN_M, high + _MARGIN_M
-            low, high = _stop_at_walls(low, high, plane_from_world, found)
+            low, high = _include_walls(low - _MARGIN_M, high + _MARGIN_M, plane_from_world, found)
         high = np.maximum(high, low + 0.1)
         out.append(_bake_rectangle(entity, plane_from_world, low, high, posed, depth, pixels, config))
     return tuple(out)
@@ -57,17 +63,17 @@ def _plane_frame(entity: BaseEntity) -> np.ndarray:
 
 
 def _drop_to(floor: BaseEntity, points: np.ndarray) -> np.ndarray:
-    """Move points straight down (or up) to the floor plane."""
+    """Move points vertically onto the floor plane."""
     n, d = floor.surface.plane[:3], floor.surface.plane[3]
     out = points.copy()
     out[:, 2] = -(points[:, :2] @ n[:2] + d) / n[2]
     return out
 
 
-def _stop_at_walls(
+def _include_walls(
     low: np.ndarray, high: np.ndarray, plane_from_world: np.ndarray, found: InstanceSet
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep at least what walls span; the margin may pass behind a wall by its own width only."""
+    """Grow a rectangle to what the walls span."""
     for base in found.base:
         if base.label == "wall":
             flat = transform_points(plane_from_world, base.surface.polygon)[:, :2]
@@ -82,10 +88,7 @@ def _bake_rectangle(
     world_from_plane = invert_rigid(plane_from_world)
     size = high - low
     vertices, faces, uvs = _grid(low, high, 0.5)
-    side = 64
-    while side < min(config.texture_max_px, float(size.max()) / config.base_texel_m):
-        side *= 2
-    side = min(side, config.texture_max_px)
+    side = texture_side(float(size.max()) / config.base_texel_m, 64, config.texture_max_px)
     center = (np.arange(side) + 0.5) / side
     u, v = np.meshgrid(center, 1 - center)
     flat = np.stack([low[0] + u * size[0], low[1] + v * size[1], np.zeros_like(u)], -1).reshape(-1, 3)
@@ -108,59 +111,46 @@ def _bake_rectangle(
 
 
 def _grid(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A rectangle of squares: vertices (v, 3) at z = 0, faces with normal +z, uvs (v, 2)."""
+    """Return a rectangle of squares: vertices (v, 3) at z = 0, faces with normal +z, uvs (v, 2)."""
     nx, ny = (max(1, int(np.ceil((high[a] - low[a]) / step))) for a in range(2))
     s, t = np.meshgrid(np.linspace(0, 1, nx + 1), np.linspace(0, 1, ny + 1), indexing="ij")
     uvs = np.stack([s, t], -1).reshape(-1, 2)
     vertices = np.column_stack([low + uvs * (high - low), np.zeros(len(uvs))])
     index = np.arange((nx + 1) * (ny + 1)).reshape(nx + 1, ny + 1)
-    a, b, c, d = (
-        index[:-1, :-1].ravel(),
-        index[1:, :-1].ravel(),
-        index[1:, 1:].ravel(),
-        index[:-1, 1:].ravel(),
-    )
+    a, b = index[:-1, :-1].ravel(), index[1:, :-1].ravel()
+    c, d = index[1:, 1:].ravel(), index[:-1, 1:].ravel()
     return vertices, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).astype(np.int32), uvs
 
 
 def _collect(
-    texels: Texels,
-    entity: BaseEntity,
-    posed: PosedFrames,
-    depth: DepthMaps,
-    pixels: ScenePixels,
+    texels: Texels, entity: BaseEntity, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels,
     config: AssetsConfig,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Blend colours from frames spread over the video."""
-    count = (pixels.ids == entity.id).reshape(len(pixels.ids), -1).sum(axis=1)
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Blend colors from frames spread over the video: colors (t, 3) and whether any frame saw them (t,)."""
+    count = pixels.counts(entity.id)
     able = np.flatnonzero(count > 0.01 * pixels.ids[0].size)
     if len(able):
-        able = able[
-            np.unique(
-                np.linspace(0, len(able) - 1, min(len(able), 2 * config.texture_frames)).round().astype(int)
-            )
-        ]
-    views = [_base_view(entity, int(f), posed, depth, pixels) for f in able]
-    looks = prepare_looks(posed, depth.camera, able, [v[0] for v in views], [v[1] for v in views])
-    color, seen, _ = collect_colors(texels, looks, 0.02)
+        count = min(len(able), 2 * config.texture_frames)
+        able = able[np.unique(np.linspace(0, len(able) - 1, count).round().astype(int))]
+    masks = [_base_view(entity, int(f), posed, depth, pixels) for f in able]
+    views = texture_views(posed, depth.camera, able, [m[0] for m in masks], [m[1] for m in masks])
+    color, seen, _ = collect_colors(texels, views, 0.02)
     return color, seen
 
 
 def _base_view(
     entity: BaseEntity, frame: int, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the plane where a frame sees it (0 elsewhere), and a weight that falls towards the mask's border."""
-    camera = depth.camera
+    """Return the plane's depth where a frame sees it (0 elsewhere), and a weight that falls towards the mask's edge."""
     n, d = entity.surface.plane[:3], entity.surface.plane[3]
     pose = posed.world_from_camera[frame]
-    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    along = (n @ pose[:3, 0]) * u[None] + (n @ pose[:3, 1]) * v[:, None] + n @ pose[:3, 2]
+    u, v = depth.camera.pixel_rays()[..., :2].transpose(2, 0, 1)
+    along = (n @ pose[:3, 0]) * u + (n @ pose[:3, 1]) * v + n @ pose[:3, 2]
     plane_depth = np.where(along < -1e-6, -(n @ pose[:3, 3] + d) / np.minimum(along, -1e-6), 0)
     measured = pixels.depth[frame]
     on_plane = np.abs(measured - plane_depth) < 0.02 + 0.02 * plane_depth
     mask = (pixels.ids[frame] == entity.id) & ((measured <= 0) | on_plane)
-    # Contact shadows and badly cut outlines of objects stay out.
+    # Excludes contact shadows and pixels of objects along inexact outlines.
     mask = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8))
     border = np.minimum(cv2.distanceTransform(mask, cv2.DIST_L2, 3), 10.0) / 10.0
     return np.where(mask > 0, plane_depth, 0).astype(np.float32), border

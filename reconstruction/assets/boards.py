@@ -1,8 +1,7 @@
-"""The underside of a board on legs: no camera sees it, but the board's rim says how thick the board is.
+"""Underside of a table top: its thickness is measured at its rim.
 
-From above, depth reaches a few centimetres into a table top, and what lies below is unknown: between aprons and legs
-it passes for enclosed, without them the top ends as a sheet. All around the top its rim was seen, and what is free
-below the rim.
+Depth reaches a few centimetres into a table top from above, and the space below it is unknown: completion would fill it
+between aprons and legs, or leave the top a thin sheet. The rim and the free space below it were seen all around.
 """
 
 from dataclasses import dataclass, replace
@@ -11,19 +10,22 @@ import numpy as np
 
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 
-_UP = 0.85  # cosine
-_LEAST_SHARE = 0.25  # of the box's plan that the board covers
-_LEAST_HEIGHT = 0.85  # of the thing's height: boards above that are tops
-_RIM_M = 0.02
+_UP = 0.85  # least z of an upward normal
+_LEAST_SHARE = 0.25  # of the object's footprint that the board covers
+_LEAST_HEIGHT = 0.85  # of the object's height: only boards above that are tops
+_RIM_M = 0.02  # half width of the rim, seen from above
 _MOST_M = 0.12  # thickness of a board
-_BIN_M, _USUAL_BIN = 0.005, 1  # depth below a board's upper edge, which itself is round
-_FEW, _LEAST_POINTS = 0.2, 30  # share of the usual points: a rim's lower part is seen less
-_BELOW_M = 0.06  # the space so far below the board is empty; what goes on below that is a leg or a box
+_BIN_M, _USUAL_BIN = (
+    0.005,
+    1,
+)  # histogram of depth below the top; its first bin is skipped, as the edge is round
+_FEW, _LEAST_POINTS = 0.2, 30  # share of the usual bin's points that ends the rim; least points of that bin
+_BELOW_M = 0.06  # height below the board that is emptied; what continues farther down is a leg or a box
 
 
 @dataclass(frozen=True)
 class Board:
-    """A level board that ends in free space all around."""
+    """A level board with free space below its rim."""
 
     plan: np.ndarray  # bool (nx, ny) columns
     top_m: float  # grid frame
@@ -31,7 +33,7 @@ class Board:
 
 
 def find_board(volume: ObjectVolume, frame: ObjectFrame) -> Board | None:
-    """Return the highest large board of a thing and how thick its rim is; None where there is none, or no rim."""
+    """Return the topmost large level board of an object; None where there is none, or where its rim is not seen."""
     from scipy.ndimage import binary_closing, binary_fill_holes
 
     z, v = volume.centers(2), volume.voxel_m
@@ -46,10 +48,9 @@ def find_board(volume: ObjectVolume, frame: ObjectFrame) -> Board | None:
     layer = int(np.searchsorted(z, top)) - 1
     if not 0 < layer < len(z) - 1:
         return None
-    plan = binary_closing(np.pad(inside[:, :, layer] | inside[:, :, layer - 1], 2), np.ones((3, 3)), 2)[
-        2:-2, 2:-2
-    ]
-    plan = binary_fill_holes(plan)
+    layers = inside[:, :, layer] | inside[:, :, layer - 1]
+    plan = binary_closing(np.pad(layers, 2), np.ones((3, 3)), 2)[2:-2, 2:-2]
+    plan = np.asarray(binary_fill_holes(plan))
     box = np.ptp(np.percentile(frame.points[:, :2], [1, 99], axis=0), axis=0).prod()
     if plan.sum() * v * v < _LEAST_SHARE * box:
         return None
@@ -58,10 +59,11 @@ def find_board(volume: ObjectVolume, frame: ObjectFrame) -> Board | None:
 
 
 def _rim_height(volume: ObjectVolume, frame: ObjectFrame, plan: np.ndarray, top: float) -> float | None:
-    """Return how far below `top` the points on the rim of a plan (nx, ny) become few; None where they do not."""
+    """Return the thickness in metres at which the points on the rim of a plan (nx, ny) thin out; None: nowhere."""
     from scipy.ndimage import distance_transform_edt
 
-    to_rim = np.minimum(distance_transform_edt(plan), distance_transform_edt(~plan)) * volume.voxel_m
+    inner, outer = (np.asarray(distance_transform_edt(mask)) for mask in (plan, ~plan))
+    to_rim = np.minimum(inner, outer) * volume.voxel_m
     cell = np.floor((frame.points[:, :2] - volume.origin[:2]) / volume.voxel_m).astype(int)
     cell = np.clip(cell, 0, np.array(plan.shape) - 1)
     depth = top - frame.points[to_rim[tuple(cell.T)] < _RIM_M, 2]
@@ -78,12 +80,15 @@ def _rim_height(volume: ObjectVolume, frame: ObjectFrame, plan: np.ndarray, top:
 
 
 def with_underside(volume: ObjectVolume, solid: np.ndarray, board: Board) -> tuple[ObjectVolume, np.ndarray]:
-    """Return the volume with the unknown below a board's top decided, and what else of the unknown is solid.
+    """Decide the unknown voxels at and below a board: solid down to its underside, free below that.
 
     Args:
         volume: the evidence.
-        solid: bool (nx, ny, nz) unknown voxels that passed for solid.
-        board: of `find_board`.
+        solid: bool (nx, ny, nz) unknown voxels that completion made solid.
+        board: the result of `find_board`.
+
+    Returns:
+        The volume with these voxels known, and `solid` without them.
     """
     from scipy.ndimage import binary_dilation
 
@@ -93,7 +98,7 @@ def with_underside(volume: ObjectVolume, solid: np.ndarray, board: Board) -> tup
     full = solid | (volume.known & (volume.distance < 0))
     deeper = (z < lowest) & (z > lowest - max(_BELOW_M, 3.0 * volume.voxel_m))
     goes_on = full[:, :, deeper].mean(axis=2) > 0.5 if deeper.any() else np.zeros(board.plan.shape, bool)
-    open_below = board.plan & ~binary_dilation(goes_on, np.ones((3, 3)))
+    open_below = board.plan & ~np.asarray(binary_dilation(goes_on, np.ones((3, 3))), bool)
     layers = (z < board.top_m) & (z > lowest)
     decided = ~volume.known & layers
     decided &= np.where(z > under, board.plan[:, :, None], open_below[:, :, None])

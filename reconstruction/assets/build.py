@@ -1,4 +1,4 @@
-"""Stage 7: every instance becomes a closed, textured object with collision shape and mass; base surfaces get looks."""
+"""Stage 7: closed, textured objects with collision shapes and masses, and textured floor, walls and ceiling."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +9,7 @@ from reconstruction.assets import completion, solid, texture
 from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts, end_decomposer, kept_parts
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
-from reconstruction.assets.cuboids import unfreed_cuboid
+from reconstruction.assets.cuboids import fit_cuboid, unfreed_cuboid
 from reconstruction.assets.cut_off import Room, continued, cut_off_sides, lone_front, with_copies
 from reconstruction.assets.edges import with_simple_edges
 from reconstruction.assets.fused import fused_points, without_strays
@@ -42,14 +42,15 @@ from reconstruction.views import SceneViews
 from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
 
-_COVERED_SHARE = 0.75  # of what was seen, along each axis
-_FUSED_SHARE = 0.5  # of its fused surface, which has skirts
-_HUNG_SHARE = 0.9  # the fused surface of what hangs has no skirts behind it
+# Least size of a shape along each axis, relative to:
+_COVERED_SHARE = 0.75  # its seen points
+_FUSED_SHARE = 0.5  # its fused surface, which includes skirts
+_HUNG_SHARE = 0.9  # the fused surface of a hanging object, which has no skirts behind it
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that objects are built from; prepared once a scene."""
+    """Inputs shared by all objects, prepared once per scene."""
 
     posed: PosedFrames
     depth: DepthMaps  # of `posed`, metres
@@ -59,52 +60,52 @@ class Evidence:
     stands: Stands
     said: dict[
         int, MaterialChoice
-    ]  # by object: what it is made of, where something better than the table says
+    ]  # materials by object id, where a physicist answered; else the table decides
     fetched: Fetched | None  # meshes by a generator
     config: AssetsConfig
-    keep: Path | None = None  # folder of kept collision shapes
+    keep: Path | None = None  # folder of cached collision shapes
 
 
 @dataclass(frozen=True)
 class Shape:
-    """An object's closed shape, and where it came from."""
+    """An object's closed shape and its provenance."""
 
     body: Solid  # in the grid frame
     frame: ObjectFrame
     how: str
-    attempt: Attempt | None = None  # what came of generating it, whether it was used or not
-    is_box: bool = False  # because too little was seen of it
+    attempt: Attempt | None = None  # result of the generator, used or not
+    is_box: bool = False  # fallback, as too little was seen
 
     @property
     def colors(self) -> SurfaceColors | None:
-        """Return the colors of what no frame saw, in world space."""
+        """Return the generator's colors for unseen surface, in world space."""
         return None if self.attempt is None else self.attempt.colors
 
     @property
     def provenance(self) -> str:
-        """Say how the shape was made, and what became of a generated one."""
-        unused = self.attempt is not None and self.attempt.body is None
-        return f"{self.how}; {self.attempt.how}" if unused else self.how
+        """Return how the shape was made, and why a generated one was not used."""
+        if self.attempt is None or self.attempt.body is not None:
+            return self.how
+        return f"{self.how}; {self.attempt.how}"
 
 
 def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
     views: SceneViews | None = None, keep: Path | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
-    """Build a complete asset for every object, and textured surfaces for floor and walls.
+    """Build a complete asset for every object, and textured rectangles for floor and walls.
 
-    One object that cannot be completed never stops the others: it becomes a box, which is noted and recorded in its
-    provenance.
+    An object that cannot be completed becomes a box, with a note and in its provenance; the others go on.
 
     Args:
-        posed: Frames in world space.
-        depth: Their depth maps in metres.
-        surface: The fused surface; objects are fused again, finer, from the depth maps. Of it, the free space counts.
-        instances: The things and which pixels show them.
-        config: Resolution, budgets and limits.
-        views: What a generator and a vision-language model are shown of the objects; None: keyframes.
-        keep: Folder in which collision shapes are kept by mesh; None: they are made anew.
-        progress: Told of every object.
+        posed: keyframes in world space.
+        depth: their depth maps, metres.
+        surface: the fused surface with its free space; objects are fused again, finer, from the depth maps.
+        instances: the instances and their pixels.
+        config: resolution, budgets and limits.
+        views: views of the objects for a generator and a vision-language model; None: keyframes.
+        keep: folder that caches collision shapes by mesh; None: no cache.
+        progress: advanced with every object.
 
     Returns:
         All assets, in the order of `instances`.
@@ -128,7 +129,7 @@ def gather_evidence(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, found: InstanceSet, config: AssetsConfig,
     progress: Progress, views: SceneViews | None = None,
 ) -> Evidence:  # fmt: skip
-    """Prepare what all objects share; asks the generator and whoever knows materials, if there are any."""
+    """Prepare the shared inputs; asks the generator and the physicist, if there are any."""
     pixels = prepare_pixels(posed, depth, found.id_maps)
     pixels = without_strays(pixels, posed, depth.camera, surface, found)
     stands = find_stands(posed, depth, pixels, found)
@@ -140,7 +141,7 @@ def gather_evidence(
 
 
 def build_object(item: Instance, scene: Evidence, progress: Progress) -> ObjectAsset:
-    """Build one asset: shape, looks, collision, physics. What fails on one shape is done again with a box."""
+    """Build one asset: shape, texture, collision, physics. After a failure, build it as a box."""
     name = f"object {item.id} ({item.label})"
     try:
         shape = object_shape(item, scene)
@@ -149,8 +150,8 @@ def build_object(item: Instance, scene: Evidence, progress: Progress) -> ObjectA
         if shape.attempt is not None and shape.attempt.rejected:
             progress.note(f"{name}: {shape.attempt.how}; the embedded completion stands in")
         return _finish_object(item, shape, scene, progress)
-    # Compiled geometry libraries raise whatever they like on a degenerate shape, and one object must not cost the
-    # scene; running out of memory, or of what the machine must have, is no property of the object.
+    # Compiled geometry libraries raise anything on a degenerate shape, and one object must not fail the scene. Missing
+    # memory or software is no property of the object.
     except (MemoryError, EnvironmentMissing):
         raise
     except Exception as error:
@@ -159,10 +160,10 @@ def build_object(item: Instance, scene: Evidence, progress: Progress) -> ObjectA
 
 
 def _finish_object(item: Instance, shape: Shape, scene: Evidence, progress: Progress) -> ObjectAsset:
-    """Give a solid its looks, collision shape and mass."""
+    """Give a solid its texture, collision shape and mass."""
     body, world_from_object = to_object_space(shape.body, shape.frame)
     levels = [s.level_m - float(world_from_object[2, 3]) for s in scene.stands.on(item.id) if s.known]
-    visual, baked = _looks(item, body, world_from_object, shape.colors, scene)
+    visual, baked = _bake(item, body, world_from_object, shape.colors, scene)
     choice = choice_for(item, scene.said, baked.mean_rgb, body.extents)
     return ObjectAsset(
         id=item.id,
@@ -192,17 +193,18 @@ def _collision(
     return kept_parts(scene.keep, body, scene.config, levels=levels, progress=progress, name=name)
 
 
-def _looks(
+def _bake(
     item: Instance, body: Solid, world_from_object: np.ndarray, colors: SurfaceColors | None, scene: Evidence
 ) -> tuple[TexturedMesh, texture.Baked]:
-    """Bake a solid's texture."""
+    """Unwrap a solid and bake its texture."""
     mapping, faces, uvs = texture.unwrap(body.vertices, body.faces)
     vertices = body.vertices[mapping]
     away = scene.posed.world_from_camera[:, :3, 3] - world_from_object[:3, 3]
     distance = np.linalg.norm(away, axis=1).min()
     tolerance = float(0.006 + 3 * scene.pixels.noise_relative * distance + 0.01 * body.extents.max())
+    world = transform_points(world_from_object, vertices)
     baked = texture.bake_object(
-        transform_points(world_from_object, vertices),
+        world,
         faces,
         uvs,
         item.id,
@@ -222,29 +224,26 @@ def _appearance(baked: texture.Baked, shape: Shape) -> str:
 
 
 def to_object_space(body: Solid, frame: ObjectFrame) -> tuple[Solid, np.ndarray]:
-    """Shift a solid of the grid frame so that its origin is at the bottom centre; return world_from_object too."""
-    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    """Shift a solid of the grid frame to object space, origin at its bottom center; return world_from_object too."""
+    low, high = body.bounds
     origin = np.array([*(low + high)[:2] / 2, low[2]])
-    return with_simple_edges(Solid(body.vertices - origin, body.faces)), frame.world_from_grid @ rigid(
-        translation=origin
-    )
+    moved = with_simple_edges(Solid(body.vertices - origin, body.faces))
+    return moved, frame.world_from_grid @ rigid(translation=origin)
 
 
 def object_shape(item: Instance, scene: Evidence) -> Shape:
-    """Return an object's closed shape in its grid frame, that frame, and how the shape was made."""
-    config, stands = scene.config, scene.stands
-    seen = stands.seen[item.id]
+    """Return an object's closed shape: a slab or front where one fits, else from its fused volume."""
+    config, seen = scene.config, scene.stands.seen[item.id]
+    camera = scene.depth.camera
     if is_outlined(item, seen.points):
-        return Shape(
-            *outlined_slab(item, scene.posed, scene.depth.camera, scene.found, config), "outline+slab"
-        )
+        return Shape(*outlined_slab(item, scene.posed, camera, scene.found, config), "outline+slab")
     if len(seen.points) < config.min_points:
         return box_fallback(item, seen.points)
-    frame = frame_object(item, seen, stands.level(item.id), scene.found)
-    hanging = hanging_slab(item.id, frame, scene.posed, scene.depth.camera, scene.found, config)
+    frame = frame_object(item, seen, scene.stands.level(item.id), scene.found)
+    hanging = hanging_slab(item.id, frame, scene.posed, camera, scene.found, config)
     if hanging is not None:
         return Shape(hanging.body, frame, "observed+slab" + ("+completed" if hanging.completed else ""))
-    room = Room(scene.posed, scene.depth.camera, scene.depth.depth, scene.surface, scene.found)
+    room = Room(scene.posed, camera, scene.depth.depth, scene.surface, scene.found)
     front = lone_front(item.id, frame, seen, room)
     if front is not None:
         return Shape(front, frame, "observed+front")
@@ -255,9 +254,9 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     furniture = float(np.ptp(frame.points, axis=0).max()) > config.furniture_m
     if not sides:
         frame = confirmed(frame, volume)
-    # A container's rim may be close to what it holds; a table has none.
+    # A container's rim may be close to its content; a table has no rim.
     grow = max(2.0 * volume.noise_m, volume.voxel_m, 0.012 if furniture else 0.004)
-    volume = without_children(volume, frame, stands.on(item.id), min(grow, 0.02))
+    volume = without_children(volume, frame, scene.stands.on(item.id), min(grow, 0.02))
     volume = within_walls(continued(volume, sides), frame, scene.found)
     attempt = None
     if scene.fetched is not None:
@@ -265,15 +264,7 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
         attempt = generated_shape(item.id, scene.fetched, frame, volume, space, config, furniture=furniture)
         if attempt is not None and attempt.body is not None:
             return Shape(attempt.body, frame, attempt.how, attempt)
-    body, how = embedded_solid(volume, frame, config, furniture=furniture)
-    if frame.wall_y is not None:
-        fused = fused_points(item.id, frame, scene.surface, scene.found)
-        if len(fused) and not _covers(body, fused, _HUNG_SHARE, outer=1.0):
-            body, how = relief(fused, frame.wall_y, config), "observed+relief"
-    elif not furniture:
-        seen_points = _seen_of(item.id, body, frame, scene)
-        if not _covers(body, seen_points):
-            body, how = mound(seen_points, config), "observed+relief"
+    body, how = _embedded_shape(item.id, volume, frame, scene, furniture=furniture)
     if body is None:
         return box_fallback(item, seen.points)
     if furniture and frame.wall_y is None:
@@ -283,21 +274,29 @@ def object_shape(item: Instance, scene: Evidence) -> Shape:
     return Shape(body, frame, how + "+continued" * bool(sides), attempt)
 
 
-def _seen_of(item: int, body: Solid | None, frame: ObjectFrame, scene: Evidence) -> np.ndarray:
-    """Return the points (k, 3), grid frame, that a small thing's shape must cover.
-
-    Of a thing that is a few pixels in each frame, borders that snap to edges of color leave next to nothing: where its
-    shape is less than half as large as its fused surface, that counts.
-    """
+def _embedded_shape(
+    item: int, volume: ObjectVolume, frame: ObjectFrame, scene: Evidence, *, furniture: bool
+) -> tuple[Solid | None, str]:
+    """Return the embedded completion, or a relief where it is smaller than what was seen."""
+    body, how = embedded_solid(volume, frame, scene.config, furniture=furniture)
+    if furniture and frame.wall_y is None:
+        return body, how
     fused = fused_points(item, frame, scene.surface, scene.found)
+    if frame.wall_y is not None:
+        if len(fused) and not _covers(body, fused, _HUNG_SHARE, outer=1.0):
+            return relief(fused, frame.wall_y, scene.config), "observed+relief"
+        return body, how
+    # Instance borders snap to color edges, which leaves next to nothing of an object of few pixels: then its fused
+    # surface counts as what was seen.
     enough = len(fused) == 0 or _covers(body, fused, _FUSED_SHARE)
-    return frame.points if enough else fused
+    points = frame.points if enough else fused
+    return (body, how) if _covers(body, points) else (mound(points, scene.config), "observed+relief")
 
 
 def embedded_solid(
     volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig, *, furniture: bool
 ) -> tuple[Solid | None, str]:
-    """Return the embedded completion of what was seen, and how it was made; None where nothing solid comes of it."""
+    """Return the completion of what was seen (`completion.complete`) and how it was made; None where it is empty."""
     field = completion.complete(volume, frame, config, furniture=furniture)
     body = solid.extract(field, frame.points)
     if field.symmetries and not _covers(body, frame.points):
@@ -307,7 +306,7 @@ def embedded_solid(
         return None, ""
     if frame.wall_y is None:
         tolerance = max(0.003, 1.5 * volume.noise_m, 0.8 * volume.voxel_m)
-        cuboid = solid.fit_cuboid(frame.points, frame.normals, body, tolerance)
+        cuboid = fit_cuboid(frame.points, frame.normals, body, tolerance)
         if cuboid is None:
             cuboid = unfreed_cuboid(volume, frame, tolerance)
         if cuboid is not None:
@@ -322,7 +321,7 @@ def embedded_solid(
 def _covers(
     body: Solid | None, points: np.ndarray, share: float = _COVERED_SHARE, outer: float = 3.0
 ) -> bool:
-    """Tell whether a body is as large as what was seen: a wrong symmetry frees what was there, as do few pixels."""
+    """Tell whether a body is about as large as the points: wrong symmetries and thin evidence carve too much."""
     if body is None:
         return False
     seen = np.ptp(np.percentile(points, [outer, 100 - outer], axis=0), axis=0)
@@ -330,9 +329,9 @@ def _covers(
 
 
 def box_around(frame: ObjectFrame, points: np.ndarray) -> Shape:
-    """Return the box, standing, of points (k, 3) on the fused surface of furniture, grid frame.
+    """Return the box around fused points (k, 3) of furniture, grid frame.
 
-    Of a shelf at the rim of a few frames, one post is all that id maps show; its edges tell how far it goes.
+    Of a shelf at the border of a few frames, id maps may show one post only; the fused surface tells its extent.
     """
     low, high = np.percentile(points, [1, 99], axis=0)
     low[2] = min(low[2], 0.0) if frame.on_support else low[2]
@@ -340,7 +339,7 @@ def box_around(frame: ObjectFrame, points: np.ndarray) -> Shape:
 
 
 def box_fallback(item: Instance, points: np.ndarray) -> Shape:
-    """Return a box of the instance's extents standing where it was seen."""
+    """Return a box of the instance's extents, where the instance is."""
     size = np.maximum(np.nan_to_num(item.extents_m, nan=0.02), 0.01)
     c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])

@@ -1,8 +1,8 @@
-"""From what was seen of an object to a closed signed distance field.
+"""Completion of an object's volume to a closed signed distance field.
 
-The seen surface is kept. The unknown is closed by contact with the support, by symmetry, and by space carving: what
-no ray has freed, inside the hull of what was seen, is solid where seen surface encloses it, and empty where it only
-lies in the shadow of an overhang (below a table top, between boards).
+Seen surface is kept. Unknown voxels are decided by contact with the support, by symmetry, and by space carving: those
+that no ray freed, inside the hull of the seen points, are solid where seen surface encloses them, and empty where they
+only lie in the shadow of an overhang (below a table top, between boards).
 """
 
 from dataclasses import dataclass, replace
@@ -16,24 +16,24 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.rim_artifacts import without_whiskers
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 
-_HIDDEN_M = 0.02  # of a foot
-_RIM_DIRECTIONS = 6  # of 8: what has more than its own height in so many directions lies within a rim
+_HIDDEN_M = 0.02  # an object whose seen points start higher has an occluded foot
+_RIM_DIRECTIONS = 6  # of 8 in which taller voxels surround a low one: it lies within the object's rim
 
 
 @dataclass(frozen=True)
 class CompletedField:
-    """A signed distance field without unknowns."""
+    """A signed distance field without unknown voxels."""
 
     origin: np.ndarray  # float64 (3,) corner of voxel (0, 0, 0), grid frame
     voxel_m: float
     distance: np.ndarray  # float32 (nx, ny, nz), positive outside
-    symmetries: tuple[str, ...]
+    symmetries: tuple[str, ...]  # applied ones with their scores
 
 
 def complete(
     volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig, *, furniture: bool
 ) -> CompletedField:
-    """Close the unknown part of an object's volume."""
+    """Decide the unknown voxels of an object's volume; see the module."""
     volume = _settle_on_support(volume, frame)
     names: list[str] = []
     if config.symmetry and frame.wall_y is None:
@@ -56,9 +56,9 @@ def complete(
 
 
 def _settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume:
-    """Nothing of the object is below its support, and it goes straight down where it meets it.
+    """Free everything below the support, and extend the object straight down to it.
 
-    Just above the support nothing can be told free (noise), so that the layer above is carried down.
+    Noise hides free space just above the support: unknown voxels there take the value above them.
     """
     if frame.wall_y is not None:
         return volume
@@ -73,43 +73,35 @@ def _settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume
             free[:, :, k][carry] = free[:, :, k + 1][carry]
             known[:, :, k] |= carry
         _drop_skirts(distance, known, free, volume, frame, first)
-    distance[:, :, :first] = volume.trunc_m
-    known[:, :, :first] = True
-    free[:, :, :first] = True
+    distance[:, :, :first], known[:, :, :first], free[:, :, :first] = volume.trunc_m, True, True
     return replace(volume, distance=distance, known=known, free=free)
 
 
 def _drop_skirts(
-    distance: np.ndarray,
-    known: np.ndarray,
-    free: np.ndarray,
-    volume: ObjectVolume,
-    frame: ObjectFrame,
-    first: int,
-) -> None:
-    """Free what lies flat on the support around the object: support surface that was labelled as the object.
+    distance: np.ndarray, known: np.ndarray, free: np.ndarray, volume: ObjectVolume, frame: ObjectFrame, first: int
+) -> None:  # fmt: skip
+    """Free (in place) support surface around the object that was labeled as the object.
 
-    Depth is uncertain at outlines, so that a rim of the support within the noise counts as object there. What lies
-    flat within the object's own rim is its floor, and so is what something stands on.
+    It is low and outside the object's rim, as depth noise at occlusion boundaries leaves it. Low voxels within the rim
+    are the object's floor; so are columns that children stand on.
     """
     height = max(3.0 * volume.noise_m, 2.0 * volume.voxel_m)
     if float(np.percentile(frame.points[:, 2], 98)) < 3.0 * height:
         return
     last = first + int(np.ceil(height / volume.voxel_m))
-    taller = ((distance[:, :, last:] < 0) & known[:, :, last:]).any(axis=2)
-    # Below unseen space there may still be object.
+    taller = np.any((distance[:, :, last:] < 0) & known[:, :, last:], axis=2, keepdims=True)
+    # Unseen space above may hide the object.
     hidden = (~known[:, :, last : last + 2]).any(axis=2)
-    within = _directions_met(~taller[:, :, None], taller[:, :, None])[:, :, 0] >= _RIM_DIRECTIONS
-    skirt = ~taller & ~hidden & ~within
+    within = _directions_met(~taller, taller) >= _RIM_DIRECTIONS
+    skirt = ~(taller | within)[:, :, 0] & ~hidden
     if volume.carrying is not None:
         skirt &= ~volume.carrying
-    for k in range(first, last):
-        distance[:, :, k][skirt] = volume.trunc_m
-        known[:, :, k][skirt] = True
-        free[:, :, k][skirt] = True
+    low = np.s_[first:last]
+    distance[skirt, low], known[skirt, low], free[skirt, low] = volume.trunc_m, True, True
 
 
 def _apply_symmetries(volume: ObjectVolume, frame: ObjectFrame) -> tuple[ObjectVolume, list[str]]:
+    """Complete a volume by rotation symmetry, else by mirror symmetries; return it with what was applied."""
     axis = symmetry.fit_axis(frame.points, frame.normals)
     if axis is not None and np.linalg.norm(axis) < 0.35 * np.ptp(frame.points[:, :2], axis=0).max():
         distance, known, score = symmetry.rotate_complete(volume, axis, frame.points, frame.normals)
@@ -126,7 +118,7 @@ def _apply_symmetries(volume: ObjectVolume, frame: ObjectFrame) -> tuple[ObjectV
 
 
 def hull_region(volume: ObjectVolume, points: np.ndarray, *, to_support: bool) -> np.ndarray:
-    """Voxels (nx, ny, nz) within a polyhedron of 74 directions around the seen points and their feet."""
+    """Return the voxels (nx, ny, nz) in the discrete hull, of 74 directions, of points (k, 3) and their feet."""
     if to_support:
         feet = points.copy()
         feet[:, 2] = np.minimum(feet[:, 2], 0.0)
@@ -145,9 +137,9 @@ def hull_region(volume: ObjectVolume, points: np.ndarray, *, to_support: bool) -
 
 
 def enclosed(volume: ObjectVolume, hull: np.ndarray, needed: int) -> np.ndarray:
-    """Unknown voxels of the hull that meet the inside of the object in `needed` of 8 horizontal directions.
+    """Return the unknown voxels of the hull that are enclosed: in `needed` of 8 horizontal directions.
 
-    In each direction the first voxel that is not unknown decides: inside of seen surface, or free space.
+    In each direction the first voxel that is not unknown decides: inside the object, or free.
     """
     unknown = ~volume.known & hull
     inside = volume.known & (volume.distance < 0)
@@ -155,7 +147,7 @@ def enclosed(volume: ObjectVolume, hull: np.ndarray, needed: int) -> np.ndarray:
 
 
 def _directions_met(unknown: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return in how many of 8 horizontal directions (nx, ny, nz) the first voxel that is not unknown is inside."""
+    """Return in how many of 8 horizontal directions the first voxel that is not unknown is inside: (nx, ny, nz)."""
     count = np.zeros(unknown.shape, np.uint8)
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         count += _meets(unknown, inside, dx, dy)
@@ -163,7 +155,7 @@ def _directions_met(unknown: np.ndarray, inside: np.ndarray) -> np.ndarray:
 
 
 def _meets(unknown: np.ndarray, inside: np.ndarray, dx: int, dy: int) -> np.ndarray:
-    """Whether the first voxel in direction (dx, dy) that is not unknown is inside, per voxel."""
+    """Return whether the first voxel in direction (dx, dy) that is not unknown is inside, per voxel."""
     if dx == 0:
         return _meets(unknown.swapaxes(0, 1), inside.swapaxes(0, 1), dy, 0).swapaxes(0, 1)
     out = inside.copy()
@@ -184,57 +176,53 @@ def _meets(unknown: np.ndarray, inside: np.ndarray, dx: int, dy: int) -> np.ndar
 def _contact(
     volume: ObjectVolume, hull: np.ndarray, frame: ObjectFrame, closed: np.ndarray, *, furniture: bool
 ) -> np.ndarray:
-    """Unknown voxels between the object and its support close below: seen surface ends there, so it stands there."""
+    """Return the unknown voxels between an object's seen surface and its support: objects stand, they do not float."""
     size = np.percentile(frame.points, 99, axis=0) - np.percentile(frame.points, 1, axis=0)
     reach = 0.03 if furniture else max(0.03, 0.4 * float(size[:2].min()))
     solid_above = volume.known & (volume.distance < 0)
     lowest = float(np.percentile(frame.points[:, 2], 1))
     if not frame.on_support:
         reach = min(reach, 0.02)
-    elif not furniture and lowest > _HIDDEN_M:  # a rim hides its foot, and nothing floats
+    elif not furniture and lowest > _HIDDEN_M:  # a rim occludes its foot
         reach = max(reach, lowest + 2 * volume.voxel_m)
         solid_above |= closed
     layers = min(int(np.ceil(reach / volume.voxel_m)), volume.distance.shape[2] - 1)
     z = volume.centers(2)
     first = int(np.searchsorted(z, 0.0))
-    out = np.zeros(volume.distance.shape, bool)
-    # Walk each column upwards from the support: if only unknown lies between it and the object, it is solid.
+    # Walk each column up from the support: where only unknown lies between it and the object, that is solid.
     open_column = np.ones(volume.distance.shape[:2], bool)
-    reached = np.zeros(volume.distance.shape[:2], bool)
     height = np.zeros(volume.distance.shape[:2], np.int32)
     for k in range(first, min(first + layers + 1, volume.distance.shape[2])):
         hit = open_column & solid_above[:, :, k]
-        reached |= hit
         height[hit] = k
         open_column &= ~volume.known[:, :, k] & ~hit
-    for k in range(first, min(first + layers + 1, volume.distance.shape[2])):
-        out[:, :, k] = reached & (k < height) & ~volume.known[:, :, k]
-    return out & hull
+    layer = np.arange(volume.distance.shape[2])
+    return (layer >= first) & (layer < height[:, :, None]) & ~volume.known & hull
 
 
 def _behind_to_wall(volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig) -> np.ndarray:
-    """For things that hang: solid from the seen front to the wall, at least as thick as `flat_thickness_m`."""
+    """Return the solid voxels of a hanging object: from its seen front to the wall, at least `flat_thickness_m`."""
+    assert frame.wall_y is not None
     y = volume.centers(1)
     surface = volume.known & (volume.distance < 0)
     seen = surface.any(axis=1)
     front = np.where(seen, y[np.argmax(surface, axis=1)], np.inf)
-    wall = frame.wall_y if frame.wall_y is not None else float(y[-1])
-    back = np.maximum(wall, front + config.flat_thickness_m)
+    back = np.maximum(frame.wall_y, front + config.flat_thickness_m)
     slab = (y[None, :, None] >= front[:, None, :]) & (y[None, :, None] <= back[:, None, :])
     return slab & ~volume.free
 
 
 def _keep_shells(field: np.ndarray, volume: ObjectVolume, config: AssetsConfig) -> np.ndarray:
-    """Limit what lies behind a one-sided shell to solid of at least the minimum thickness (already in the band)."""
+    """Clip the field to about the minimum thickness inside and two voxels outside."""
     return np.clip(field, -2.0 * max(volume.voxel_m, 0.5 * config.min_thickness_m), 2.0 * volume.voxel_m)
 
 
 def _blend(field: np.ndarray, volume: ObjectVolume, frame: ObjectFrame) -> np.ndarray:
-    """Smooth within the noise where seen, and by two voxels where closed, then cut flat at the support."""
+    """Smooth by the noise where seen and by two voxels where completed, then cut flat at the support."""
     sigma_seen = float(np.clip(0.7 * volume.noise_m / volume.voxel_m, 0.0, 2.0))
     seen = gaussian_filter(field, sigma_seen) if sigma_seen > 0.3 else field
     if frame.wall_y is None:
-        # The cut must not round the bottom edge off: continue the field below it first.
+        # Continue the field below the cut first, so that smoothing does not round the bottom edge.
         first = int(np.searchsorted(volume.centers(2), 0.0))
         if 0 < first < field.shape[2]:
             field = field.copy()

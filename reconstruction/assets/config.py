@@ -3,35 +3,35 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-LEAST_HULLS = 6  # of an object, whatever the scene's budget
+LEAST_HULLS = 6  # convex pieces of each object, whatever the scene's budget
 
 
 @dataclass(frozen=True)
 class AssetsConfig:
-    """How complete, textured objects with physics are made from what the video saw."""
+    """How objects are completed, textured and given physics."""
 
     voxel_min_m: float = 0.002
-    """Finest voxel of an object's volume."""
+    """Finest voxel of an object's volume, metres."""
     cells_along_longest: int = 72
     """Voxels along the longest side of a small object; furniture is limited by `max_voxels`."""
     max_voxels: int = 1_100_000
     """Memory and time limit of one object's volume; larger objects get coarser voxels."""
     min_points: int = 60
-    """Objects with fewer depth pixels over all frames become boxes."""
+    """Objects with fewer depth pixels in all frames become boxes."""
     min_thickness_m: float = 0.004
-    """Seen shells whose other side was not seen become at least this thick (and at least two voxels)."""
+    """Least thickness of surface that was seen from one side only (two voxels at least), metres."""
     flat_thickness_m: float = 0.025
-    """Thickness given to things that are flush with a wall: that of a framed picture."""
+    """Least thickness of objects flat on a wall, metres: that of a framed picture."""
     symmetry: bool = True
-    """Complete by rotation and mirror symmetry where what was seen agrees."""
+    """Complete by rotation and mirror symmetry where the seen surface agrees."""
     enclosed_directions: int = 3
-    """An unseen voxel is solid if it meets the inside of seen surface in this many of 8 horizontal directions."""
+    """An unknown voxel is solid if seen surface encloses it in this many of 8 horizontal directions."""
     faces_small: int = 4000
     """Face budget of an object below `furniture_m`."""
     faces_furniture: int = 9000
     """Face budget of a larger object."""
     furniture_m: float = 0.5
-    """Longest side from which a thing counts as furniture: unseen space below overhangs stays empty."""
+    """Longest side from which an object counts as furniture: unseen space below overhangs stays empty."""
     texture_min_px: int = 128
     """Smallest side of an object's square texture."""
     texture_max_px: int = 1024
@@ -45,58 +45,58 @@ class AssetsConfig:
     hulls_furniture: int = 28
     """Most convex pieces of furniture."""
     hulls_ring: int = 32
-    """Most convex pieces of the walls of a container, which are cut by upright and level planes."""
+    """Most convex pieces of the walls of a container, which are cut by vertical and horizontal planes."""
     hulls_scene: int = 800
-    """Convex pieces of all objects: where they would be more, what comes last gets fewer, but 6 each."""
+    """Convex pieces of all objects together; when they run out, the last objects get fewer, but 6 each."""
     convex_enough: float = 0.93
     """Solids that fill this share of their convex hull collide as that hull."""
     dent_share: float = 0.12
-    """So are solids whose dents are shallower than this share of their middle extent (noise), …"""
+    """So do solids with dents shallower than this share of their middle extent (noise) …"""
     dent_limit_m: float = 0.012
-    """… and than this."""
+    """… and than this, metres."""
     collision_faces: int = 600
     """Faces of the decimated mesh that is decomposed."""
     coacd_threshold: float = 0.1
-    """Concavity at which CoACD stops cutting; hollow things use 0.6 of it."""
+    """Concavity at which CoACD stops cutting; 0.6 of it for hollow objects."""
     hull_vertices: int = 48
     """Most vertices of one convex piece (PhysX allows 255)."""
-    physics: Literal["table", "vlm"] = "table"
-    """Who says what things are made of and weigh: `table` by label, color and size; `vlm` asks an OpenAI-compatible
-    endpoint (see `SIMRECON_VLM_URL`), object by object, and the table decides where it has no usable answer."""
+    physics: Literal["table", "vlm"] | str = "table"
+    """Source of materials and masses: `table` by label, color and size; `vlm` asks an OpenAI-compatible endpoint
+    (see `SIMRECON_VLM_URL`) about each object, and the table decides where there is no usable answer."""
     physics_model: str = ""
     """For `vlm`: the model's name at the endpoint; empty is `SIMRECON_VLM_MODEL`."""
     seed: int = 0
     """Seed of the decomposition, and of a generator."""
-    generator: Literal["none", "rodin", "hunyuan3d", "trellis", "sam3d"] = "none"
-    """Who completes objects from pictures of them (docs/generation.md): a service (rodin costs credits), Hunyuan3D's
-    own server, or a model on this machine. What disagrees with the video is rejected, the embedded way stands in."""
+    generator: Literal["none", "rodin", "hunyuan3d", "trellis", "sam3d"] | str = "none"
+    """Generator that completes objects from pictures (docs/generation.md): a service (rodin costs credits), Hunyuan3D's
+    own server, or a model on this machine. Meshes that disagree with the video are rejected for the own completion."""
     generator_url: str = ""
-    """Address of the service; empty: Rodin's own, SIMRECON_HUNYUAN3D_URL or http://localhost:8081 for hunyuan3d."""
+    """Address of the service; empty: Rodin's own; SIMRECON_HUNYUAN3D_URL or http://localhost:8081 for hunyuan3d."""
     generator_model: str = ""
     """Rodin's tier (Gen-2), TRELLIS' weights (a name or a folder), or the pipeline.yaml of SAM 3D Objects; for
-    hunyuan3d only a name that tells kept meshes of several models apart."""
+    hunyuan3d only a name that keeps cached meshes of several models apart."""
     generator_views: int = 1
-    """Most pictures of an object that are shown to the generator (hunyuan3d and sam3d take one)."""
+    """Most pictures of an object that the generator gets (hunyuan3d and sam3d take one)."""
     generator_texture: bool = True
-    """Have hunyuan3d paint the mesh, too (a Hunyuan3D-2 server does with --enable_tex alone)."""
+    """Let hunyuan3d texture the mesh, too (a Hunyuan3D-2 server does so with --enable_tex alone)."""
     generator_poll: bool = False
-    """Ask hunyuan3d by /send and /status, where something in between cuts long requests."""
+    """Ask hunyuan3d by /send and /status, for proxies that cut long requests."""
     generator_budget: float = 0.0
-    """Credits that one run may spend. What would go beyond is not sent, and said."""
+    """Credits that one run may spend; objects beyond it are not sent, with a note."""
     generator_timeout_s: float = 900.0
-    """Time limit of one object's generation."""
+    """Time limit of one object's generation, seconds."""
     generator_max_mb: float = 100.0
-    """Largest mesh file that is taken."""
+    """Largest mesh file that is accepted, MB."""
     generator_missed: float = 0.15
-    """A mesh is rejected if a larger share of what was seen is farther from it than 1 cm and 3 % of the object."""
+    """A mesh is rejected if a larger share of the seen points is farther from it than 1 cm and 3 % of the object."""
     generator_intruding: float = 0.1
-    """A mesh is rejected if a larger share of its surface lies as deep in space that rays passed through."""
+    """A mesh is rejected if a larger share of its surface is deeper than that in free space."""
     generator_filling: float = 0.05
-    """A mesh is rejected if a larger share of its volume is space that rays passed through, as deep inside of the
-    mesh: that is one that fills the space below a table, or a bowl."""
+    """A mesh is rejected if a larger share of its volume, deeper than that inside the mesh, is free space: one that
+    fills the space below a table, or a bowl."""
 
     def with_hulls(self, most: int) -> "AssetsConfig":
-        """Return the config with no more than so many convex pieces for one object, but `LEAST_HULLS`."""
+        """Return the config with at most `most` convex pieces for one object, but `LEAST_HULLS` at least."""
         most = max(most, LEAST_HULLS)
         return replace(
             self,

@@ -1,11 +1,11 @@
-"""Things that the picture's edge cuts off: they go on where no frame looked, as far as what was seen of them says.
+"""Objects that image borders crop: extrapolation into space that no frame shows.
 
-A side is cut off where no frame shows anything beyond it, and what was seen farthest out on it was seen at the edge of
-the picture. Plates at equal distances (the boards of a shelf) go on at that distance, to the next one. Anything else
-keeps its last section, and becomes as long as it is deep: furniture seldom is shorter. A lone upright side of a thing
-that stands is no sheet: it is the front of something, taken to be as deep as it is wide.
+A side is cropped where its outermost points were seen at the image border and no frame shows anything beyond it.
+Equally spaced plates (the boards of a shelf) continue to the next one. Otherwise the last cross-section is repeated
+until the object is as long as it is deep: furniture seldom is shorter. A lone upright rectangle on a support is the
+front of a box, taken to be as deep as it is wide.
 
-Nothing grows through a wall, through another thing, or into space that a ray passed through.
+Extrapolation ends at walls, other objects and free space.
 """
 
 from dataclasses import dataclass, replace
@@ -13,65 +13,66 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.assets.solid import Solid, box_solid
-from reconstruction.assets.views import SeenPoints
+from reconstruction.assets.views import SeenPoints, pixels_of
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 from reconstruction.core.types import Camera, InstanceSet, PosedFrames, Surface
 from registry.geometry import invert_rigid, transform_points
 
-_OUTER_PERCENT = 97.0  # what lies beyond is the outermost of a side
-_EDGE_SHARE = 0.04  # of the image's width
-_AT_EDGE = 0.5  # of the outermost points must have been seen at the image's edge
-_BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02
-_MIN_WITNESSES, _PROBES = 2, 200
-_CLEAR = 0.97  # of a probe's depth: what was measured nearer hides it
-_MIN_SIZE_M = 0.25  # smaller things say too little of their sides
-_GAIN_SHARE = 0.08  # less is not worth a guess
-_SLICES, _DENSE = 40, 0.3  # along an axis, and the least share of the usual density to be well seen
-_SECTION_SHARE, _MIN_SECTION_M = 0.15, 0.03  # of what was seen is the last section
-_FACING, _MIN_FACING = 0.8, 100
+_OUTER_PERCENT = 97.0  # points beyond this percentile along an axis are the outermost
+_EDGE_SHARE = 0.04  # of the image's width: the border
+_AT_EDGE = 0.5  # least share of the outermost points seen at the border
+_BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02  # distance of the probes from a side
+_MIN_WITNESSES, _PROBES = 2, 200  # frames, points
+_CLEAR = 0.97  # of a probe's depth: what was measured nearer occludes it
+_MIN_SIZE_M = 0.25  # smaller objects are not extended
+_GAIN_SHARE = 0.08  # smaller extensions are dropped
+_SLICES, _DENSE = 40, 0.3  # of an axis; least point density of a well seen slice, relative to the median
+_SECTION_SHARE, _MIN_SECTION_M = 0.15, 0.03  # length of the last cross-section
+_FACING, _MIN_FACING = 0.8, 100  # least cosine to the axis; points
 _PLATE_CELL_M, _PLATE_SHARE, _MIN_PLATES = 0.03, 0.03, 3  # boards at eye level show little of their faces
-_PLATE_M = 0.02  # its thickness: of some the lower side was seen
-_SPACING, _PAST_PLATE = 0.15, 0.2  # how equal distances are, and how far beyond the last plate it must go on
-_SHEET_SHARE, _SHEET_FACING, _SHEET_FILLED, _SHEET_CELLS = 0.15, 0.6, 0.75, 12
-_STEP_M, _FREE_SHARE, _INSIDE_M = 0.02, 0.3, 0.03
-_IN_THE_WAY = 5  # points of another thing
+_PLATE_M = 0.02  # thickness of a plate, of some of which the lower side was seen
+_SPACING, _PAST_PLATE = (
+    0.15,
+    0.2,
+)  # greatest relative deviation of gaps; least extent beyond the last plate, in gaps
+_SHEET_SHARE = 0.15  # greatest thickness of a lone front, relative to its smaller side
+_SHEET_FACING, _SHEET_FILLED, _SHEET_CELLS = (
+    0.6,
+    0.75,
+    12,
+)  # share of points facing one way, of cells filled; cells
+_STEP_M, _FREE_SHARE, _INSIDE_M = 0.02, 0.3, 0.03  # of the march into free space
+_IN_THE_WAY = 5  # surface vertices of another object
 
 
 @dataclass(frozen=True)
 class CutOff:
-    """One side of a thing that the picture's edge cuts off, in the grid frame."""
+    """One cropped side of an object, in the grid frame; coordinates are multiplied by `sign`."""
 
     axis: int
     sign: int  # +1: towards larger coordinates
-    cut: float  # up to here it was seen, times `sign`
-    end: float  # here it is taken to end, times `sign`
-    period: float  # what lies this far before is repeated
+    cut: float  # it was seen up to here
+    end: float  # it is extended to here
+    period: float  # length of the part before the cut that is repeated
 
     def source(self, coordinate: np.ndarray) -> np.ndarray:
-        """Return where what is beyond the cut is copied from; both along the axis, times `sign`."""
+        """Return where the content at coordinates beyond the cut is copied from."""
         return coordinate - self.period * np.ceil(np.maximum(coordinate - self.cut, 0.0) / self.period)
 
 
 @dataclass(frozen=True)
 class Room:
-    """What a thing is surrounded by, and the frames that show it."""
+    """The surroundings of an object, and the frames that show it."""
 
     posed: PosedFrames
     camera: Camera  # of the instance maps
-    depth: np.ndarray  # float32 (n, h, w) measured there
+    depth: np.ndarray  # float32 (n, h, w) of that camera, metres
     surface: Surface
     found: InstanceSet
 
 
 def cut_off_sides(item: int, frame: ObjectFrame, seen: SeenPoints, room: Room) -> list[CutOff]:
-    """Return the sides of a thing that go on where no frame looked, and how far.
-
-    Args:
-        item: the thing's id.
-        frame: what was seen of it.
-        seen: the same in world space, with the frames that saw it.
-        room: what is around it.
-    """
+    """Return the cropped sides of an object and how far each is extended."""
     low, high = np.percentile(frame.points, [0.5, 99.5], axis=0)
     size = high - low
     if frame.wall_y is not None or float(size.max()) < _MIN_SIZE_M:
@@ -90,7 +91,7 @@ def cut_off_sides(item: int, frame: ObjectFrame, seen: SeenPoints, room: Room) -
 
 
 def is_cut_off(item: int, frame: ObjectFrame, seen: SeenPoints, room: Room, axis: int, sign: int) -> bool:
-    """Tell whether a side was seen at the picture's edge, and nothing beyond it."""
+    """Tell whether a side was seen at the image border and nothing beyond it."""
     return _at_image_edge(frame, seen, room, axis, sign) and not _seen_beyond(item, frame, room, axis, sign)
 
 
@@ -101,29 +102,24 @@ def _at_image_edge(frame: ObjectFrame, seen: SeenPoints, room: Room, axis: int, 
     pose = room.posed.world_from_camera[seen.frames[outer]]
     local = np.einsum("nji,nj->ni", pose[:, :3, :3], seen.points[outer] - pose[:, :3, 3])
     camera = room.camera
-    u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-    v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+    u, v = camera.project(local)
     inward = np.minimum(np.minimum(u, camera.width - u), np.minimum(v, camera.height - v))
     return bool(outer.any() and (inward < _EDGE_SHARE * camera.width).mean() >= _AT_EDGE)
 
 
 def _seen_beyond(item: int, frame: ObjectFrame, room: Room, axis: int, sign: int) -> bool:
-    """Tell whether frames show something else where the thing would go on."""
+    """Tell whether frames show something else just beyond a side of the object."""
     along = sign * frame.points[:, axis]
     outer = frame.points[along >= np.percentile(along, _OUTER_PERCENT)]
     outer = outer[:: max(1, len(outer) // _PROBES)].copy()
     size = np.ptp(np.percentile(frame.points, [0.5, 99.5], axis=0), axis=0)
     outer[:, axis] = sign * (along.max() + max(_BEYOND_SHARE * float(size.max()), _BEYOND_MIN_M))
     probes = transform_points(frame.world_from_grid, outer)
-    witnesses, camera = 0, room.camera
+    witnesses = 0
     for pose, ids, measured in zip(room.posed.world_from_camera, room.found.id_maps, room.depth):
         local = (probes - pose[:3, 3]) @ pose[:3, :3]
-        z = np.maximum(local[:, 2], 1e-6)
-        column = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(int)
-        row = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(int)
-        inside = (local[:, 2] > 0.05) & (column >= 0) & (row >= 0)
-        inside &= (column < camera.width) & (row < camera.height)
-        row, column, z = row[inside], column[inside], z[inside]
+        row, column, inside = pixels_of(local, room.camera)
+        row, column, z = row[inside], column[inside], local[inside, 2]
         clear = (ids[row, column] != item) & (measured[row, column] > _CLEAR * z)
         witnesses += bool(clear.sum() > 0.5 * len(probes))
         if witnesses >= _MIN_WITNESSES:
@@ -132,7 +128,7 @@ def _seen_beyond(item: int, frame: ObjectFrame, room: Room, axis: int, sign: int
 
 
 def _continued(frame: ObjectFrame, axis: int, sign: int, size: np.ndarray) -> CutOff | None:
-    """Return how a side goes on: to the next of equally spaced plates, or until the thing is as long as it is deep."""
+    """Extend a side to the next of equally spaced plates, or until the object is as long as it is deep."""
     start, cut = _well_seen(sign * frame.points[:, axis])
     plates = _plates(frame, axis, sign)
     if len(plates) >= _MIN_PLATES:
@@ -147,7 +143,7 @@ def _continued(frame: ObjectFrame, axis: int, sign: int, size: np.ndarray) -> Cu
 
 
 def _well_seen(along: np.ndarray) -> tuple[float, float]:
-    """Return from where to where points at coordinates (k,) are as dense as they usually are."""
+    """Return the first and last coordinate at which points (k,) are about as dense as at the median."""
     low, high = np.percentile(along, [0.5, 99.5])
     count, edges = np.histogram(along, _SLICES, (low, high))
     dense = np.flatnonzero(count >= _DENSE * np.median(count))
@@ -155,7 +151,7 @@ def _well_seen(along: np.ndarray) -> tuple[float, float]:
 
 
 def _plates(frame: ObjectFrame, axis: int, sign: int) -> np.ndarray:
-    """Return where surface that faces along an axis lies, ascending, times `sign`: the boards of a shelf."""
+    """Return where surfaces that face along an axis lie, ascending, times `sign`: the boards of a shelf."""
     along = sign * frame.points[:, axis]
     low, high = np.percentile(along, [0.5, 99.5])
     facing = np.abs(frame.normals[:, axis]) > _FACING
@@ -170,7 +166,7 @@ def _plates(frame: ObjectFrame, axis: int, sign: int) -> np.ndarray:
 
 
 def stopped(item: int, frame: ObjectFrame, room: Room, axis: int, sign: int, cut: float, end: float) -> float:
-    """Return how far, times `sign`, what a thing ends with at `cut` can go on before it meets what is known."""
+    """Return how far, times `sign`, an object can be extended from `cut` to objects, walls or free space."""
     low, high = np.percentile(frame.points, [2, 98], axis=0)
     grid_from_world = invert_rigid(frame.world_from_grid)
     across = [a for a in range(3) if a != axis]
@@ -184,7 +180,7 @@ def stopped(item: int, frame: ObjectFrame, room: Room, axis: int, sign: int, cut
     if other.sum() >= _IN_THE_WAY:
         end = float(np.percentile(along[other], 5))
     for base in room.found.base:
-        normal = base.surface.plane[:3] @ frame.world_from_grid[:3, axis] * sign
+        normal = float(base.surface.plane[:3] @ frame.world_from_grid[:3, axis] * sign)
         if base.label == "floor" or normal > -0.3:
             continue
         corner = np.array(
@@ -198,7 +194,7 @@ def stopped(item: int, frame: ObjectFrame, room: Room, axis: int, sign: int, cut
 
 
 def _until_free(frame: ObjectFrame, room: Room, axis: int, sign: int, cut: float, end: float) -> float:
-    """Return where rays passed through what lies beyond the cut, or `end`."""
+    """Return where the space beyond the cut is free, times `sign`, or `end`."""
     points = frame.points - _INSIDE_M * frame.normals
     points = points[:: max(1, len(points) // 2000)]
     points = points[points[:, 2] > 2 * _INSIDE_M].copy()
@@ -213,9 +209,9 @@ def _until_free(frame: ObjectFrame, room: Room, axis: int, sign: int, cut: float
 
 
 def lone_front(item: int, frame: ObjectFrame, seen: SeenPoints, room: Room) -> Solid | None:
-    """Return the box that a lone upright side is the front of; None for anything else.
+    """Return the box behind a lone upright rectangle; None for other shapes.
 
-    A front that the picture's edge cuts off is taken to be as wide as it is high, as pictures are.
+    A cropped rectangle is extended sideways until it is as wide as high.
     """
     low, high = np.percentile(frame.points, [1, 99], axis=0)
     low[2] = min(low[2], 0.0) if frame.on_support else low[2]
@@ -226,9 +222,9 @@ def lone_front(item: int, frame: ObjectFrame, seen: SeenPoints, room: Room) -> S
         return None
     facing = (np.abs(frame.normals[:, axis]) > _FACING) * np.sign(frame.normals[:, axis])
     behind = -int(np.sign(facing.sum()))
-    if size[axis] > _SHEET_SHARE * min(size[wide], size[2]) or abs(facing.sum()) < _SHEET_FACING * len(
-        facing
-    ):
+    if size[axis] > _SHEET_SHARE * min(size[wide], size[2]):
+        return None
+    if abs(facing.sum()) < _SHEET_FACING * len(facing):
         return None
     if not _is_rectangle(frame.points[:, [wide, 2]], low[[wide, 2]], high[[wide, 2]]):
         return None
@@ -253,7 +249,7 @@ def _is_rectangle(across: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool
 
 
 def with_copies(frame: ObjectFrame, sides: list[CutOff]) -> ObjectFrame:
-    """Return the frame with points where the thing is taken to go on."""
+    """Return the frame with points copied to where the object is extended."""
     points, normals = frame.points, frame.normals
     for side in sides:
         along = side.sign * points[:, side.axis]
@@ -271,7 +267,7 @@ def with_copies(frame: ObjectFrame, sides: list[CutOff]) -> ObjectFrame:
 
 
 def continued(volume: ObjectVolume, sides: list[CutOff]) -> ObjectVolume:
-    """Return the volume with what lies beyond each cut copied from before it, but for space known to be free."""
+    """Return the volume with the extended sides filled in by copies, except where space is known to be free."""
     for side in sides:
         along = side.sign * volume.centers(side.axis)
         beyond = np.flatnonzero((along > side.cut) & (along <= side.end))

@@ -1,8 +1,7 @@
-"""Every edge of a closed mesh between exactly two faces, also for readers that know vertices by their positions.
+"""Repair of closed meshes so that every edge has exactly two faces, also after vertices are merged by position.
 
-A mesh can be a closed manifold by its vertex numbers and yet have two of its edges at one place, where decimation made
-two sheets touch. Once vertices at one place are one (the mesh was written to a file, with its texture's seams), four
-faces meet there, and a reader finds it not watertight. Such an edge is split for one of the two pairs of faces.
+Decimation can make two sheets touch: a manifold by vertex numbers has two edges at one place. Once a file reader merges
+these vertices, four faces share an edge, and the mesh is not watertight. Such an edge is split for one pair of faces.
 """
 
 import numpy as np
@@ -10,13 +9,13 @@ import numpy as np
 from reconstruction.assets.solid import Solid, compact, manifold_of
 
 _MAX_PASSES = 12
-_AT = (0.5, 0.4, 0.6)  # where along an edge it is split, in the order of passes
+_AT = (0.5, 0.4, 0.6)  # position of the split along an edge, by pass
 
 
 def with_simple_edges(solid: Solid) -> Solid:
-    """Return the solid with vertices at one place (in single precision) made one and no edge shared by four faces.
+    """Merge vertices at one position (single precision) and split edges that more than two faces share.
 
-    Its surface stays where it is. A solid that cannot be mended comes back as it was.
+    The surface does not move. A solid that cannot be repaired is returned unchanged.
     """
     vertices, index = np.unique(solid.vertices.astype(np.float32), axis=0, return_inverse=True)
     points = vertices.astype(np.float64)
@@ -33,7 +32,7 @@ def with_simple_edges(solid: Solid) -> Solid:
 
 
 def _without_folds(faces: np.ndarray) -> np.ndarray:
-    """Drop faces (f, 3) that are no triangle any more, and pairs of faces that lie back to back."""
+    """Drop degenerate faces (f, 3) and pairs of opposite faces with the same corners."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     corners, group = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
@@ -55,7 +54,7 @@ def _without_folds(faces: np.ndarray) -> np.ndarray:
 
 
 def _doubled(faces: np.ndarray) -> list[tuple[int, int, int, int]] | None:
-    """Return (a, b, face, face) of edges shared by more than two faces, for one pair of each; None for open meshes."""
+    """Return (a, b, face, face) for one pair of faces of each edge with more than two; None for open meshes."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     owner = np.repeat(np.arange(len(faces)), 3)
     low, high = np.minimum(start, end), np.maximum(start, end)
@@ -64,21 +63,23 @@ def _doubled(faces: np.ndarray) -> list[tuple[int, int, int, int]] | None:
     forward = start < end
     if (np.bincount(group, weights=np.where(forward, 1.0, -1.0)) != 0).any():
         return None
-    out, taken = [], set()
+    out: list[tuple[int, int, int, int]] = []
+    taken: set[int] = set()
     for number in np.flatnonzero(uses > 2):
         half = np.flatnonzero(group == number)
         one, other = half[forward[half]][-1], half[~forward[half]][-1]
-        if owner[one] in taken or owner[other] in taken or owner[one] == owner[other]:
+        pair = int(owner[one]), int(owner[other])
+        if pair[0] in taken or pair[1] in taken or pair[0] == pair[1]:
             continue
-        taken |= {owner[one], owner[other]}
-        out.append((int(low[one]), int(high[one]), int(owner[one]), int(owner[other])))
+        taken.update(pair)
+        out.append((int(low[one]), int(high[one]), *pair))
     return out
 
 
 def _split(
     points: np.ndarray, faces: np.ndarray, pairs: list[tuple[int, int, int, int]], at: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Put a vertex on each edge, and let the two faces given for it meet there."""
+    """Put a vertex on each edge, and connect the two given faces to it."""
     added, more = [], []
     faces = faces.copy()
     for a, b, *both in pairs:

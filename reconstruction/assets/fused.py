@@ -1,8 +1,7 @@
-"""What the fused surface knows of a thing: where it is at all, and what no single frame's depth should be believed of.
+"""An object's part of the fused surface: a reference for its depth pixels, and a substitute for its volume.
 
-The surface has been put together from all frames and cut with the votes of many. Depth at outlines, where windows of
-the matcher see two surfaces, strays from it: such a pixel of a thing is an error of its frame. And a board seen edge
-on by few pixels a frame may still have been fused well.
+All frames contribute to the fused surface. Depth pixels far from it are matching errors of their frame, at occlusion
+boundaries. A board seen edge-on by few pixels per frame may still be fused well.
 """
 
 from dataclasses import replace
@@ -15,16 +14,16 @@ from reconstruction.assets.volume import ObjectFrame
 from reconstruction.core.types import Camera, InstanceSet, PosedFrames, Surface
 from registry.geometry import invert_rigid, transform_points
 
-_CELL_M, _MAX_CELLS = 0.006, 6_000_000
+_CELL_M, _MAX_CELLS = 0.006, 6_000_000  # spacing of samples, and voxels of the distance field
 _PAD_CELLS = 6
-_REACH_M, _REACH_SIGMAS = 0.012, 2.0
+_REACH_M, _REACH_SIGMAS = 0.012, 2.0  # greatest distance of a pixel: this plus so many sigmas of depth
 _MIN_SAMPLES = 60
-_MIN_BELIEVED = 0.6  # of a thing's pixels; with less, its surface is too poor to judge them
-_TRIM_PERCENT = 0.4
+_MIN_BELIEVED = 0.6  # least share of an object's pixels on its surface; with less, all are kept
+_TRIM_PERCENT = 0.4  # outermost points that are dropped, on each side
 
 
 def sample_surface(item: int, surface: Surface, found: InstanceSet) -> np.ndarray:
-    """Return points (k, 3), world, spread over the triangles of the fused surface that are a thing's, 6 mm apart."""
+    """Return points (k, 3), world, sampled about 6 mm apart on an object's triangles of the fused surface."""
     own = found.vertex_instance == item
     if not own.any():
         return np.zeros((0, 3))
@@ -39,7 +38,7 @@ def sample_surface(item: int, surface: Surface, found: InstanceSet) -> np.ndarra
 
 
 def fused_points(item: int, frame: ObjectFrame, surface: Surface, found: InstanceSet) -> np.ndarray:
-    """Return points (k, 3) on the fused surface of a thing in its grid frame, its outermost slivers left out."""
+    """Return points (k, 3) on an object's fused surface, in its grid frame, without the outermost ones."""
     points = transform_points(invert_rigid(frame.world_from_grid), sample_surface(item, surface, found))
     if len(points) < _MIN_SAMPLES:
         return np.zeros((0, 3))
@@ -50,7 +49,7 @@ def fused_points(item: int, frame: ObjectFrame, surface: Surface, found: Instanc
 def without_strays(
     pixels: ScenePixels, posed: PosedFrames, camera: Camera, surface: Surface, found: InstanceSet
 ) -> ScenePixels:
-    """Return the pixels without the depth of those that lie off the surface of the thing that they show."""
+    """Set the depth of pixels that lie off the fused surface of their object to unknown."""
     depth = pixels.depth.copy()
     for item in found.objects:
         samples = sample_surface(item.id, surface, found)
@@ -58,9 +57,7 @@ def without_strays(
         if len(samples) < _MIN_SAMPLES or len(rows) == 0:
             continue
         z = pixels.depth[rows, v, u].astype(np.float64)
-        local = np.stack(
-            [(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], -1
-        )
+        local = camera.unproject(u + 0.5, v + 0.5, z)
         pose = posed.world_from_camera[rows]
         points = np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3]
         stray = _distance(points, samples) > _REACH_M + _REACH_SIGMAS * pixels.noise_relative * z
@@ -70,7 +67,7 @@ def without_strays(
 
 
 def _distance(points: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Return how far points (n, 3) are from the nearest of some samples (k, 3), to a cell; infinity where far."""
+    """Return the distance (n,) of points to the nearest sample (k, 3), to a voxel; infinity outside their box."""
     low, high = samples.min(axis=0), samples.max(axis=0)
     cell = max(_CELL_M, float((np.prod(high - low + 0.1) / _MAX_CELLS) ** (1 / 3)))
     pad = _PAD_CELLS
@@ -78,7 +75,7 @@ def _distance(points: np.ndarray, samples: np.ndarray) -> np.ndarray:
     shape = np.ceil((high - start) / cell).astype(int) + pad
     empty = np.ones(shape, bool)
     empty[tuple(np.floor((samples - start) / cell).astype(int).T)] = False
-    distance = ndimage.distance_transform_edt(empty, sampling=cell).astype(np.float32)
+    distance = np.asarray(ndimage.distance_transform_edt(empty, sampling=cell)).astype(np.float32)
     index = np.floor((points - start) / cell).astype(int)
     inside = ((index >= 0) & (index < shape)).all(axis=1)
     out = np.full(len(points), np.inf, np.float32)

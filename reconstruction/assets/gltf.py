@@ -1,7 +1,7 @@
-"""Mesh files of a bundle: textured .glb (glTF 2.0, +Y up inside) and convex .obj parts. Same input, same bytes.
+"""Mesh files of a bundle: textured .glb (glTF 2.0) and convex parts as .obj, byte-identical for identical input.
 
-Object space is +z up, glTF is +y up: `(x, y, z)_object = (x, -z, y)_gltf`. Texture coordinates here have their origin
-at the lower left, glTF's at the upper left.
+Object space is +z up, glTF is +y up: `(x, y, z)_object = (x, -z, y)_gltf`. The origin of texture coordinates is at the
+lower left here, at the upper left in glTF.
 """
 
 import io
@@ -17,11 +17,15 @@ from registry.geometry import GLTF_FROM_WORLD, WORLD_FROM_GLTF
 
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
-_REPEAT, _CLAMP = 10497, 33071
+_CLAMP = 33071
 
 
 def write_glb(mesh: TexturedMesh, path: Path) -> None:
-    """Write a textured mesh (+z up) as a self-contained binary glTF file (+y up)."""
+    """Write a textured mesh (+z up) as a self-contained binary glTF file (+y up).
+
+    Raises:
+        BundleError: the texture cannot be encoded.
+    """
     import cv2
 
     rotation = GLTF_FROM_WORLD[:3, :3]
@@ -83,10 +87,10 @@ def write_glb(mesh: TexturedMesh, path: Path) -> None:
 
 
 def read_glb(path: Path) -> TexturedMesh:
-    """Read back what `write_glb` wrote: one primitive with one texture, +z up.
+    """Read a file of `write_glb`: one primitive with one texture, +z up.
 
     Raises:
-        BundleError: the file is not such a .glb.
+        BundleError: the file is no such .glb.
     """
     import cv2
 
@@ -122,6 +126,7 @@ def read_glb(path: Path) -> TexturedMesh:
 
 
 def _accessor(document: dict, body: bytes, number: int) -> np.ndarray:
+    """Return the array (n,) or (n, width) of a glTF accessor."""
     item = document["accessors"][number]
     view = document["bufferViews"][item["bufferView"]]
     kinds = {5121: np.uint8, 5123: np.uint16, _UINT: np.uint32, _FLOAT: np.float32}
@@ -132,9 +137,10 @@ def _accessor(document: dict, body: bytes, number: int) -> np.ndarray:
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 45.0) -> np.ndarray:
-    """Return a unit normal per vertex (v, 3), area-weighted over the faces that share its place within a crease angle.
+    """Return a unit normal per vertex (v, 3): the area-weighted mean over the faces at its position.
 
-    Vertices that lie in the same place (texture seams) are smoothed together, sharp edges of seams stay sharp.
+    Vertices at the same position (texture seams) are smoothed together unless their normals differ by more than the
+    crease angle.
     """
     p = np.asarray(vertices, np.float64)
     corner = p[faces]
@@ -161,8 +167,8 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
 def write_obj(part: ConvexPart, path: Path) -> None:
     """Write a convex part as Wavefront OBJ in its own space (+z up, metres, seven digits).
 
-    Where these digits do not tell two corners apart, as after a cut, the hull of those that they do is written: once
-    readers join what lies in the same place, the triangles between would leave openings.
+    Where rounding merges corners, the hull of the rounded corners is written, as readers that merge vertices would see
+    openings.
     """
     corners, faces = _written(part)
     lines = corners + [f"f {a} {b} {c}" for a, b, c in faces + 1]
@@ -170,11 +176,12 @@ def write_obj(part: ConvexPart, path: Path) -> None:
 
 
 def written_corners(part: ConvexPart) -> np.ndarray:
-    """Return the corners (n, 3) that whoever reads the file of a convex part gets, to the last bit."""
+    """Return the corners (n, 3) that a reader of the part's file gets, to the last bit."""
     return np.array([line.split()[1:] for line in _written(part)[0]], np.float64)
 
 
 def _written(part: ConvexPart) -> tuple[list[str], np.ndarray]:
+    """Return the vertex lines of a part's file, and its faces (f, 3) from 0."""
     from reconstruction.assets.solid import hull_solid
 
     corners, faces = _corner_lines(part.vertices), np.asarray(part.faces, np.int64)
@@ -189,7 +196,7 @@ def _corner_lines(vertices: np.ndarray) -> list[str]:
 
 
 def read_obj(path: Path) -> ConvexPart:
-    """Read back what `write_obj` wrote."""
+    """Read a file of `write_obj`."""
     vertices, faces = [], []
     for line in Path(path).read_text().splitlines():
         words = line.split()

@@ -1,8 +1,8 @@
-"""Flat things on walls: pictures, mirrors, boards. A slab fits them better than any volume.
+"""Flat objects on walls (pictures, mirrors, boards) as slabs.
 
-Their depth hardly differs from the wall's, so a fused volume is as thick as its noise. And they are often cut by the
-image's edge: where no frame ever saw wall beyond a side, that side is not the thing's own, and the slab goes on until
-it is as long as it is wide, which is the likeliest guess for a picture.
+Their depth hardly differs from the wall's, so that a fused volume would be as thick as the depth noise. Image borders
+often crop them: a side beyond which no frame saw wall is not the object's own. The slab is extended there until it is
+square, the likeliest guess for a picture.
 """
 
 from dataclasses import dataclass
@@ -12,22 +12,27 @@ import numpy as np
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.hanging_front import front_of
 from reconstruction.assets.solid import Solid, box_solid
+from reconstruction.assets.views import pixels_of
 from reconstruction.assets.volume import ObjectFrame
 from reconstruction.core.types import Camera, Instance, InstanceSet, PosedFrames
 from registry.geometry import rigid, transform_points
 
 _MAX_THICKNESS_M = 0.10
-_MAX_SPREAD_M, _LAYER_M = 0.025, 0.035
-_MIN_FLAT_SHARE = 0.6
-_CELL_M, _MAX_CELLS = 0.008, 120
-_MIN_COVERED = 0.5  # of what a well covered strip has
-_MIN_STRIP = 4  # cells of a strip that must be in view to judge it by less
-_EDGE_PX = 6.0
-_BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02
-_MIN_WITNESSES = 2
-_PROBES = 7
-_SEEN_SHARE, _SEEN_PERCENT = 0.5, 2.0  # of its box on the wall
-_BEHIND_SHARE, _MOST_PERCENT = 0.35, 80.0  # of how far it stands out; of the points
+_MAX_SPREAD_M = 0.025  # of the points' distances to the wall (1-sigma)
+_LAYER_M = 0.035  # least half width of the inlier band around the median distance
+_MIN_FLAT_SHARE = 0.6  # inliers
+_CELL_M, _MAX_CELLS = 0.008, 120  # occupancy grid on the wall
+_MIN_COVERED = 0.5  # least coverage of a strip, relative to well covered ones
+_MIN_STRIP = 4  # strips with fewer visible cells count as having this many
+_EDGE_PX = 6.0  # depth is missing this close to the image border
+_BEYOND_SHARE, _BEYOND_MIN_M = 0.04, 0.02  # distance of the probes from a side
+_MIN_WITNESSES = 2  # frames
+_PROBES = 7  # points along a side
+_SEEN_SHARE, _SEEN_PERCENT = 0.5, 2.0  # least share of the box on the wall; percentile that bounds the points
+_BEHIND_SHARE, _MOST_PERCENT = (
+    0.35,
+    80.0,
+)  # points are the wall's where this percentage lies in that share of the depth
 
 
 @dataclass(frozen=True)
@@ -35,13 +40,13 @@ class Hanging:
     """A slab in the grid frame, its back on the wall."""
 
     body: Solid
-    completed: bool  # it goes on where no frame looked
+    completed: bool  # extended beyond what was seen
 
 
 def is_outlined(item: Instance, points: np.ndarray) -> bool:
-    """Tell whether the box of a thing on a wall is from its outlines.
+    """Tell whether the box of an object on a wall comes from its outlines rather than from its depth.
 
-    Few points (n, 3) were seen, or they are those of the wall behind it.
+    That is so where its points (n, 3), in world space, cover little of the box, or lie on the wall behind it.
     """
     if not item.attached_hint:
         return False
@@ -62,9 +67,9 @@ def is_outlined(item: Instance, points: np.ndarray) -> bool:
 def outlined_slab(
     item: Instance, posed: PosedFrames, camera: Camera, found: InstanceSet, config: AssetsConfig
 ) -> tuple[Solid, ObjectFrame]:
-    """Return the box of what is known by its outline, its back on the wall, in a grid frame, and that frame.
+    """Return the box of an object known by its outline, its back on the wall, in a grid frame, and that frame.
 
-    How thick a flat one is, views may tell.
+    The images measure the thickness of a flat one (`front_of`).
     """
     c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
     front, width, height = item.extents_m
@@ -86,22 +91,16 @@ def hanging_slab(
     found: InstanceSet,
     config: AssetsConfig,
 ) -> Hanging | None:
-    """Return the slab of a thing that hangs flat on its wall; None for what is thick, bent or not on a wall.
+    """Fit a slab to an object that hangs flat on its wall; None where it is thick, bent or not on a wall.
 
-    Args:
-        item: The thing's id.
-        frame: What was seen of the thing; +y of its grid frame looks into the wall.
-        posed: The keyframes' poses, in world space.
-        camera: The camera at the resolution of the instance maps.
-        found: Its instance maps tell where wall was seen beyond the thing.
-        config: `flat_thickness_m` is the least thickness.
+    +y of the grid frame points into the wall. `camera` has the resolution of the instance maps.
     """
     if frame.wall_y is None or len(frame.points) < config.min_points:
         return None
     away_m = frame.wall_y - frame.points[:, 1]
     thickness = float(np.median(away_m))
     spread = 1.4826 * float(np.median(np.abs(away_m - thickness)))
-    # Depth takes a plain front for the wall behind it, and finds the frame around it: both are the thing.
+    # Depth puts a plain front at the wall, and the frame around it in front of the wall: both belong to the object.
     flat = np.abs(away_m - thickness) < max(2.5 * spread, _LAYER_M)
     if thickness > _MAX_THICKNESS_M or spread > _MAX_SPREAD_M or flat.mean() < _MIN_FLAT_SHARE:
         return None
@@ -132,23 +131,21 @@ def hanging_slab(
 def _covered_rectangle(
     frame: ObjectFrame, flat: np.ndarray, posed: PosedFrames, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners (2,) x and z of the rectangle that the `flat` ones of the seen points cover.
+    """Return the corners (2,) x and z of the rectangle that the `flat` seen points cover.
 
-    What counts is that a strip is covered where any frame could see it, not how often: the part at the image's edge is
-    in few frames only.
+    Coverage of a strip is relative to its cells that any frame could see, as few show the image border.
     """
     across = frame.points[flat][:, [0, 2]]
     start, end = across.min(axis=0), across.max(axis=0)
     cell = max(_CELL_M, float((end - start).max()) / _MAX_CELLS)
     index = np.floor((across - start) / cell).astype(int)
     shape = tuple(index.max(axis=0) + 1)
-    filled = (
-        np.bincount(np.ravel_multi_index(index.T, shape), minlength=int(np.prod(shape))).reshape(shape) > 0
-    )
+    counts = np.bincount(np.ravel_multi_index(index.T, shape), minlength=int(np.prod(shape)))
+    filled = counts.reshape(shape) > 0
     x, z = np.meshgrid(*(start[k] + (np.arange(shape[k]) + 0.5) * cell for k in (0, 1)), indexing="ij")
     centers = np.stack([x, np.full(shape, frame.wall_y), z], axis=-1).reshape(-1, 3)
-    visible = filled | _in_view(transform_points(frame.world_from_grid, centers), posed, camera).reshape(
-        shape
+    visible = (
+        _in_view(transform_points(frame.world_from_grid, centers), posed, camera).reshape(shape) | filled
     )
     low, high = np.empty(2), np.empty(2)
     for axis in (0, 1):
@@ -160,16 +157,20 @@ def _covered_rectangle(
 
 
 def _in_view(world: np.ndarray, posed: PosedFrames, camera: Camera) -> np.ndarray:
-    """Return which points (n, 3) are inside some frame and off its very edge, where depth is missing."""
+    """Return which points (n, 3) are inside some image, `_EDGE_PX` from its border at least."""
     out = np.zeros(len(world), bool)
     for pose in posed.world_from_camera:
         local = (world - pose[:3, 3]) @ pose[:3, :3]
-        z = np.maximum(local[:, 2], 1e-6)
-        u, v = camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy
-        inside = (
-            (u > _EDGE_PX) & (v > _EDGE_PX) & (u < camera.width - _EDGE_PX) & (v < camera.height - _EDGE_PX)
+        in_front = local[:, 2] > 0.05
+        local[:, 2] = np.maximum(local[:, 2], 1e-6)
+        u, v = camera.project(local)
+        out |= (
+            in_front
+            & (u > _EDGE_PX)
+            & (v > _EDGE_PX)
+            & (u < camera.width - _EDGE_PX)
+            & (v < camera.height - _EDGE_PX)
         )
-        out |= inside & (local[:, 2] > 0.05)
     return out
 
 
@@ -179,7 +180,7 @@ def _wall_beyond(
 ) -> bool:  # fmt: skip
     """Tell whether frames show floor or wall in most of a strip just beyond one side of the rectangle.
 
-    That the image goes on there is not enough: depth is missing along the image's edges.
+    That the image extends beyond it is not enough, as depth is missing along image borders.
     """
     beyond = max(_BEYOND_SHARE * float((high - low).max()), _BEYOND_MIN_M)
     probes = np.empty((_PROBES, 3))
@@ -190,12 +191,7 @@ def _wall_beyond(
     base = np.array([entity.id for entity in found.base])
     witnesses = 0
     for pose, ids in zip(posed.world_from_camera, found.id_maps):
-        local = (world - pose[:3, 3]) @ pose[:3, :3]
-        z = np.maximum(local[:, 2], 1e-6)
-        column = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(int)
-        row = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(int)
-        inside = (local[:, 2] > 0.05) & (column >= 0) & (row >= 0)
-        inside &= (column < camera.width) & (row < camera.height)
+        row, column, inside = pixels_of((world - pose[:3, 3]) @ pose[:3, :3], camera)
         seen = np.isin(ids[row[inside], column[inside]], base)
         witnesses += bool(seen.sum() > 0.5 * _PROBES)
         if witnesses >= _MIN_WITNESSES:

@@ -1,8 +1,7 @@
-"""How far a flat thing stands out from its wall, by the images: there its front agrees between views.
+"""Thickness of a flat object on a wall, by a plane sweep over the images.
 
-A picture is 1 to 4 cm thick, which is within the noise of depth maps and of every surface fused from them. But between
-places a metre apart its front shifts by several pixels a centimetre, so that views rectified onto the right plane
-agree, and onto any other one do not.
+A picture is 1 to 4 cm thick, which is within the noise of depth maps and of surfaces fused from them. Between views a
+metre apart its front shifts by several pixels per centimetre: images rectified onto the right plane agree.
 """
 
 import cv2
@@ -11,36 +10,36 @@ import numpy as np
 from reconstruction.core.types import Camera, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
-_CELL_M, _MAX_CELLS = 0.005, 160
-_STEP_M, _FAR_M = 0.004, 0.1
-_RIM_CELLS = 3
+_CELL_M, _MAX_CELLS = 0.005, 160  # sampling of a plane
+_STEP_M, _FAR_M = 0.004, 0.1  # planes: their spacing, and the farthest one from the wall
+_RIM_CELLS = 3  # border around the object: a plain front has texture only at its outline
 _MAX_VIEWS = 24
 _MIN_VIEWS = 4
-_MIN_SEEN = 0.25  # of the rectangle, for a view to count
-_SMOOTH_CELLS = 6.0  # coarser than this is light, not a pattern
-_NEARLY = 0.25  # of the rise from the least to the ends
-_MIN_CONTRAST = 0.9  # the best plane's variance over that of the wall's or the farthest one
-_MIN_RISE = 1.0  # squared gray levels: below it, no view differs from any other
+_MIN_SEEN = 0.25  # share of the rectangle that a view must show
+_SMOOTH_CELLS = 6.0  # sigma of the high-pass filter that removes illumination
+_NEARLY = 0.25  # tolerance of a minimum, as a share of the rise from the least score to the ends
+_MIN_CONTRAST = 0.9  # greatest score of the best plane, relative to the first and last one
+_MIN_RISE = 1.0  # least difference to them, squared gray levels
 
 
 def front_of(
     world_from_grid: np.ndarray, wall_y: float, low: np.ndarray, high: np.ndarray, item: int, posed: PosedFrames,
     camera: Camera, found: InstanceSet,
 ) -> float | None:  # fmt: skip
-    """Return the distance in metres of a thing's front from its wall; None where the images do not tell.
+    """Return the distance in metres of an object's front from its wall; None where the images do not tell.
 
     Args:
-        world_from_grid: float64 (4, 4) of a frame whose +y looks into the wall and whose z is up.
-        wall_y: where the wall is.
-        low: float64 (2,) x and z of the thing's lower corner.
+        world_from_grid: float64 (4, 4); +y of the grid frame points into the wall, +z up.
+        wall_y: the wall's y in the grid frame.
+        low: float64 (2,) x and z of the object's lower corner.
         high: of its upper corner.
-        item: the thing's id.
-        posed: keyframes in the same world.
+        item: the object's id.
+        posed: keyframes in world space.
         camera: the camera at the resolution of the instance maps.
-        found: its instance maps tell where the thing is seen.
+        found: the instances; their maps tell where the object is seen.
     """
     cell = max(_CELL_M, float((high - low).max()) / _MAX_CELLS)
-    rim = _RIM_CELLS * cell  # a plain front shows only in its outline
+    rim = _RIM_CELLS * cell
     x, z = np.meshgrid(
         np.arange(low[0] - rim, high[0] + rim, cell), np.arange(low[1] - rim, high[1] + rim, cell)
     )
@@ -66,7 +65,7 @@ def front_of(
 
 
 def _first_minimum(scores: np.ndarray) -> int:
-    """Return the minimum nearest to the wall of those that hardly differ from the least: few views agree on several."""
+    """Return the local minimum nearest to the wall among those close to the least score: few views tell them apart."""
     least = float(scores.min())
     inner = np.arange(1, len(scores) - 1)
     low = (scores[inner] <= scores[inner - 1]) & (scores[inner] <= scores[inner + 1])
@@ -77,18 +76,19 @@ def _first_minimum(scores: np.ndarray) -> int:
 def _project(
     points: np.ndarray, pose: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return float32 columns and rows in pixels, and where points (h, w, 3) are inside the image."""
+    """Return float32 columns and rows (h, w) in pixels of world points (h, w, 3), and which are inside the image."""
     local = transform_points(invert_rigid(np.asarray(pose)), points)
-    depth = np.maximum(local[..., 2], 1e-6)
-    u = camera.fx * local[..., 0] / depth + camera.cx
-    v = camera.fy * local[..., 1] / depth + camera.cy
-    inside = (local[..., 2] > 0.05) & (u > 1) & (v > 1) & (u < camera.width - 2) & (v < camera.height - 2)
+    in_front = local[..., 2] > 0.05
+    local[..., 2] = np.maximum(local[..., 2], 1e-6)
+    u, v = camera.project(local)
+    inside = in_front & (u > 1) & (v > 1) & (u < camera.width - 2) & (v < camera.height - 2)
     return u.astype(np.float32), v.astype(np.float32), inside
 
 
 def _seen(
     points: np.ndarray, posed: PosedFrames, i: int, camera: Camera, ids: np.ndarray, item: int
 ) -> np.ndarray:
+    """Return which plane points (h, w, 3) show the object in view `i`, dilated by `_RIM_CELLS`."""
     u, v, inside = _project(points, posed.world_from_camera[i], camera)
     out = np.zeros(inside.shape, bool)
     out[inside] = ids[v[inside].astype(int), u[inside].astype(int)] == item
@@ -96,8 +96,10 @@ def _seen(
 
 
 def _disagreement(points: np.ndarray, posed: PosedFrames, views: list[tuple[int, np.ndarray]]) -> float:
-    """Return the variance between views of the pattern on a plane, points (h, w, 3) in world space."""
-    total, squares, count = 0.0, 0.0, 0.0
+    """Return the variance between views of the high-pass filtered images on a plane of points (h, w, 3), world."""
+    shape = points.shape[:2]
+    total, squares = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
+    count = np.zeros((*shape, 1), np.float32)
     for i, mask in views:
         u, v, inside = _project(points, posed.world_from_camera[i], posed.camera)
         image = cv2.remap(np.asarray(posed.images[i]), u, v, cv2.INTER_LINEAR).astype(np.float32)

@@ -1,7 +1,7 @@
-"""What stands out from a wall without being flat, as a relief: a wall shelf, a row of hooks.
+"""Height fields: objects that stand out from a wall without being flat (a wall shelf, a row of hooks).
 
-A board seen edge on has few pixels in any frame, too few to carve it from; the fused surface has all frames' word on
-it. A thing that hangs is fixed to its wall, so that what lies between its front and the wall is taken for solid.
+A board seen edge-on covers too few pixels to carve it; the fused surface combines all frames. An object that hangs is
+fixed to its wall, so that the space between its front and the wall is solid.
 """
 
 from dataclasses import replace
@@ -14,16 +14,16 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid, extract, lighten
 
 _CELL_M, _MAX_CELLS = 0.008, 96
-_FRONT_PERCENT = 90.0  # of the distances to the wall in a cell
-_CLOSED_CELLS = 2
+_FRONT_PERCENT = 90.0  # of the distances to the wall in a cell: its front
+_CLOSED_CELLS = 2  # radius of the gray-scale closing
 _MAX_REACH_M = 0.6
-_TOLERANCE_M = 0.001
+_TOLERANCE_M = 0.001  # of the decimation
 
 
 def relief(points: np.ndarray, wall_y: float, config: AssetsConfig) -> Solid | None:
-    """Return what lies between points (k, 3) and the wall at `wall_y`, in the grid frame, +y into the wall.
+    """Return the solid between points (k, 3) and the wall at `wall_y`, grid frame, +y into the wall; None if empty.
 
-    No part stands out less than `config.flat_thickness_m`. None where there is nothing.
+    No part stands out by less than `config.flat_thickness_m`.
     """
     away = np.clip(wall_y - points[:, 1], config.flat_thickness_m, _MAX_REACH_M)
     if len(points) == 0:
@@ -33,7 +33,7 @@ def relief(points: np.ndarray, wall_y: float, config: AssetsConfig) -> Solid | N
     size = np.maximum(across.max(axis=0) - start, _CELL_M)
     cell = max(_CELL_M, float(size.max()) / _MAX_CELLS)
     shape = tuple(np.ceil(size / cell).astype(int))
-    # Whole cells, so that the relief is as large as what was seen.
+    # The cells divide the extent exactly, so that the solid is as large as what was seen.
     steps = size / shape
     index = np.clip(np.floor((across - start) / steps).astype(int), 0, np.array(shape) - 1)
     flat = np.ravel_multi_index(index.T, shape)
@@ -51,9 +51,9 @@ def relief(points: np.ndarray, wall_y: float, config: AssetsConfig) -> Solid | N
 
 
 def mound(points: np.ndarray, config: AssetsConfig) -> Solid | None:
-    """Return what lies between points (k, 3) and the support at z = 0 below them, in the grid frame.
+    """Return the solid between points (k, 3) and the support at z = 0 below them, in the grid frame; None if empty.
 
-    For flat things that few frames saw, at a slant, so that rays took too much of their volume away.
+    For flat objects that few frames saw, at grazing angles, where carving removes too much.
     """
     laid = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
     body = relief(laid, 0.0, replace(config, flat_thickness_m=config.min_thickness_m))
@@ -66,17 +66,17 @@ def mound(points: np.ndarray, config: AssetsConfig) -> Solid | None:
 def _between(
     front: np.ndarray, start: np.ndarray, steps: np.ndarray, wall_y: float, cell: float
 ) -> Solid | None:
-    """Return the solid between the wall and fronts (nx, nz) in metres before it, 0 = nothing."""
+    """Return the solid between the wall and a height field (nx, nz) of distances to it in metres, 0 = nothing."""
     layers = max(int(np.ceil(front.max() / cell)), 1)
     step_y = front.max() / layers
-    depth = (np.arange(layers) + 0.5) * step_y  # of the middle of each layer before the wall
+    depth = (np.arange(layers) + 0.5) * step_y  # distance of each layer's middle to the wall
     filled = depth[None, :, None] < front[:, None, :]
     grid = np.pad(filled, 1)
     field = CompletedField(np.zeros(3), 1.0, np.where(grid, -0.5, 0.5).astype(np.float32), ())
     body = extract(field)
     if body is None:
         return None
-    # The field's unit is a cell; in y it counts from the wall into the room.
+    # The field's unit is a cell; its y counts from the wall into the room.
     cells = body.vertices - 1.0
     vertices = np.column_stack(
         [start[0] + cells[:, 0] * steps[0], wall_y - cells[:, 1] * step_y, start[1] + cells[:, 2] * steps[1]]

@@ -1,16 +1,19 @@
-"""Compiled loops of the assets stage."""
+"""Compiled kernels of the assets stage: viewing angles, volumetric fusion, texture sampling.
+
+They are long because all work on a voxel or texel happens in one iteration of a parallel loop.
+"""
 
 import math
 
 import numpy as np
 from numba import njit, prange
 
-_EDGE = 0.025  # a neighbour that is nearer or farther by this share of depth lies across an edge
+_EDGE = 0.025  # relative depth difference to a neighbor that is a discontinuity
 
 
 @njit(cache=True, parallel=True)
 def incidence_cosines(depth, fx, fy, cx, cy):  # pragma: no cover - compiled
-    """Cosine between ray and surface normal per pixel (n, h, w); 0 where depth jumps or is unknown."""
+    """Return the cosine between ray and surface normal (n, h, w); 0 at discontinuities and where depth is unknown."""
     n, h, w = depth.shape
     out = np.zeros((n, h, w), np.float32)
     for job in prange(n * h):
@@ -25,7 +28,7 @@ def incidence_cosines(depth, fx, fy, cx, cy):  # pragma: no cover - compiled
             limit = _EDGE * z
             if zl <= 0 or zr <= 0 or zu <= 0 or zd <= 0:
                 continue
-            # Pixels beside something nearer, and those that fly between two surfaces, carry no evidence.
+            # Pixels beside a nearer surface, and flying pixels between two surfaces, carry no evidence.
             if z - min(min(zl, zr), min(zu, zd)) > limit:
                 continue
             left, right = abs(zl - z) < limit, abs(zr - z) < limit
@@ -52,7 +55,7 @@ def incidence_cosines(depth, fx, fy, cx, cy):  # pragma: no cover - compiled
 
 @njit(cache=True, inline="always")
 def _own_depth(depth, ids, f, target, u, v, w, h):  # pragma: no cover - compiled
-    """Bilinear depth where the four pixels around belong to the object and are one surface, else the nearest."""
+    """Bilinear depth where the four pixels around show the object and are one surface, else the nearest pixel's."""
     iu, iv = int(u), int(v)
     here = depth[f, iv, iu]
     x0, y0 = int(math.floor(u - 0.5)), int(math.floor(v - 0.5))
@@ -73,7 +76,7 @@ def _own_depth(depth, ids, f, target, u, v, w, h):  # pragma: no cover - compile
 
 @njit(cache=True, inline="always")
 def _beside_own(ids, f, target, iu, iv, w, h):  # pragma: no cover - compiled
-    """Whether a pixel borders one of the object: the outline is only known to a pixel."""
+    """Whether a pixel borders one of the object: outlines are known to a pixel only."""
     if iu > 0 and ids[f, iv, iu - 1] == target:
         return True
     if iu < w - 1 and ids[f, iv, iu + 1] == target:
@@ -85,33 +88,17 @@ def _beside_own(ids, f, target, iu, iv, w, h):  # pragma: no cover - compiled
 
 @njit(cache=True, parallel=True)
 def fuse_object(
-    depth,
-    confidence,
-    ids,
-    cosine,
-    inner,
-    frames,
-    camera_from_grid,
-    fx,
-    fy,
-    cx,
-    cy,
-    target,
-    shape,
-    origin,
-    voxel,
-    trunc,
-    tau,
-    shell,
-    shade,
-):  # pragma: no cover - compiled
-    """Sum the evidence of all frames in every voxel of one object's grid.
+    depth, confidence, ids, cosine, inner, frames, camera_from_grid, fx, fy, cx, cy, target, shape, origin, voxel,
+    trunc, tau, shell, shade,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Accumulate the evidence of all frames in every voxel of one object's grid.
 
-    Returns (nx, ny, nz) each: soft-maximum numerator and denominator of signed distances to the object's seen
-    surface, number of frames whose ray passed through, number of frames that saw the object's surface there,
-    number of frames that see something else there that does not hide the voxel, number of frames that saw the
-    object's surface less than `shell` in front of it, number of frames that saw its surface there well inside
-    its outline, and number of frames that saw its surface before the voxel, but less than `shade` before it.
+    Returns (nx, ny, nz) each:
+        numerator, denominator: of the mean signed distance to the seen surface, weighted towards large ones (soft
+            maximum of temperature `tau`);
+        numbers of frames that saw: the voxel free; the object's surface at it; something else there that does not
+            occlude the voxel; the surface less than `shell` in front of it; the surface at it, well inside the
+            object's outline; the surface in front of it by more than `trunc` and less than `shade`.
     """
     nx, ny, nz = shape
     numerator = np.zeros((nx, ny, nz), np.float32)
@@ -191,7 +178,7 @@ def fuse_object(
 def _sample_pixel(
     point, normal, m, center, image, depth, border, fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, out
 ):  # pragma: no cover - compiled
-    """Colour of a surface point in one frame into `out` (3,); returns its weight, 0 where the frame does not see it."""
+    """Write a point's color in one frame to `out` (3,); return its weight, 0 where the frame does not see it."""
     px, py, pz = point[0], point[1], point[2]
     z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
     if z < 0.05:
@@ -210,7 +197,7 @@ def _sample_pixel(
     iu = min(max(int(dfx * xn + dcx), 0), depth.shape[1] - 1)
     iv = min(max(int(dfy * yn + dcy), 0), depth.shape[0] - 1)
     here = depth[iv, iu]
-    slope = 1.5 * z / dfx / max(cos, 0.1)  # depth changes this much over a pixel
+    slope = 1.5 * z / dfx / max(cos, 0.1)  # change of depth over a pixel
     if here <= 0 or abs(here - z) > tolerance + slope or border[iv, iu] <= 0:
         return 0.0
     x0, y0 = int(u - 0.5), int(v - 0.5)
@@ -225,18 +212,9 @@ def _sample_pixel(
 
 @njit(cache=True, parallel=True)
 def sample_frames(
-    points,
-    normals,
-    camera_from_world,
-    centers,
-    images,
-    depths,
-    borders,
-    intrinsics,
-    depth_intrinsics,
-    tolerance,
-):  # pragma: no cover - compiled
-    """Colours (k, t, 3) and weights (k, t) of surface points in every frame."""
+    points, normals, camera_from_world, centers, images, depths, borders, intrinsics, depth_intrinsics, tolerance
+):  # pragma: no cover - compiled  # fmt: skip
+    """Return colors (k, t, 3) and weights (k, t) of surface points in every frame."""
     count, frames = len(points), len(images)
     colors = np.zeros((frames, count, 3), np.float32)
     weights = np.zeros((frames, count), np.float32)
@@ -253,19 +231,9 @@ def sample_frames(
 
 @njit(cache=True, parallel=True)
 def blend_frames(
-    points,
-    normals,
-    camera_from_world,
-    centers,
-    images,
-    depths,
-    borders,
-    gains,
-    intrinsics,
-    depth_intrinsics,
-    tolerance,
-):  # pragma: no cover - compiled
-    """Blend each surface point's best three colours; returns colours (t, 3) and whether any frame saw it (t,)."""
+    points, normals, camera_from_world, centers, images, depths, borders, gains, intrinsics, depth_intrinsics, tolerance
+):  # pragma: no cover - compiled  # fmt: skip
+    """Blend the three best colors of each surface point; return colors (t, 3) and whether any frame saw it (t,)."""
     count, frames = len(points), len(images)
     out = np.zeros((count, 3), np.float32)
     seen = np.zeros(count, np.bool_)
@@ -296,7 +264,7 @@ def blend_frames(
         for slot in range(3):
             if weight[slot] <= 0:
                 break
-            # Highlights and stray labels differ from the middle of three colours.
+            # Specular highlights and wrong ids differ from the median of the three colors.
             off = 0.0
             if weight[2] > 0:
                 for c in range(3):

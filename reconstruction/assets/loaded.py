@@ -1,4 +1,4 @@
-"""Meshes that others made: read from a file of any kind, upright in our axes, with their looks."""
+"""Mesh files of other programs, read by trimesh, with their textures or vertex colors."""
 
 from typing import Any, BinaryIO
 
@@ -8,34 +8,34 @@ from registry.geometry import WORLD_FROM_GLTF
 
 
 def load_mesh(source: "str | BinaryIO", file_type: str | None = None) -> Any:
-    """Return all meshes of a file as one `trimesh.Trimesh`, in the file's own axes.
+    """Read all meshes of a file as one `trimesh.Trimesh`, in the file's own axes.
 
     Raises:
-        ValueError: it holds no mesh that can be read, with the reason.
+        ValueError: the file holds no readable mesh, with the reason.
     """
     import trimesh
 
     try:
-        loaded = trimesh.load(source, file_type=file_type, force="mesh", process=False)
+        loaded: Any = trimesh.load(source, file_type=file_type, force="mesh", process=False)
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise ValueError(f"it cannot be read ({type(error).__name__}: {error})") from error
     if len(getattr(loaded, "faces", ())) < 4:
         raise ValueError("it holds no mesh of at least 4 triangles")
     if not np.isfinite(np.asarray(loaded.vertices)).all():
-        raise ValueError("it has vertices that are no numbers")
+        raise ValueError("it has vertices that are not finite")
     if int(np.max(loaded.faces)) >= len(loaded.vertices) or int(np.min(loaded.faces)) < 0:
-        raise ValueError("its triangles name vertices that it does not have")
+        raise ValueError("its triangles refer to vertices that do not exist")
     return loaded
 
 
 def upright(vertices: np.ndarray, *, gltf: bool) -> np.ndarray:
-    """Return vertices (v, 3) with +z up; those of glTF files are +y up."""
+    """Return vertices (v, 3) with +z up; glTF files are +y up."""
     vertices = np.asarray(vertices, np.float64)
     return vertices @ WORLD_FROM_GLTF[:3, :3].T if gltf else vertices
 
 
 def picture_of(loaded: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return uvs (v, 2) and the RGB picture uint8 (h, w, 3) that they mean; None where a mesh has no such looks."""
+    """Return uvs (v, 2) and the texture uint8 (h, w, 3) RGB of a mesh; None where it has none."""
     visual = loaded.visual
     uv = getattr(visual, "uv", None)
     material = getattr(visual, "material", None)

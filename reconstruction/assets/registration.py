@@ -1,44 +1,44 @@
-"""Where a mesh of unknown size, heading and place fits to what was seen of an object, and whether it does.
+"""Registration of a generated mesh of unknown scale, heading and position to the seen points of an object.
 
-Both are upright, so that a similarity has a heading, a scale and a place. Many of them are tried: headings all around,
-scales that the seen height and widths suggest, places at which the seen part may lie within the mesh. The best are
-refined by robust symmetric ICP (seen points to the mesh's surface, and the mesh's surface to seen points where it is
-near them), and the one is taken that explains most of what was seen with least of it in space known to be free.
+Mesh and points are upright. Candidate poses combine headings all around, scales from the seen height and widths, and
+positions at which the seen part may lie within the mesh. The best ones are refined by robust symmetric ICP. The result
+is the pose that explains most of the seen points with the least surface in free space.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 _HEADINGS = 24
-_SAME_SCALE = 0.04
-_SLACK = 0.1  # of the mesh's width: more than that unseen, and the seen part may lie anywhere along it
-_TRIED, _REFINED, _FINISHED = 240, 12, 3  # seen points of a try; tries that are refined coarsely, and finely
+_SAME_SCALE = 0.04  # log scales closer than this count as one candidate
+_SLACK = 0.1  # of the mesh's width: if more of it is unseen, the seen part may lie at either end
+_TRIED, _REFINED, _FINISHED = 240, 12, 3  # seen points per candidate; candidates in coarse and in fine ICP
 _POINTS = (500, 2500)  # of either side in coarse and fine ICP
 _STEPS = (12, 25)
-_TRIMMED = 0.92  # of the pairs that count
-_FACING = 0.3  # cosine from which two normals may belong to the same surface
+_TRIMMED = 0.92  # quantile of the pairs' distances that is kept
+_FACING = 0.3  # least cosine between the normals of a pair
 _DAMPING = 1e-5
-_SIDEWAYS = 0.15  # weight of a pair's distance along the surface
-_NEAR_M, _NEAR_SHARE = 0.01, 0.03
+_SIDEWAYS = 0.15  # weight of a pair's tangential distance
+_NEAR_M, _NEAR_SHARE = 0.01, 0.03  # tolerance: the larger of this and this share of the object's size
 FreeDepth = Callable[
     [np.ndarray], np.ndarray
-]  # points (n, 3) -> metres (n,) into space known to be free, 0 elsewhere
+]  # points (n, 3) -> depth in free space (n,), metres; 0 outside of it
 
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """What was seen of an object, upright, in metres."""
+    """The seen points of an object, upright, in metres."""
 
     points: np.ndarray  # float64 (k, 3)
     normals: np.ndarray  # float64 (k, 3) outwards, zero where unknown
-    floor_z: float | None  # height of what it stands on; None where that is not known
+    floor_z: float | None  # height of its support; None where unknown
 
     @property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of its box without stray points; it reaches down to what it stands on."""
+        """Return the corners (3,) of the points' box without outliers, down to the support."""
         low, high = np.percentile(self.points, 0.5, axis=0), np.percentile(self.points, 99.5, axis=0)
         if self.floor_z is not None:
             low[2] = self.floor_z
@@ -60,30 +60,28 @@ class Pose:
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Return points (n, 3) of the mesh where they are seen."""
+        """Transform points (n, 3) of the mesh to the seen frame."""
         return self.scale * points @ self.rotation.T + self.place
 
     def undo(self, points: np.ndarray) -> np.ndarray:
-        """Return seen points (n, 3) in the mesh's own frame."""
+        """Transform points (n, 3) of the seen frame to the mesh."""
         return (points - self.place) @ self.rotation / self.scale
 
 
 @dataclass(frozen=True)
 class Registration:
-    """The best place of a mesh, and how well it fits there."""
+    """The best pose of a mesh and its residuals."""
 
     scale: float
     rotation: np.ndarray  # float64 (3, 3) about z
     translation: np.ndarray  # float64 (3,): seen = scale * rotation @ mesh + translation
-    distance_m: float  # median, of what was seen from the mesh
-    near_m: float  # what counts as near
-    missed: float  # share of what was seen that is farther from the mesh than that
-    intruding: (
-        float  # share of the mesh's surface that lies that deep in free space, or below what it stands on
-    )
+    distance_m: float  # median distance of the seen points to the mesh
+    near_m: float  # tolerance
+    missed: float  # share of the seen points beyond the tolerance
+    intruding: float  # share of the mesh's surface deeper than that in free space or below the support
 
     def fault(self, missed: float, intruding: float) -> str:
-        """Return why the mesh cannot be what was seen, "" where it can."""
+        """Return why the mesh is rejected at these limits; "" where it is not."""
         if self.missed > missed:
             return (
                 f"{self.missed:.0%} of what was seen is farther than {100 * self.near_m:.1f} cm from it "
@@ -97,26 +95,26 @@ class Registration:
 def register(
     points: np.ndarray, normals: np.ndarray, seen: SeenSurface, free_depth: FreeDepth
 ) -> Registration:
-    """Fit an upright mesh to what was seen.
+    """Fit an upright mesh to seen points.
 
     Args:
-        points: float (n, 3) evenly on the mesh's surface, +z up, in units of its own.
+        points: float (n, 3) evenly on the mesh's surface, +z up, in any unit.
         normals: float (n, 3) outwards.
-        seen: At least some dozens of points.
-        free_depth: How deep in free space points are.
+        seen: the object, some dozens of points at least.
+        free_depth: depth of points in free space.
 
     Returns:
         The best fit, however bad: see `Registration.fault`.
     """
     search = _Search(points, normals, seen, free_depth)
-    poses = search.tries()
+    poses = search.candidates()
     for count, steps, kept in zip(_POINTS, _STEPS, (_FINISHED, 1)):
         poses = search.best([search.refine(pose, count, steps) for pose in poses], kept, count)
     return search.registration(poses[0])
 
 
 class _Search:
-    """One mesh and one seen surface, both thinned for repeated use."""
+    """Search for the pose of one mesh on one seen surface."""
 
     def __init__(
         self, points: np.ndarray, normals: np.ndarray, seen: SeenSurface, free_depth: FreeDepth
@@ -133,8 +131,8 @@ class _Search:
         self.width = np.maximum(self.high - self.low, 1e-3)
         self.near_m = max(_NEAR_M, _NEAR_SHARE * float(self.width.max()))
 
-    def tries(self) -> list[Pose]:
-        """Return the most promising of all headings, scales and places."""
+    def candidates(self) -> list[Pose]:
+        """Return the poses of least cost among all headings, scales and positions."""
         poses = []
         for heading in np.arange(_HEADINGS) * (2 * np.pi / _HEADINGS):
             turned = self.points[:, :2] @ Pose(heading, 1.0, np.zeros(3)).rotation[:2, :2].T
@@ -148,7 +146,7 @@ class _Search:
         return self.best(poses, _REFINED, _TRIED)
 
     def _scales(self, size: np.ndarray) -> list[float]:
-        """Return scales at which a turned mesh of that size is as high or as wide as what was seen."""
+        """Return scales at which a turned mesh of that size is as high or as wide as the seen points."""
         ratio = self.width / np.maximum(size, 1e-9)
         out: list[float] = []
         for scale in (ratio[2], ratio.max(), ratio[:2].max(), np.sqrt(ratio[2] * ratio[:2].max())):
@@ -157,7 +155,7 @@ class _Search:
         return out
 
     def _places(self, size: np.ndarray, middle: np.ndarray) -> list[np.ndarray]:
-        """Return where the bottom center may be: the seen box in the middle, or at an end, of what is larger."""
+        """Return positions of the bottom center: the smaller box at the middle of the larger one, or at its ends."""
         ends = []
         for axis in range(2):
             center = (self.low[axis] + self.high[axis]) / 2
@@ -170,11 +168,12 @@ class _Search:
         return [np.array([x, y, z]) for x in ends[0] for y in ends[1] for z in bottoms]
 
     def best(self, poses: list[Pose], kept: int, count: int) -> list[Pose]:
-        """Return the poses of least cost, in that order."""
+        """Return the `kept` poses of least cost, ascending."""
         order = np.argsort([self._cost(pose, count) for pose in poses], kind="stable")
         return [poses[k] for k in order[:kept]]
 
     def _cost(self, pose: Pose, count: int) -> float:
+        """Return the mean truncated distance of seen points plus the mean truncated intrusion of the mesh."""
         distance, _, facing = self._to_mesh(pose, _thinned(len(self.seen.points), count))
         distance = np.where(facing, distance, distance + 0.5 * self.near_m)
         near = 0.5 * self.near_m
@@ -184,21 +183,20 @@ class _Search:
         return float(unexplained + np.minimum(depth / near, 1.0).mean())
 
     def _intrusion(self, points: np.ndarray) -> np.ndarray:
-        """Return how deep (n,) points are in free space, or below what the object stands on."""
+        """Return the depth (n,) of points in free space, or below the support."""
         depth = self.free_depth(points)
         if self.seen.floor_z is None:
             return depth
         return np.maximum(depth, self.seen.floor_z - points[:, 2])
 
     def _to_mesh(self, pose: Pose, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return distances (n,) of seen points from the mesh's surface, its nearest points there, and whether they
-        face the same way."""
+        """Return distances (n,) of seen points to the mesh, their nearest points on it, and whether normals agree."""
         points = self.seen.points[rows]
         _, nearest = self.tree.query(pose.undo(points))
         offset = pose.apply(self.points[nearest]) - points
         normal = self.normals[nearest] @ pose.rotation.T
         along = np.einsum("nk,nk->n", offset, normal)
-        # The surface goes on between its points: sideways by their spacing costs nothing.
+        # The surface continues between its points: tangential distances up to their spacing are free.
         sideways = np.linalg.norm(offset - along[:, None] * normal, axis=1)
         spacing = pose.scale * self._spacing
         distance = np.hypot(along, np.maximum(sideways - spacing, 0.0))
@@ -206,15 +204,13 @@ class _Search:
         facing = ~known | (np.einsum("nk,nk->n", self.seen.normals[rows], normal) > _FACING)
         return distance, nearest, facing
 
-    @property
+    @cached_property
     def _spacing(self) -> float:
-        """Return the usual distance between neighboring points of the mesh, in its units."""
-        if not hasattr(self, "_spaced"):
-            self._spaced = float(np.median(self.tree.query(self.points[::20], k=2)[0][:, 1]))
-        return self._spaced
+        """Median distance between neighboring points of the mesh, in its units."""
+        return float(np.median(self.tree.query(self.points[::20], k=2)[0][:, 1]))
 
     def refine(self, pose: Pose, count: int, steps: int) -> Pose:
-        """Improve a pose by robust symmetric ICP, point to plane and a little point to point."""
+        """Refine a pose by robust symmetric ICP, mostly point to plane."""
         own = _thinned(len(self.seen.points), count)
         mesh = _thinned(len(self.points), count)
         for _ in range(steps):
@@ -228,7 +224,7 @@ class _Search:
         return pose
 
     def _step(self, pose: Pose, own: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:
-        """Return the change of heading, log scale and place (5,) that brings pairs together."""
+        """Return the change (5,) of heading, log scale and position from one set of pairs; None if there are few."""
         seen = self.seen.points[own]
         distance, nearest, facing = self._to_mesh(pose, own)
         near = np.quantile(distance, _TRIMMED)
@@ -238,7 +234,7 @@ class _Search:
         typical = max(float(np.median(distance[keep])), 5e-4)
         moved = [pose.apply(self.points[nearest[keep]])]
         target, normal = [seen[keep]], [self.normals[nearest[keep]] @ pose.rotation.T]
-        # From the mesh: only where something was seen close by; its far side has no partner.
+        # From the mesh only near seen points, as its unseen side has no partner.
         there = pose.apply(self.points[mesh])
         gap, partner = self.seen_tree.query(there, distance_upper_bound=4 * typical + 0.002)
         found = np.isfinite(gap)
@@ -257,7 +253,7 @@ class _Search:
     def _solve(
         self, pose: Pose, moved: np.ndarray, target: np.ndarray, normal: np.ndarray, typical: float
     ) -> np.ndarray:
-        """Least squares over pairs, weighted down with their distance (Geman-McClure)."""
+        """Solve the pairs' least squares, with Geman-McClure weights of the distance along the normal."""
         offset = target - moved
         along = np.einsum("nk,nk->n", offset, normal)
         weight = 1.0 / (1.0 + (along / (2 * typical)) ** 2) ** 2
@@ -273,7 +269,7 @@ class _Search:
         normal_matrix += np.einsum("n,nak,nbk->ab", slide, columns, columns)
         right += np.einsum("n,nak,nk->a", slide, columns, offset)
         size = float(self.width.max())
-        # What the pairs do not tell (the heading of a jar, the depth of a thing seen from one side) stays.
+        # Damping keeps what the pairs do not determine, such as the heading of a jar.
         scale = np.array([size, size, 1.0, 1.0, 1.0]) ** 2 * weight.sum()
         normal_matrix += np.diag(_DAMPING * scale)
         free = [0, 1, 2, 3] if self.seen.floor_z is not None else [0, 1, 2, 3, 4]
@@ -284,7 +280,7 @@ class _Search:
         return change
 
     def registration(self, pose: Pose) -> Registration:
-        """Measure a pose on all that was seen."""
+        """Measure the residuals of a pose on all seen points."""
         distance, _, _ = self._to_mesh(pose, _thinned(len(self.seen.points), 8000))
         depth = self._intrusion(pose.apply(self.points))
         rotation = pose.rotation
@@ -300,5 +296,5 @@ class _Search:
 
 
 def _thinned(total: int, count: int) -> np.ndarray:
-    """Return at most `count` evenly spread rows of `total`."""
+    """Return at most `count` evenly spaced row numbers of `total`."""
     return np.unique(np.linspace(0, total - 1, min(total, count)).round().astype(np.int64))

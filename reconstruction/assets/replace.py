@@ -1,7 +1,8 @@
-"""A mesh of the user's own in place of a reconstructed one (`--overrides`)."""
+"""Replacement of a reconstructed mesh by a user's file (`--overrides`)."""
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +17,12 @@ from registry.errors import UsageError
 
 
 def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = None) -> ObjectAsset:
-    """Return the object with the mesh of a file: metres, upright as in any viewer, standing where the object stood.
+    """Return the object with the mesh of a file, in metres, standing where the object stood.
 
     Args:
-        item: The object.
-        path: Anything that trimesh reads; .glb and .gltf are +y up, all others +z up.
-        config: For the collision shape.
+        item: the object.
+        path: any file that trimesh reads; .glb and .gltf are +y up, all others +z up.
+        config: for the collision shape.
 
     Raises:
         UsageError: the file is missing or holds no usable mesh.
@@ -37,29 +38,29 @@ def replace_mesh(item: ObjectAsset, path: Path, config: AssetsConfig | None = No
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = vertices - np.array([*(low + high)[:2] / 2, low[2]])
     if (high - low).max() > 20 or (high - low).max() < 1e-3:
+        size = (high - low).round(3)
         raise UsageError(
-            f"overrides: {path} of object {item.id} is {(high - low).round(3)} m large; metres are expected"
+            f"overrides: the mesh {path} of object {item.id} is {size} m large; scale it to metres"
         )
     faces = np.asarray(loaded.faces, np.int32)
-    uvs, texture = _looks(loaded, len(vertices))
+    uvs, texture = _texture(loaded, len(vertices))
     body = to_manifold(Solid(vertices, faces)) or hull_solid(vertices)
     choice = MaterialChoice(item.physics.material, False, None, "user's mesh")
     made, had = physical_attributes(body, choice), item.physics
     ranges = replace(had.ranges, mass_kg=made.ranges.mass_kg)
     physics = replace(made, friction=had.friction, restitution=had.restitution, ranges=ranges)
+    source = f"user mesh {path.name}"
     return replace(
         item,
         visual=TexturedMesh(vertices.astype(np.float32), faces, uvs, texture),
         collision=collision_parts(body, config),
         physics=physics,
-        provenance=replace(
-            item.provenance, geometry=f"user mesh {path.name}", appearance=f"user mesh {path.name}"
-        ),
+        provenance=replace(item.provenance, geometry=source, appearance=source),
     )
 
 
-def _looks(loaded, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return uvs (v, 2) and a square texture of a trimesh; a plain colour where it has none."""
+def _texture(loaded: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return uvs (v, 2) and a square texture of a `trimesh.Trimesh`; a plain color where it has none."""
     import cv2
 
     drawn = picture_of(loaded)

@@ -1,27 +1,29 @@
-"""What seems to be behind a thing's far rim: depth and ids err at outlines, and there no frame contradicts them.
+"""Removal of false surface behind an object's far rim, where no frame contradicts errors of depth and ids.
 
-Before a rim, or beside it, other frames see past what one frame got wrong. Behind it they see the rim itself or nothing
-at all, so that two or three pixels of a few frames draw a thing out by centimetres, on the side that no camera was on.
-Such a tail is reported by few frames, by pixels at the outline only, and lies beyond all that was seen well. What is
-left of it are whiskers: next to no volume, but whole centimetres of the thing's box.
+Before or beside a rim, other frames see past the error of one frame. Behind it they see the rim or nothing, so that a
+few outline pixels of a few frames extend the object by centimetres, away from the cameras. Such a tail is reported by
+few frames, by outline pixels only, and lies beyond all well seen surface. Completion leaves whiskers of it: hardly any
+volume, but centimetres of the object's box.
 """
 
 import numpy as np
 
 from registry.geometry import invert_rigid
 
-_SURE_FRAMES = 2  # saw the surface well inside the thing's outline
-_FEW_REPORTS = 0.35  # of the usual number of frames
-_SHADOWED = 2.0  # times as many frames as report surface see the rim before it
-_AWAY_DEG = (-60.0, -30.0, 0.0, 30.0, 60.0)  # off the direction from the cameras to a thing
-_ONE_SIDED = 0.5  # mean of the unit vectors from the cameras, for them to be on one side
-_WELL_PERCENT = 99.7  # of the columns that were seen well: the rest may be tail, too
-_TAIL_SHARE = 0.06  # of the voxels where surface was seen: more is a part of the thing
-_WHISKER_SECTION, _WHISKER_VOLUME = 0.03, 0.0015  # of the usual section, of the thing's volume
+_SURE_FRAMES = 2  # frames with pixels well inside the outline that make surface certain
+_FEW_REPORTS = 0.35  # of the usual number of frames: weakly seen
+_SHADOWED = (
+    2.0  # a weak voxel is false if this many times more frames see the rim before it than surface at it
+)
+_AWAY_DEG = (-60.0, -30.0, 0.0, 30.0, 60.0)  # relative to the mean direction from the cameras
+_ONE_SIDED = 0.5  # least length of the mean unit vector from the cameras, for them to be on one side
+_WELL_PERCENT = 99.7  # of the well seen columns: the rest may be tail, too
+_TAIL_SHARE = 0.06  # greatest share of the surface voxels; more is a part of the object
+_WHISKER_SECTION, _WHISKER_VOLUME = 0.03, 0.0015  # of the usual cross-section, of the object's volume
 
 
 def away_directions(camera_from_grid: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Return level unit vectors (k, 2) away from cameras (n, 4, 4); k = 0 where they look from all around."""
+    """Return horizontal unit vectors (k, 2) away from cameras (n, 4, 4); none if they are all around `middle`."""
     centers = np.array([invert_rigid(pose)[:2, 3] for pose in camera_from_grid]).reshape(-1, 2)
     ways = middle[:2] - centers
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
@@ -35,21 +37,21 @@ def away_directions(camera_from_grid: np.ndarray, middle: np.ndarray) -> np.ndar
 def behind_rims(
     near: np.ndarray, support: np.ndarray, inner: np.ndarray, shadowed: np.ndarray, away: np.ndarray
 ) -> np.ndarray:
-    """Tell which voxels (nx, ny, nz) with surface only have it by what went wrong at outlines.
+    """Return which surface voxels (nx, ny, nz) are errors at outlines.
 
     Args:
-        near: bool, some frames report surface; at least one voxel.
-        support: how many do.
-        inner: how many of them with pixels well inside the thing's outline.
-        shadowed: how many frames see the thing's surface close before the voxel.
-        away: level directions (k, 2) away from the cameras.
+        near: bool (nx, ny, nz) voxels with surface, at least one.
+        support: number of frames that saw it.
+        inner: number of those with pixels well inside the outline.
+        shadowed: number of frames that saw the object's surface close before the voxel.
+        away: directions (k, 2) of `away_directions`.
     """
     weak = near & (inner < _SURE_FRAMES) & (support < _FEW_REPORTS * np.percentile(support[near], 75))
     return (weak & (shadowed > _SHADOWED * support)) | _beyond(near, weak, away)
 
 
 def _beyond(near: np.ndarray, weak: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Tell which weakly seen voxels lie farther from the cameras than what was seen well; a large part is no tail."""
+    """Return the weak voxels farther from the cameras than all well seen ones; none where they are too many."""
     out = np.zeros(near.shape, bool)
     well = np.argwhere((near & ~weak).any(axis=2))
     columns = np.stack(np.meshgrid(*(np.arange(n) for n in near.shape[:2]), indexing="ij"), axis=-1)
@@ -62,12 +64,12 @@ def _beyond(near: np.ndarray, weak: np.ndarray, away: np.ndarray) -> np.ndarray:
 
 
 def without_whiskers(field: np.ndarray, voxel_m: float, *, top: bool) -> np.ndarray:
-    """Return a signed distance field (nx, ny, nz) without what sticks out sideways and is next to nothing.
+    """Cut thin protrusions of little volume off a signed distance field (nx, ny, nz), at its sides.
 
     Args:
         field: metres, positive outside.
-        voxel_m: size of a voxel.
-        top: also without what sticks out upwards, such as remains of things that stood on it.
+        voxel_m: edge of a voxel.
+        top: also at the top, where remains of carried objects are.
     """
     solid = field < 0
     total = int(solid.sum())
@@ -76,7 +78,7 @@ def without_whiskers(field: np.ndarray, voxel_m: float, *, top: bool) -> np.ndar
         if not sections.any():
             break
         slim = sections < _WHISKER_SECTION * np.percentile(sections[sections > 0], 90)
-        first = int(np.argmin(slim))  # from outside, the first section that is not slim
+        first = int(np.argmin(slim))  # from outside, the first thick section
         if 0 < sections[:first].sum() < _WHISKER_VOLUME * total:
             beyond = (first - 0.5 - np.arange(len(sections), dtype=np.float32)) * voxel_m
             beyond = np.moveaxis(beyond[::-sign][:, None, None], 0, axis)

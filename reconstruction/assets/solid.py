@@ -1,4 +1,4 @@
-"""From a signed distance field to one watertight, manifold, light mesh; boxes where nothing better is known."""
+"""Closed triangle meshes: extraction from a signed distance field, cleaning, smoothing, decimation, boxes and hulls."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -10,16 +10,19 @@ from reconstruction.assets.completion import CompletedField
 if TYPE_CHECKING:
     import manifold3d
 
-_LEG_SHARE, _LEG_HEIGHT_SHARE = 0.003, 0.4  # of the largest body's volume, of the thing's height
-_LEG_GAP_M, _LEG_OVERLAP_M = 0.06, 0.003
-_MOST_POINTS = 5000
-_SEEN_SHARE = 0.01  # of a thing's seen points lie on a body that is no crumb, if it is as large as a leg
-_MAX_VOLUME_CHANGE = 0.1  # by decimation
+_LEG_SHARE, _LEG_HEIGHT_SHARE = (
+    0.003,
+    0.4,
+)  # least volume and height of a leg, relative to the main body, to the solid
+_LEG_GAP_M, _LEG_OVERLAP_M = 0.06, 0.003  # widest gap that is bridged; overlap after that
+_MOST_POINTS = 5000  # seen points that are looked up
+_SEEN_SHARE = 0.01  # least share of the seen points on a body that is kept though small
+_MAX_VOLUME_CHANGE = 0.1  # by decimation, relative
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A closed triangle mesh, outward normals."""
+    """A closed triangle mesh with outward normals."""
 
     vertices: np.ndarray  # float64 (v, 3)
     faces: np.ndarray  # int32 (f, 3)
@@ -27,8 +30,18 @@ class Solid:
     @property
     def volume(self) -> float:
         """Return the enclosed volume in cubic metres."""
+        return float(self.tetrahedra.sum() / 6)
+
+    @property
+    def tetrahedra(self) -> np.ndarray:
+        """Return six times the signed volume (f,) that each face spans with the origin."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        return float(np.einsum("nk,nk->n", a, np.cross(b, c)).sum() / 6)
+        return np.einsum("nk,nk->n", a, np.cross(b, c))
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and the upper corner (3,) of the axis-aligned box."""
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
     @property
     def extents(self) -> np.ndarray:
@@ -37,7 +50,7 @@ class Solid:
 
 
 def extract(field: CompletedField, points: np.ndarray | None = None) -> Solid | None:
-    """Return the zero surface of a field, its largest body and others that are no crumbs (`without_crumbs`)."""
+    """Extract a field's zero surface by marching cubes, without small bodies (`without_crumbs`); None if empty."""
     from skimage.measure import marching_cubes
 
     if not (field.distance < 0).any():
@@ -50,15 +63,15 @@ def extract(field: CompletedField, points: np.ndarray | None = None) -> Solid | 
 
 
 def without_crumbs(solid: Solid, points: np.ndarray | None = None, share: float = 0.04) -> Solid | None:
-    """Drop small bodies, and bodies inside others (closed cavities); legs that lost their joint are kept and reach up.
+    """Drop small bodies and closed cavities; None where nothing is left.
 
-    A leg is slim, so that its share of the volume says little: what stands as high as much of the thing belongs to it.
-    So does the rail of a chair's back, of which next to nothing is solid: many of the thing's points were seen on it.
+    Two kinds of small bodies stay: tall ones (legs; a gap to the main body is bridged), and those with many seen points
+    (the rail of a chair's back).
 
     Args:
         solid: closed bodies.
-        points: float64 (k, 3) seen on the thing, in the same frame; None: volume alone decides.
-        share: of the largest body's volume, from which on a body is no crumb.
+        points: float64 (k, 3) seen points in the same frame; None: volume alone decides.
+        share: least volume of a body, relative to the largest.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -70,8 +83,7 @@ def without_crumbs(solid: Solid, points: np.ndarray | None = None, share: float 
     )
     count, label = connected_components(edges, directed=False)
     face_label = label[f[:, 0]]
-    a, b, c = (solid.vertices[f[:, k]] for k in range(3))
-    volumes = np.bincount(face_label, weights=np.einsum("nk,nk->n", a, np.cross(b, c)) / 6, minlength=count)
+    volumes = np.bincount(face_label, weights=solid.tetrahedra / 6, minlength=count)
     if volumes.max() <= 0:
         return None
     main = int(np.argmax(volumes))
@@ -89,8 +101,8 @@ def without_crumbs(solid: Solid, points: np.ndarray | None = None, share: float 
 
 
 def _well_seen(solid: Solid, label: np.ndarray, count: int, points: np.ndarray | None) -> np.ndarray:
-    """Tell which of `count` bodies (`label` of each vertex) much of what was seen of a thing lies on."""
-    from scipy.spatial import cKDTree
+    """Return which of `count` bodies (`label` of each vertex) hold many of the seen points."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     if points is None or len(points) == 0:
         return np.zeros(count, bool)
@@ -100,7 +112,7 @@ def _well_seen(solid: Solid, label: np.ndarray, count: int, points: np.ndarray |
 
 
 def _reaching(leg: np.ndarray, main: np.ndarray) -> np.ndarray:
-    """Return the heights (k,) of a leg stretched upwards to the body above it, where a small gap is between them."""
+    """Return the heights (k,) of a leg's vertices, stretched up over a small gap to the body above it."""
     low, high = leg.min(axis=0), leg.max(axis=0)
     over = np.all((main[:, :2] > low[:2]) & (main[:, :2] < high[:2]), axis=1)
     if not over.any():
@@ -111,9 +123,17 @@ def _reaching(leg: np.ndarray, main: np.ndarray) -> np.ndarray:
     return low[2] + (leg[:, 2] - low[2]) * (1 + (gap + _LEG_OVERLAP_M) / (high[2] - low[2]))
 
 
+def surface_samples(solid: Solid, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return points (count, 3) that are uniformly distributed on the surface."""
+    corner = solid.vertices[solid.faces]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    chosen = rng.choice(len(area), count, p=area / area.sum())
+    return np.einsum("nk,nkc->nc", rng.dirichlet((1.0, 1.0, 1.0), count), corner[chosen])
+
+
 def compact(solid: Solid) -> Solid:
     """Drop vertices that no face uses."""
-    used, inverse = np.unique(solid.faces, return_inverse=True)
+    used, inverse = np.unique(solid.faces, return_inverse=True)[:2]
     return Solid(solid.vertices[used], inverse.reshape(-1, 3).astype(np.int32))
 
 
@@ -138,15 +158,13 @@ def taubin(solid: Solid, iterations: int, fixed: np.ndarray) -> Solid:
 
 
 def lightened(solid: Solid, max_faces: int) -> Solid | None:
-    """Return about `max_faces` faces of a solid by quadric decimation; None where that breaks or shrinks it."""
+    """Decimate to about `max_faces` faces by quadric error; None where the result is open or changes the volume."""
     import fast_simplification
 
     vertices, faces = fast_simplification.simplify(
-        np.ascontiguousarray(solid.vertices, np.float64),
-        np.ascontiguousarray(solid.faces, np.int32),
-        target_count=int(max_faces),
-        agg=4,
-    )
+        np.ascontiguousarray(solid.vertices, np.float64), np.ascontiguousarray(solid.faces, np.int32),
+        target_count=max_faces, agg=4,
+    )[:2]  # fmt: skip
     closed = to_manifold(compact(Solid(vertices.astype(np.float64), faces.astype(np.int32))))
     if closed is None or abs(closed.volume - solid.volume) >= 0.05 * solid.volume + 1e-7:
         return None
@@ -154,7 +172,7 @@ def lightened(solid: Solid, max_faces: int) -> Solid | None:
 
 
 def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
-    """Decimate to a manifold mesh of at most about `max_faces` faces."""
+    """Decimate to a manifold mesh of about `max_faces` faces at most."""
     if len(solid.faces) > max_faces:
         light = lightened(solid, max_faces)
         if light is not None:
@@ -165,36 +183,23 @@ def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
 
 
 def to_manifold(solid: Solid) -> Solid | None:
-    """Return the mesh as manifold3d accepts it, or None where it is not a closed manifold."""
+    """Return the mesh as manifold3d reads it; None where it is not a closed manifold."""
     body = manifold_of(solid)
     return None if body is None else from_manifold(body)
 
 
 def manifold_of(solid: Solid) -> "manifold3d.Manifold | None":
-    """Return the body of a mesh, or None where it is not a closed manifold."""
+    """Return a mesh as a manifold3d body; None where it is not a closed manifold."""
     import manifold3d
 
-    mesh = manifold3d.Mesh(
-        vert_properties=np.ascontiguousarray(solid.vertices, np.float32),
-        tri_verts=np.ascontiguousarray(solid.faces, np.uint32),
-    )
-    mesh.merge()
-    body = manifold3d.Manifold(mesh)
+    body = _read_manifold(solid)
     if body.status() != manifold3d.Error.NoError or body.is_empty() or body.volume() <= 0:
         return None
     return body
 
 
-def from_manifold(body) -> Solid:
-    """Read a manifold3d body."""
-    out = body.to_mesh()
-    return Solid(
-        np.array(out.vert_properties[:, :3], np.float64, order="C"),
-        np.array(out.tri_verts, np.int32, order="C"),
-    )
-
-
-def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
+def _read_manifold(solid: Solid) -> "manifold3d.Manifold":
+    """Return a mesh as a manifold3d body, which has an error status where it is no manifold."""
     import manifold3d
 
     mesh = manifold3d.Mesh(
@@ -202,19 +207,49 @@ def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Soli
         tri_verts=np.ascontiguousarray(solid.faces, np.uint32),
     )
     mesh.merge()
-    body = manifold3d.Manifold(mesh)
+    return manifold3d.Manifold(mesh)
+
+
+def from_manifold(body: "manifold3d.Manifold") -> Solid:
+    """Return the mesh of a manifold3d body."""
+    out = body.to_mesh()
+    vertices = np.array(out.vert_properties[:, :3], np.float64, order="C")
+    return Solid(vertices, np.array(out.tri_verts, np.int32, order="C"))
+
+
+def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
+    """Decimate within a growing tolerance until `max_faces` is reached or the volume changes."""
+    import manifold3d
+
+    body = _read_manifold(solid)
     if body.status() != manifold3d.Error.NoError:
         return solid
     light = body
     for factor in (0.3, 0.6, 1.0, 2.0, 4.0):
         made = body.simplify(tolerance_m * factor)
-        # A tolerance near a body's thickness eats it: a table's top layer is a few millimetres thin.
+        # A tolerance near the thickness of a body destroys it: a table's top layer is a few millimetres thin.
         if abs(made.volume() - body.volume()) > _MAX_VOLUME_CHANGE * body.volume():
             break
         light = made
         if light.num_tri() <= max_faces:
             break
     return from_manifold(light)
+
+
+def raster_section(
+    body: "manifold3d.Manifold", height: float, low: np.ndarray, cell: float, shift: float, shape: np.ndarray
+) -> np.ndarray:
+    """Draw a body's horizontal section: uint8 (rows along y, columns along x), 1 inside, to a sixteenth of a cell.
+
+    `low` (2,) is drawn at coordinate `shift` of the picture, where pixel centers are whole; `shape` is columns, rows.
+    """
+    import cv2
+
+    out = np.zeros((shape[1], shape[0]), np.uint8)
+    outlines = [((outline - low) / cell + shift) * 16 for outline in body.slice(height).to_polygons()]
+    fixed_point = [np.round(outline).astype(np.int32) for outline in outlines]
+    cv2.fillPoly(out, fixed_point, 1, cv2.LINE_8, 4)  # even-odd
+    return out
 
 
 def box_solid(low: np.ndarray, high: np.ndarray) -> Solid:
@@ -238,38 +273,3 @@ def hull_solid(points: np.ndarray) -> Solid:
     inward = np.einsum("nk,nk->n", np.cross(b - a, c - a), a - center) < 0
     faces[inward] = faces[inward][:, ::-1]
     return compact(Solid(np.asarray(points, np.float64), faces.astype(np.int32)))
-
-
-def fit_cuboid(points: np.ndarray, normals: np.ndarray, solid: Solid, tolerance_m: float) -> Solid | None:
-    """Return a box if that is what was seen: nearly all seen points lie on three or more of its faces, none inside.
-
-    The box stands on z = 0; each side lies where the points on it are, unseen sides where the completed solid ends.
-    """
-    low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
-    low[2] = 0.0
-    size = high - low
-    if size.min() < 0.008:
-        return None
-    use = np.linalg.norm(normals, axis=1) > 0.5
-    p, n = points[use], normals[use]
-    if len(p) < 100:
-        return None
-    seen = 0
-    for axis in range(3):
-        for bound, sign in ((low, -1), (high, 1)):
-            on = (n[:, axis] * sign > 0.85) & (
-                np.abs(p[:, axis] - bound[axis]) < max(4 * tolerance_m, 0.1 * size[axis])
-            )
-            if on.sum() > 0.02 * len(p) and not (axis == 2 and sign < 0):
-                bound[axis] = np.median(p[on, axis])
-                seen += 1
-    if seen < 2 or (high - low).min() < 0.008:
-        return None
-    to_faces = np.minimum(np.abs(points - low), np.abs(points - high)).min(axis=1)
-    beyond = np.maximum(np.maximum(low - points, points - high), 0).max(axis=1)
-    fits = (to_faces < tolerance_m) & (beyond < tolerance_m)
-    flat = np.abs(n).max(axis=1) > 0.85
-    box = box_solid(low, high)
-    if fits.mean() < 0.9 or flat.mean() < 0.75 or solid.volume < 0.8 * box.volume:
-        return None
-    return box

@@ -1,7 +1,7 @@
-"""Where things stand: at which height each object meets what carries it, and what thereby is not its carrier's.
+"""Contact between each object and its carrier: height, footprint, and the volume that a carrier must not fill.
 
-Depth is fat at outlines, so that a fused table top carries rims of whatever stands on it. The carrier is built
-without the space that its children fill, and its collision shape is cut level where they stand.
+Depth maps bleed over occlusion boundaries, so that a fused table top carries rims of the objects on it. The carrier's
+volume is freed where its children stand, and its collision shape is cut level there.
 """
 
 from dataclasses import dataclass, replace
@@ -14,58 +14,58 @@ from reconstruction.assets.volume import ObjectFrame, ObjectVolume, without_outl
 from reconstruction.core.types import DepthMaps, Instance, InstanceSet, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
-_SAME_LEVEL_M = 0.015
-# No camera sees the board below a thing, but something carries it: at least this much is there.
-_BOARD_M = 0.02
+_SAME_LEVEL_M = 0.015  # levels of one parent's children that differ by less are the same level
+_BOARD_M = 0.02  # least thickness of the unseen support right below a child
 _FOOTPRINT_SHRINK_M = 0.006
-_SMEAR_REACH_M = 0.06  # depth of a thing smears as far onto what is around it
-_RISE_M = 0.004
-_LEAST_HIDDEN_M, _HIDDEN_BELOW_M = 0.01, 0.02  # the rim of what hides a foot passes for its support
-_LEAST_COVERED_M = 0.02  # of a carrier's sides is seen below the thing that covers it
-_COVERED_REACH_M, _COVERED_OVERLAP_M = 0.008, 0.012  # the sides err by as much
-_COVERED_SHARE, _COVERED_POINTS = 0.5, 30  # of the upper half of its sides
-_MOST_BEHIND = 0.5  # of a thing's volume: a wall that cuts off more is none
-_LEVEL_AROUND = 0.8  # of a rise's outline, where its carrier is at the level of what stands beside it
+_BLEED_REACH_M = 0.06  # how far a child's depth bleeds onto the carrier around it
+_RISE_M = 0.004  # least height of a rise above the contact level
+_LEAST_HIDDEN_M = 0.01  # least occluded height of a foot
+_HIDDEN_BELOW_M = 0.02  # a measured support this far above the foot is the occluding rim
+_LEAST_COVERED_M = 0.02  # least visible height of the sides of a covered carrier
+_COVERED_REACH_M, _COVERED_OVERLAP_M = 0.008, 0.012  # tolerance of the sides, sideways and upwards
+_COVERED_SHARE, _COVERED_POINTS = 0.5, 30  # share and number of the upper side points below the child
+_MOST_BEHIND = 0.5  # a wall that cuts off a larger share of the volume is ignored
+_LEVEL_AROUND = 0.8  # least share of a rise's surroundings at the contact level
 
 
 @dataclass(frozen=True)
 class Standing:
-    """One object on what carries it."""
+    """Contact of one object with its carrier."""
 
     child: int
     parent: int
     level_m: float  # world height of the contact
-    known: bool  # the carrier's surface was measured there
+    known: bool  # the carrier's surface was measured there; False: `level_m` is the object's lowest point
     outline: np.ndarray  # float64 (k, 2) convex footprint of the child, world, counter-clockwise
     top_m: float
 
 
 @dataclass(frozen=True)
 class Stands:
-    """All contacts of a scene, and the points that they were found from."""
+    """All contacts of a scene, and the object points that they were measured from."""
 
     seen: dict[int, SeenPoints]
     by_child: dict[int, Standing]
 
     def level(self, child: int) -> float | None:
-        """Return the height that a child stands at, if it was measured."""
+        """Return the world height of a child's contact; None where it was not measured."""
         found = self.by_child.get(child)
         return found.level_m if found is not None and found.known else None
 
     def on(self, parent: int) -> tuple[Standing, ...]:
-        """Return what stands on a parent."""
+        """Return the contacts of all children of a parent."""
         return tuple(s for s in self.by_child.values() if s.parent == parent)
 
 
 def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found: InstanceSet) -> Stands:
-    """Measure the contacts of all objects with what `support_hint` says that they rest on."""
+    """Measure where each object with 30 seen points or more touches the carrier that its `support_hint` names."""
     from scipy.spatial import ConvexHull, QhullError
 
     seen = {
         o.id: within_outlines(lift_object(posed, depth, pixels, o.id), posed, depth, pixels, o.id)
         for o in found.objects
     }
-    # What has no shape with a name may be the lower part of the thing itself: that is not raised onto it.
+    # An unlabeled carrier may be the lower part of the object itself: it gets no covered top.
     shaped = {o.id for o in found.objects if o.label != "unknown"}
     by_child: dict[int, Standing] = {}
     carriers: dict[int, SeenPoints] = {}
@@ -82,7 +82,7 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
         if foot is not None and (level is None or level - foot > _HIDDEN_BELOW_M):
             level = foot
         middle = np.median(points[:, :2], axis=0)
-        # The outermost points are depth errors at the outline: drop them before the hull.
+        # The outermost points are errors at occlusion boundaries: drop them before the hull.
         flat = points[:: max(1, len(points) // 20_000), :2]
         far = np.linalg.norm(flat - middle, axis=1)
         flat = flat[far <= np.percentile(far, 99.5)]
@@ -99,25 +99,25 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
 
 
 def _hidden_foot(item: Instance, low: float, high: float) -> float | None:
-    """Return the height that the instance's box reaches down to, where what was seen of the thing ends higher up.
+    """Return the bottom of the instance's box where a container's rim occludes the object's foot; else None.
 
-    It is that of the floor of the container whose rim hides the foot; a thing is hidden by half at most.
+    At most the lower half of an object counts as occluded.
     """
     bottom = float(item.center[2] - 0.5 * item.extents_m[2])
     return bottom if _LEAST_HIDDEN_M < low - bottom <= high - low else None
 
 
 def _covered_top(outline: np.ndarray, low: float, level: float, carrier: np.ndarray) -> float | None:
-    """Return the height of the top of a carrier that the thing on it covers, or None where it does not.
+    """Return the height of a carrier's top that its child covers completely; None where it does not.
+
+    Only the sides of such a carrier are seen, and the height where they meet their own support was taken for its top.
+    The wall of a container rises as high, but outside the footprint.
 
     Args:
-        outline: of the thing, seen from above (k, 2).
-        low: where what was seen of the thing ends.
-        level: where the carrier's surface around it seemed to be.
+        outline: the child's footprint (k, 2).
+        low: lowest seen height of the child, world.
+        level: measured height of the carrier's surface, world.
         carrier: points of the carrier (n, 3), world.
-
-    Its sides are all that is seen of such a carrier, and where they meet what it stands on itself passes for its top.
-    The wall of a container rises as high, but around the thing.
     """
     if low - level < _LEAST_COVERED_M:
         return None
@@ -130,9 +130,9 @@ def _covered_top(outline: np.ndarray, low: float, level: float, carrier: np.ndar
 
 
 def _agreed(by_child: dict[int, Standing]) -> dict[int, Standing]:
-    """Give children of one parent whose levels differ by noise only the same level: they stand on one board.
+    """Give children of one parent a common level where their levels differ by noise only.
 
-    What seems to stand up to 3 cm lower than most others around does not sink into their board either.
+    In a group that mostly agrees, children up to 3 cm lower than the others are raised to its level.
     """
     out = dict(by_child)
     for parent in {s.parent for s in by_child.values()}:
@@ -154,16 +154,15 @@ def _agreed(by_child: dict[int, Standing]) -> dict[int, Standing]:
 def without_children(
     volume: ObjectVolume, frame: ObjectFrame, standing: tuple[Standing, ...], grow_m: float
 ) -> ObjectVolume:
-    """Free the space that children fill, and fill in what they stand on.
+    """Free a carrier's volume where its children are, and fill in the board below them.
 
-    Free is what lies above their contact, within their footprint grown by `grow_m` and where their smeared depth
-    raises the carrier (`_smeared`). Solid is a board right below the contact, within the footprint and the
-    carrier's own outline: it was hidden by the child.
+    Free: above each contact, within the child's footprint grown by `grow_m` and where its depth bleeds onto the carrier
+    (`_bleeding`). Solid: a board right below the contact, within the child's footprint and the carrier's own outline,
+    as the child occluded it.
     """
     if not standing:
         return volume
-    distance, known = volume.distance.copy(), volume.known.copy()
-    free, seen = volume.free.copy(), volume.seen.copy()
+    distance, known, free, seen = volume.distance, volume.known, volume.free, volume.seen
     grid_from_world = invert_rigid(frame.world_from_grid)
     x, y, z = (volume.centers(axis) for axis in range(3))
     plane = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
@@ -174,52 +173,45 @@ def without_children(
     shape = (len(x), len(y))
     filled = [_within(plane, corners[:, :2], grow_m).reshape(shape) for corners in corners_of]
     every = np.any(filled, axis=0)
-    # What stands on it may reach beyond its edges: a plate on a small box.
+    # Children may overhang: a plate on a small box.
     own_plan = np.ones(shape, bool)
     if len(frame.points):
         own_plan = _within(plane, _outline(frame.points[:, :2]), volume.voxel_m).reshape(shape)
     carrying = np.zeros(shape, bool)
     for s, corners, own in zip(standing, corners_of, filled):
-        near = _within(plane, corners[:, :2], _SMEAR_REACH_M).reshape(shape)
+        near = _within(plane, corners[:, :2], _BLEED_REACH_M).reshape(shape)
         top = corners[0, 2] + s.top_m - s.level_m
-        inside = own | _smeared(volume, near, every, float(corners[0, 2]), float(top)) if s.known else own
+        inside = own | _bleeding(volume, near, every, float(corners[0, 2]), float(top)) if s.known else own
         above = z - corners[0, 2]
-        # Exactly at the contact the carrier's surface comes out, so that the field stays smooth there.
+        # The field is zero exactly at the contact, which keeps it smooth there.
         wanted = np.clip(above, 0.0, volume.trunc_m).astype(np.float32)
-        layers = np.flatnonzero((above > 0) & (z < corners[0, 2] + (s.top_m - s.level_m) + grow_m))
-        for k in layers:
-            distance[:, :, k][inside] = np.maximum(
-                np.where(known[:, :, k][inside], distance[:, :, k][inside], -np.inf), wanted[k]
-            )
-            known[:, :, k][inside] = True
-            free[:, :, k][inside] = True
-            seen[:, :, k][inside] = above[k] < volume.trunc_m
+        freed = inside[:, :, None] & (above > 0) & (z < corners[0, 2] + (s.top_m - s.level_m) + grow_m)
+        distance = np.where(freed, np.maximum(np.where(known, distance, -np.inf), wanted), distance)
+        known, free = known | freed, free | freed
+        seen = np.where(freed, above < volume.trunc_m, seen)
         core = _within(plane, corners[:, :2], -_FOOTPRINT_SHRINK_M).reshape(shape) & own_plan
         carrying |= core
-        for k in np.flatnonzero((above <= 0) & (above > -max(_BOARD_M, 2.5 * volume.voxel_m))):
-            depth_below = max(float(above[k]), -volume.trunc_m)
-            distance[:, :, k][core] = np.minimum(
-                np.where(known[:, :, k][core], distance[:, :, k][core], np.inf), depth_below
-            )
-            known[:, :, k][core] = True
-            free[:, :, k][core] = False
+        board = core[:, :, None] & (above <= 0) & (above > -max(_BOARD_M, 2.5 * volume.voxel_m))
+        wanted = np.maximum(above, -volume.trunc_m).astype(np.float32)
+        distance = np.where(board, np.minimum(np.where(known, distance, np.inf), wanted), distance)
+        known, free = known | board, free & ~board
     return replace(volume, distance=distance, known=known, free=free, seen=seen, carrying=carrying)
 
 
-def _smeared(
+def _bleeding(
     volume: ObjectVolume, near: np.ndarray, filled: np.ndarray, level: float, top: float
 ) -> np.ndarray:
-    """Tell which columns (nx, ny) of a carrier only seem raised, by the depth of a thing that stands beside them.
+    """Return the columns (nx, ny) of a carrier that are raised only by depth bleeding from a child beside them.
+
+    A connected rise is bleeding where all of it is near the child and no higher than the child, and the carrier around
+    it is at the contact level. The rim of a container extends farther, or has nothing beyond it.
 
     Args:
         volume: the carrier.
-        near: bool (nx, ny) columns within reach of the thing's smear.
-        filled: bool (nx, ny) columns below the things on the carrier.
-        level: height at which the thing stands, grid frame.
-        top: its top, grid frame.
-
-    A rise is smear where all of it is near the thing and lower than it, and the carrier is at the thing's level all
-    around the rise. A rim goes on farther than that, or there is nothing beyond it.
+        near: bool (nx, ny) columns within `_BLEED_REACH_M` of the child's footprint.
+        filled: bool (nx, ny) columns below any child.
+        level: contact height, grid frame.
+        top: height of the child's top, grid frame.
     """
     from scipy.ndimage import binary_dilation, label
 
@@ -232,7 +224,7 @@ def _smeared(
         solid[:, :, (z < least) & (z > level - _BOARD_M - volume.voxel_m)].any(axis=2) & ~raised & ~filled
     )
     out = np.zeros(raised.shape, bool)
-    rises, _ = label(raised, np.ones((3, 3)))
+    rises = label(raised, np.ones((3, 3)))[0]  # pyright: ignore[reportIndexIssue]
     for number in np.unique(rises[near & raised]):
         own = rises == number
         around = binary_dilation(own, np.ones((3, 3))) & ~own & ~filled
@@ -244,7 +236,7 @@ def _smeared(
 
 
 def within_walls(volume: ObjectVolume, frame: ObjectFrame, found: InstanceSet) -> ObjectVolume:
-    """Free what lies behind a wall: the wall seen between the boards of a shelf is none of the shelf's."""
+    """Free the columns behind a wall: wall pixels between the boards of a shelf are not the shelf's."""
     walls = [b.surface.plane for b in found.base if b.label == "wall"]
     if not walls or frame.wall_y is not None:
         return volume
@@ -265,7 +257,7 @@ def within_walls(volume: ObjectVolume, frame: ObjectFrame, found: InstanceSet) -
 
 
 def _outline(points: np.ndarray) -> np.ndarray:
-    """Return the convex outline (k, 2), counter-clockwise, of points (n, 2), the outermost ones left out."""
+    """Return the convex outline (k, 2), counter-clockwise, of points (n, 2) without the outermost ones."""
     from scipy.spatial import ConvexHull, QhullError
 
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
@@ -277,7 +269,7 @@ def _outline(points: np.ndarray) -> np.ndarray:
 
 
 def _within(points: np.ndarray, outline: np.ndarray, grow_m: float) -> np.ndarray:
-    """Tell which points (n, 2) lie in a counter-clockwise convex outline moved outwards by `grow_m`."""
+    """Return which points (n, 2) lie in a counter-clockwise convex outline offset outwards by `grow_m`."""
     inside = np.ones(len(points), bool)
     for a, b in zip(outline, np.roll(outline, -1, axis=0)):
         edge = b - a

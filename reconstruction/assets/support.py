@@ -1,21 +1,21 @@
-"""At which height an object stands: that of its support just below it, where the support was measured around it."""
+"""World height of the support right below an object, measured around the object."""
 
 import numpy as np
 
 from reconstruction.assets.views import SeenPoints
 from reconstruction.core.types import Instance, InstanceSet
 
-_SMEAR_M = (0.025, 0.06)  # smeared depth ends before, and what lies farther off says little
-_SMEAR_HEIGHT_M = 0.03
-_LEVEL_M = 0.003
+_RING_M = (0.025, 0.06)  # distance from the footprint: nearer, the object's depth bleeds onto the support
+_BLEED_HEIGHT_M = 0.03  # greatest height of that slope
+_LEVEL_M = 0.003  # tolerance of a flat support
 
 
 def support_height(
     item: Instance, points: np.ndarray, carrier: SeenPoints | None, found: InstanceSet
 ) -> float | None:
-    """Return the height of what the object stands on, just below it, or None where that is not known.
+    """Return the world height of the support right below an object with points (k, 3); None where it is not known.
 
-    Floors are planes. Other supports are measured: their points (`carrier`) in a ring around the footprint.
+    A floor is a plane. Other supports are measured: their points (`carrier`) in a ring around the footprint.
     """
     lowest = float(np.percentile(points[:, 2], 0.5))
     height = float(np.percentile(points[:, 2], 99.5)) - lowest
@@ -31,27 +31,27 @@ def support_height(
     if len(ring) < 30:
         return None
     level = float(np.percentile(ring, 30))
-    # What encloses the object (a tray's rim) rises beside it; it stands on the low part.
+    # A rim around the object (a tray) is higher than what it stands on: take the low part.
     if level > lowest + 0.01:
         level = float(np.percentile(ring, 8))
     if level > lowest + 0.02 or lowest - level > max(0.04, 0.6 * height):
         return None
     around = _level_around(points, carrier)
-    # Depth smears what is flat into a slope around it, as wide as a few centimetres: it stands at the slope's foot.
-    if around is not None and level - _SMEAR_HEIGHT_M < around < level:
+    # Bleeding turns a flat support into a slope of a few centimetres around the object: take the foot of the slope.
+    if around is not None and level - _BLEED_HEIGHT_M < around < level:
         level = around
     return min(level, lowest + 0.004)
 
 
 def _level_around(points: np.ndarray, support: SeenPoints) -> float | None:
-    """Return the height of a flat support a few centimetres off an object, or None: not flat, or not all around it."""
-    low, high = points[:, :2].min(axis=0) - _SMEAR_M[1], points[:, :2].max(axis=0) + _SMEAR_M[1]
+    """Return the height of the flat support a few centimetres from an object; None: not flat, or not all around it."""
+    low, high = points[:, :2].min(axis=0) - _RING_M[1], points[:, :2].max(axis=0) + _RING_M[1]
     inside = np.all((support.points[:, :2] > low) & (support.points[:, :2] < high), axis=1)
     near = support.points[inside & (support.normals[:, 2] > 0.7)]
     if len(near) < 60:
         return None
     away = _footprint_distance(points, near)
-    ring = near[(away > _SMEAR_M[0]) & (away < _SMEAR_M[1])]
+    ring = near[(away > _RING_M[0]) & (away < _RING_M[1])]
     offset = ring[:, :2] - np.median(points[:, :2], axis=0)
     sector = np.floor((np.arctan2(offset[:, 1], offset[:, 0]) / np.pi + 1) * 6).astype(int) % 12
     heights = [np.median(ring[sector == k, 2]) for k in range(12) if (sector == k).sum() >= 5]
@@ -63,14 +63,14 @@ def _level_around(points: np.ndarray, support: SeenPoints) -> float | None:
 
 
 def _footprint_distance(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return how far (n,) points `near` are from an object's points, seen from above."""
-    from scipy.spatial import cKDTree
+    """Return the distance (n,) of points `near` to an object's points, seen from above."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     return cKDTree(points[:: max(1, len(points) // 5000), :2]).query(near[:, :2])[0]
 
 
 def _support_ring(points: np.ndarray, support: SeenPoints) -> np.ndarray:
-    """Heights of the support's surface in a ring of a few centimetres around the object."""
+    """Return heights (k,) of the support within 1.2, 2.5 or 4 cm of the object: the nearest with 60 points."""
     if len(support.points) == 0:
         return np.zeros(0)
     low, high = points[:, :2].min(axis=0) - 0.04, points[:, :2].max(axis=0) + 0.04

@@ -1,4 +1,4 @@
-"""Rotation and mirror symmetry about vertical axes and planes: found where the seen part agrees, then applied."""
+"""Rotation symmetry about vertical axes and mirror symmetry in vertical planes: detection and completion."""
 
 from dataclasses import dataclass
 
@@ -10,15 +10,19 @@ from reconstruction.assets.volume import ObjectVolume
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A symmetry that what was seen supports."""
+    """A mirror symmetry that the seen points support."""
 
-    kind: str  # "rotation" | "mirror-x" | "mirror-y"
-    center: np.ndarray  # float64 (2,) axis, or a point of the mirror plane, grid frame
-    agreement: float
+    kind: str  # "mirror-x" | "mirror-y"
+    center: np.ndarray  # float64 (2,) a point of the mirror plane, grid frame
+    agreement: float  # share of seen points whose mirror images lie on surface
 
 
 def fit_axis(points: np.ndarray, normals: np.ndarray) -> np.ndarray | None:
-    """Return x, y of the vertical axis that the surface normals meet, if one exists: float64 (2,)."""
+    """Fit a vertical axis that the normals of points (k, 3) meet, by iteratively reweighted least squares.
+
+    Returns:
+        x, y of the axis (2,); None where the normals do not determine one.
+    """
     flat = normals[:, :2]
     size = np.linalg.norm(flat, axis=1)
     use = size > 0.4
@@ -43,16 +47,16 @@ def fit_axis(points: np.ndarray, normals: np.ndarray) -> np.ndarray | None:
 def rotate_complete(
     volume: ObjectVolume, axis: np.ndarray, points: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Complete about a vertical axis: every ring of equal radius and height takes what most of it is known to be.
+    """Complete a volume by rotation: unknown voxels take the mean of their ring where most of it agrees.
 
     Args:
-        volume: The evidence.
+        volume: the evidence.
         axis: x, y of the axis (2,).
-        points: Seen points (k, 3), which decide whether the symmetry holds.
-        normals: Their normals (k, 3); level surface says nothing about the symmetry.
+        points: seen points (k, 3), for the score.
+        normals: their normals (k, 3); level surface does not count.
 
     Returns:
-        Signed distance (nx, ny, nz), whether it is known now, and the share of seen side surface that agrees.
+        Signed distance (nx, ny, nz), whether it is known now, and the share of seen side surface that is round.
     """
     v = volume.voxel_m
     x, y = volume.centers(0) - axis[0], volume.centers(1) - axis[1]
@@ -76,15 +80,12 @@ def rotate_complete(
     out[fill] = ring_mean[fill]
     smooth = known & decided[index] & (np.abs(ring_mean - clipped) < tolerance)
     out[smooth] = 0.3 * clipped[smooth] + 0.7 * ring_mean[smooth]
-    return (
-        out.reshape(volume.distance.shape).astype(np.float32),
-        (known | fill).reshape(volume.known.shape),
-        score,
-    )
+    known_now = (known | fill).reshape(volume.known.shape)
+    return out.reshape(volume.distance.shape).astype(np.float32), known_now, score
 
 
 def _round_share(volume: ObjectVolume, axis: np.ndarray, points: np.ndarray, normals: np.ndarray) -> float:
-    """Share of seen side surface that has the usual radius of its height (outside and inside apart)."""
+    """Return the share of seen side surface at the median radius of its height, outside and inside apart."""
     sideways = np.hypot(normals[:, 0], normals[:, 1]) > 0.7
     if sideways.sum() < 50:
         return 0.0
@@ -107,6 +108,7 @@ def _round_share(volume: ObjectVolume, axis: np.ndarray, points: np.ndarray, nor
 
 
 def _sample(volume: ObjectVolume, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interpolated distance at points (n, 3), and whether it is known there."""
     cell = ((points - volume.origin) / volume.voxel_m - 0.5).T
     value = map_coordinates(volume.distance, cell, order=1, mode="nearest")
     nearest = np.round(cell).astype(int)
@@ -116,7 +118,7 @@ def _sample(volume: ObjectVolume, points: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def find_mirror(volume: ObjectVolume, points: np.ndarray, axis: int) -> Symmetry | None:
-    """Find the mirror plane across `axis` (0: x, 1: y) near the middle that the seen points support best."""
+    """Return the best mirror plane across `axis` (0: x, 1: y) near the middle; None where the points support none."""
     thin = points[:: max(1, len(points) // 4000)]
     low, high = np.percentile(thin[:, axis], [1, 99])
     middle, reach = (low + high) / 2, 0.15 * (high - low)
@@ -142,7 +144,7 @@ def find_mirror(volume: ObjectVolume, points: np.ndarray, axis: int) -> Symmetry
 
 
 def mirror_complete(volume: ObjectVolume, found: Symmetry) -> tuple[np.ndarray, np.ndarray]:
-    """Give unknown voxels what their mirror images are known to be."""
+    """Fill unknown voxels from their mirror images; return the distance (nx, ny, nz) and whether it is known now."""
     axis = 0 if found.kind == "mirror-x" else 1
     n = volume.distance.shape[axis]
     position = (2 * found.center[axis] - volume.centers(axis) - volume.origin[axis]) / volume.voxel_m - 0.5

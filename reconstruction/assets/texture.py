@@ -1,8 +1,7 @@
-"""Texture coordinates, and colours baked from the frames that see each texel best.
+"""Texture atlases, and colors baked into them from keyframes.
 
-Every texel is looked up in the chosen frames where the object's own mesh does not hide it and the instance map says
-that the pixel is the object's. Frames are brought to one exposure, the best few colours are blended, unseen texels
-take colours from the nearest seen surface.
+A texel takes the blend of the best few frames that show it: where the object's own mesh does not occlude it and the
+instance map has the object's id. Exposures are equalized first. Unseen texels take colors of the nearest seen surface.
 """
 
 from dataclasses import dataclass
@@ -20,31 +19,31 @@ from registry.geometry import invert_rigid
 if TYPE_CHECKING:
     from reconstruction.assets.generation.complete import SurfaceColors
 
-_GAIN = (0.6, 1.6)  # by which generated colors may be brought to those of the frames
+_GAIN = (0.6, 1.6)  # range of the gains that match a generator's colors to the frames
 
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels that a mesh uses, with their places on it."""
+    """The texels of a mesh's atlas that lie in triangles, with their surface points."""
 
     rows: np.ndarray  # int32 (t,)
     columns: np.ndarray  # int32 (t,)
     points: np.ndarray  # float64 (t, 3)
-    normals: np.ndarray  # float64 (t, 3)
+    normals: np.ndarray  # float64 (t, 3) of the faces
 
 
 @dataclass(frozen=True)
 class Baked:
-    """A texture and where it came from."""
+    """A baked texture and its source frames."""
 
     texture: np.ndarray  # uint8 (s, s, 3), row 0 at v = 1
-    seen_share: float  # of the mesh's area
-    frames: np.ndarray  # int32 (k,) frame rows, best first
-    mean_rgb: np.ndarray  # float64 (3,) of what was seen
+    seen_share: float  # of the texels
+    frames: np.ndarray  # int32 (k,) rows of the keyframes, best first
+    mean_rgb: np.ndarray  # float (3,) of the seen texels
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a mesh into charts: indices of the original vertices (v,), faces (f, 3), uvs (v, 2) with padding."""
+    """Cut a mesh into padded charts: indices of the original vertices (v,), faces (f, 3), uvs (v, 2)."""
     import xatlas
 
     atlas = xatlas.Atlas()
@@ -64,7 +63,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def texels_of(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, size: int) -> Texels:
-    """Find the texel centres that lie in triangles, with their points and face normals."""
+    """Return the texels whose centers lie in triangles, with their points and face normals."""
     flat = np.column_stack([uvs[:, 0] * size, (1 - uvs[:, 1]) * size, np.ones(len(uvs))])
     camera = Camera(size, size, 1.0, 1.0, 0.0, 0.0)
     raster = rasterize_mesh(flat, faces, camera, np.eye(4))
@@ -78,8 +77,8 @@ def texels_of(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, size: in
 
 
 def choose_frames(posed: PosedFrames, pixels: ScenePixels, target: int, limit: int) -> np.ndarray:
-    """Choose frames that see the object large, sharp and from different sides; best first: int32 (k,)."""
-    count = (pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1).astype(np.float64)
+    """Choose frames that see the object large, sharp and from apart: int32 (k,), best first."""
+    count = pixels.counts(target).astype(np.float64)
     sharp = np.asarray(posed.sharpness, np.float64)
     sharp = sharp / max(float(np.median(sharp)), 1e-12)
     score = count * np.clip(sharp, 0.3, 1.5)
@@ -98,63 +97,63 @@ def choose_frames(posed: PosedFrames, pixels: ScenePixels, target: int, limit: i
 
 
 @dataclass(frozen=True)
-class Looks:
-    """Frames prepared to look surface points up in."""
+class TextureViews:
+    """Keyframes that surface points take their colors from."""
 
-    frames: np.ndarray  # int32 (k,) frame rows
+    frames: np.ndarray  # int32 (k,) rows of the keyframes
     camera_from_world: np.ndarray  # float64 (k, 4, 4)
-    centers: np.ndarray  # float64 (k, 3)
+    centers: np.ndarray  # float64 (k, 3) of the cameras
     images: np.ndarray  # uint8 (k, h, w, 3)
-    depths: np.ndarray  # float32 (k, hd, wd) of the surface itself where the frame shows it, else 0
+    depths: np.ndarray  # float32 (k, hd, wd) of the surface itself, 0 where another instance is seen
     borders: np.ndarray  # float32 (k, hd, wd) weight, falling towards the outline
-    intrinsics: tuple[float, float, float, float]
-    depth_intrinsics: tuple[float, float, float, float]
+    intrinsics: tuple[float, ...]  # fx, fy, cx, cy of the images
+    depth_intrinsics: tuple[float, ...]
 
-    def arguments(self) -> tuple:
+    def arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return what the kernels take, in their order."""
         return self.camera_from_world, self.centers, self.images, self.depths, self.borders
 
 
-def prepare_looks(
-    posed: PosedFrames,
-    depth_camera: Camera,
-    frames: np.ndarray,
-    depths: list[np.ndarray],
-    borders: list[np.ndarray],
-) -> Looks:
-    """Gather what baking needs of the chosen frames."""
+def texture_views(
+    posed: PosedFrames, depth_camera: Camera, frames: np.ndarray, depths: list[np.ndarray], borders: list[np.ndarray]
+) -> TextureViews:  # fmt: skip
+    """Gather the views of the keyframes at rows `frames`; `depths` and `borders` are theirs."""
     shape = (len(frames), depth_camera.height, depth_camera.width)
-    cameras = [posed.camera, depth_camera]
     poses = posed.world_from_camera[frames].reshape(-1, 4, 4)
-    return Looks(
+    return TextureViews(
         np.asarray(frames, np.int32),
         np.ascontiguousarray(invert_rigid(poses)),
         np.ascontiguousarray(poses[:, :3, 3]),
         np.ascontiguousarray(posed.images[frames]),
         np.array(depths, np.float32).reshape(shape),
         np.array(borders, np.float32).reshape(shape),
-        *((float(c.fx), float(c.fy), float(c.cx), float(c.cy)) for c in cameras),
+        tuple(posed.camera.intrinsics.tolist()),
+        tuple(depth_camera.intrinsics.tolist()),
     )
 
 
 def collect_colors(
-    texels: Texels, looks: Looks, tolerance_m: float
+    texels: Texels, views: TextureViews, tolerance_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blend all texels from the frames: colours (t, 3), seen (t,), and each frame's share of the work (k,)."""
+    """Blend all texels from the views.
+
+    Returns:
+        Colors float32 (t, 3), whether any view shows them (t,), and each view's total weight (k,).
+    """
     from reconstruction.assets.kernels import blend_frames, sample_frames
 
     count = len(texels.points)
-    if len(looks.frames) == 0 or count == 0:
-        return np.zeros((count, 3), np.float32), np.zeros(count, bool), np.zeros(len(looks.frames))
+    if len(views.frames) == 0 or count == 0:
+        return np.zeros((count, 3), np.float32), np.zeros(count, bool), np.zeros(len(views.frames))
     some = np.arange(0, count, max(1, count // 12000))
     colors, weights = sample_frames(
-        texels.points[some], texels.normals[some], *looks.arguments(), looks.intrinsics, looks.depth_intrinsics,
+        texels.points[some], texels.normals[some], *views.arguments(), views.intrinsics, views.depth_intrinsics,
         tolerance_m,
     )  # fmt: skip
     gains = exposure_gains(colors, weights)[:, 0].astype(np.float32)
     color, seen = blend_frames(
-        np.ascontiguousarray(texels.points), np.ascontiguousarray(texels.normals), *looks.arguments(), gains,
-        looks.intrinsics, looks.depth_intrinsics, tolerance_m,
+        np.ascontiguousarray(texels.points), np.ascontiguousarray(texels.normals), *views.arguments(), gains,
+        views.intrinsics, views.depth_intrinsics, tolerance_m,
     )  # fmt: skip
     return color, seen, weights.sum(axis=1, dtype=np.float64)
 
@@ -164,7 +163,10 @@ def bake_object(
     depth_camera: Camera, pixels: ScenePixels, config: AssetsConfig, tolerance_m: float,
     beneath: "SurfaceColors | None" = None,
 ) -> Baked:  # fmt: skip
-    """Bake the texture of one object from the frames that see it; what none sees has the colors `beneath`, if any."""
+    """Bake the texture of object `target` from the frames that see it; unseen texels take the colors `beneath`, if any.
+
+    A frame sees a texel where its depth differs from the mesh's by `tolerance_m` at most.
+    """
     frames = choose_frames(posed, pixels, target, config.texture_frames)
     size = _texture_size(vertices_world, faces, uvs, frames, posed, config)
     texels = texels_of(vertices_world, faces, uvs, size)
@@ -175,25 +177,20 @@ def bake_object(
         )
         mask = cv2.erode((pixels.ids[frame] == target).astype(np.uint8), np.ones((3, 3), np.uint8))
         borders.append(np.minimum(cv2.distanceTransform(mask, cv2.DIST_L2, 3), 6.0) / 6.0)
-    looks = prepare_looks(posed, depth_camera, frames, depths, borders)
-    color, seen, share = collect_colors(texels, looks, tolerance_m)
-    filled = None if beneath is None else _looked_up(texels, color, seen, beneath)
-    return _finish(texels, color, seen, size, frames, share, filled)
+    views = texture_views(posed, depth_camera, frames, depths, borders)
+    color, seen, share = collect_colors(texels, views, tolerance_m)
+    filled = None if beneath is None else _transferred(texels, color, seen, beneath)
+    return _painted(texels, color, seen, size, frames, share, filled)
 
 
 def _texture_size(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    uvs: np.ndarray,
-    frames: np.ndarray,
-    posed: PosedFrames,
+    vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, frames: np.ndarray, posed: PosedFrames,
     config: AssetsConfig,
-) -> int:
-    """Side of the texture at which a texel is about a pixel of the nearest frame."""
+) -> int:  # fmt: skip
+    """Return the texture's side at which a texel is about as large as a pixel of the nearest frame."""
     corner, flat = vertices[faces], uvs[faces]
-    area = (
-        np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
-    )
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = np.linalg.norm(normals, axis=1).sum() / 2
     e1, e2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     used = np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]).sum() / 2
     if len(frames) == 0 or used <= 0:
@@ -201,15 +198,22 @@ def _texture_size(
     center = vertices.mean(axis=0)
     distance = np.linalg.norm(posed.world_from_camera[frames][:, :3, 3] - center, axis=1).min()
     pixel = max(distance, 0.1) / posed.camera.fx
-    wanted = np.sqrt(area / used) / pixel
-    size = config.texture_min_px
-    while size < min(wanted, config.texture_max_px):
-        size *= 2
-    return min(size, config.texture_max_px)
+    return texture_side(np.sqrt(area / used) / pixel, config.texture_min_px, config.texture_max_px)
+
+
+def texture_side(wanted_px: float, least_px: int, most_px: int) -> int:
+    """Double `least_px` until it reaches `wanted_px`, but not beyond `most_px`."""
+    side = least_px
+    while side < min(wanted_px, most_px):
+        side *= 2
+    return min(side, most_px)
 
 
 def exposure_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """One gain per frame (k, 1) that makes frames agree where they see the same texels; mean gain 1."""
+    """Return gains (k, 1), geometric mean 1, that equalize colors (k, t, 3) of the texels that frames see alike.
+
+    `weights` (k, t) are 0 where a frame does not see a texel.
+    """
     gains = np.ones(len(colors))
     luminance = colors.mean(axis=2)
     seen = weights > 0
@@ -224,17 +228,17 @@ def exposure_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return (gains / np.exp(np.log(gains).mean()))[:, None]
 
 
-def _finish(
+def _painted(
     texels: Texels, color: np.ndarray, seen: np.ndarray, size: int, frames: np.ndarray, share: np.ndarray,
-    filled: np.ndarray | None = None,
+    filled: np.ndarray | None,
 ) -> Baked:  # fmt: skip
-    """Fill unseen texels (from `filled`, else from the nearest seen surface), and grow charts over their borders."""
+    """Draw the texels, unseen ones from `filled` or else the nearest seen surface; extend charts past their borders."""
     known = seen.copy()
     if filled is not None:
         color[~seen] = filled[~seen]
         known[:] = True
     elif seen.any() and not seen.all():
-        # Every few texels is enough: what lies between is interpolated.
+        # A coarse subset suffices: the texels between are interpolated.
         step = 1
         while (~seen).sum() / step**2 > 6000:
             step += 1
@@ -244,9 +248,10 @@ def _finish(
     elif not seen.any():
         color[:] = 150.0
         known[:] = True
-    mean = (
-        color[seen].mean(axis=0) if seen.any() else (np.full(3, 150.0) if filled is None else color.mean(0))
-    )
+    if seen.any():
+        mean = color[seen].mean(axis=0)
+    else:
+        mean = np.full(3, 150.0) if filled is None else color.mean(0)
     picture = np.zeros((size, size, 3), np.float32)
     drawn = np.zeros((size, size), bool)
     picture[texels.rows[known], texels.columns[known]] = color[known]
@@ -262,9 +267,9 @@ def _finish(
     )
 
 
-def _looked_up(texels: Texels, color: np.ndarray, seen: np.ndarray, beneath: "SurfaceColors") -> np.ndarray:
-    """Return colors float32 (t, 3) of the nearest surface that faces alike, as bright as the frames have it."""
-    from scipy.spatial import cKDTree
+def _transferred(texels: Texels, color: np.ndarray, seen: np.ndarray, beneath: "SurfaceColors") -> np.ndarray:
+    """Return colors float32 (t, 3) of the nearest surface of like normal, with gains that match the seen texels."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     size = max(float(np.ptp(texels.points, axis=0).max()), 1e-6)
     own = np.concatenate([beneath.points, 0.05 * size * beneath.normals], axis=1)
@@ -277,8 +282,8 @@ def _looked_up(texels: Texels, color: np.ndarray, seen: np.ndarray, beneath: "Su
 
 
 def _from_neighbours(texels: Texels, color: np.ndarray, seen: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Mean colour of the nearest seen texels, near in place and facing alike."""
-    from scipy.spatial import cKDTree
+    """Return the mean color of the nearest seen texels, by position and normal."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     size = max(float(np.ptp(texels.points, axis=0).max()), 1e-6)
     feature = np.concatenate([texels.points, 0.12 * size * texels.normals], axis=1)
@@ -292,18 +297,15 @@ def _from_neighbours(texels: Texels, color: np.ndarray, seen: np.ndarray, wanted
 
 
 def push_pull(picture: np.ndarray, filled: np.ndarray) -> np.ndarray:
-    """Fill the pixels that are not `filled` smoothly from those that are, over a pyramid."""
+    """Fill the pixels that are not `filled` smoothly from those that are (pull-push, Gortler et al. 1996)."""
     weight = filled.astype(np.float32)
     if filled.all() or not filled.any():
         return picture
-    levels = [(picture * weight[..., None], weight)]
+    levels: list[tuple[np.ndarray, np.ndarray]] = [(picture * weight[..., None], weight)]
     while min(levels[-1][1].shape) > 1 and (levels[-1][1] == 0).any():
         c, w = levels[-1]
         shape = (max(1, (c.shape[1] + 1) // 2), max(1, (c.shape[0] + 1) // 2))
-        c2, w2 = (
-            cv2.resize(c, shape, interpolation=cv2.INTER_AREA),
-            cv2.resize(w, shape, interpolation=cv2.INTER_AREA),
-        )
+        c2, w2 = (np.asarray(cv2.resize(image, shape, interpolation=cv2.INTER_AREA)) for image in (c, w))
         full = np.minimum(w2 * 4, 1.0) / np.maximum(w2, 1e-12)
         levels.append((c2 * full[..., None], w2 * full))
     c, w = levels[-1]
@@ -315,7 +317,7 @@ def push_pull(picture: np.ndarray, filled: np.ndarray) -> np.ndarray:
 
 
 def textured(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, texture: np.ndarray) -> TexturedMesh:
-    """Assemble the mesh type of `reconstruction.core.types`."""
+    """Convert to the array types of `TexturedMesh`."""
     return TexturedMesh(
         np.ascontiguousarray(vertices, np.float32),
         np.ascontiguousarray(faces, np.int32),

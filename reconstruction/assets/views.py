@@ -1,17 +1,16 @@
-"""What the frames know of each pixel beside its depth: how squarely it was seen, and how noisy depth is at all.
-
-Prepared once per scene and shared by all objects.
-"""
+"""Depth pixels of all frames with viewing angles and noise, computed once per scene, and the points of one object."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from reconstruction.core.types import DepthMaps, PosedFrames
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
 from registry.geometry import invert_rigid, transform_points
 
-_OUTLINE_PX = 3  # so far inside its outline a thing's pixels are surely its own
+_OUTLINE_PX = 3  # depth and ids are unreliable this close to an instance's outline
+_NEAR_M = 0.05  # nearer points do not project
+FEW_PIXELS = 8  # frames that show no more of an object are ignored
 
 
 @dataclass(frozen=True)
@@ -21,9 +20,13 @@ class ScenePixels:
     depth: np.ndarray  # float32 (n, h, w) z-depth, 0 = unknown
     confidence: np.ndarray  # uint8 (n, h, w)
     ids: np.ndarray  # uint16 (n, h, w)
-    cosine: np.ndarray  # float32 (n, h, w) of the angle between ray and surface normal; 0 at depth edges
-    inner: np.ndarray  # bool (n, h, w) the pixels around show the same thing: depth and ids err at outlines
+    cosine: np.ndarray  # float32 (n, h, w) between ray and surface normal; 0 at depth discontinuities
+    inner: np.ndarray  # bool (n, h, w) farther than `_OUTLINE_PX` from other instances
     noise_relative: float  # 1-sigma of depth over depth
+
+    def counts(self, target: int) -> np.ndarray:
+        """Return how many pixels of each frame show instance `target` (n,)."""
+        return (self.ids == target).reshape(len(self.ids), -1).sum(axis=1)
 
 
 def prepare_pixels(posed: PosedFrames, depth: DepthMaps, id_maps: np.ndarray) -> ScenePixels:
@@ -31,29 +34,41 @@ def prepare_pixels(posed: PosedFrames, depth: DepthMaps, id_maps: np.ndarray) ->
     from reconstruction.assets.kernels import incidence_cosines
 
     maps = np.ascontiguousarray(depth.depth, np.float32)
-    camera = depth.camera
-    cosine = incidence_cosines(maps, camera.fx, camera.fy, camera.cx, camera.cy)
     ids = np.ascontiguousarray(id_maps, np.uint16)
     return ScenePixels(
         maps,
         np.ascontiguousarray(depth.confidence, np.uint8),
         ids,
-        cosine,
+        incidence_cosines(maps, *depth.camera.intrinsics),
         inner_pixels(ids),
         measure_noise(posed, depth),
     )
 
 
 def inner_pixels(ids: np.ndarray) -> np.ndarray:
-    """Tell which pixels (n, h, w) of id images have the same id all around, `_OUTLINE_PX` pixels far."""
+    """Return which pixels (n, h, w) of id images have the same id everywhere within `_OUTLINE_PX`."""
     kernel = np.ones((2 * _OUTLINE_PX + 1,) * 2, np.uint8)
     return np.stack([cv2.erode(image, kernel) == cv2.dilate(image, kernel) for image in ids])
 
 
-def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:
-    """Return the relative 1-sigma of depth from how well neighbouring frames agree, within [0.0005, 0.02].
+def pixels_of(
+    local: np.ndarray, camera: Camera, border: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project points (n, 3) of the camera's frame to pixels.
 
-    Pixels of one frame are moved into the next one; differences above 4 % are occlusions, not noise.
+    Returns:
+        Rows and columns int64 (n,), and which points lie in the image, `border` pixels from its edge at least.
+    """
+    u, v = camera.project(np.column_stack([local[:, :2], np.maximum(local[:, 2], 1e-6)]))
+    row, column = np.floor(v).astype(int), np.floor(u).astype(int)
+    inside = (local[:, 2] > _NEAR_M) & (column >= border) & (row >= border)
+    return row, column, inside & (column < camera.width - border) & (row < camera.height - border)
+
+
+def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:
+    """Return the relative 1-sigma of depth from the agreement of near frames, within [0.0005, 0.02].
+
+    Each second frame is warped into the one two frames later; differences above 4 % are occlusions, not noise.
     """
     camera, maps = depth.camera, depth.depth
     differences = []
@@ -62,23 +77,16 @@ def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:
         b = a + 2
         flat = np.flatnonzero(np.asarray(maps[a]).ravel() > 0)[::step]
         v, u = np.divmod(flat, camera.width)
-        z = maps[a][v, u].astype(np.float64)
-        local = np.stack(
-            [(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], -1
-        )
+        local = camera.unproject(u + 0.5, v + 0.5, maps[a][v, u].astype(np.float64))
         world = transform_points(posed.world_from_camera[a], local)
         seen = transform_points(invert_rigid(posed.world_from_camera[b]), world)
-        front = seen[:, 2] > 0.05
-        seen = seen[front]
-        u2 = np.floor(camera.fx * seen[:, 0] / seen[:, 2] + camera.cx).astype(int)
-        v2 = np.floor(camera.fy * seen[:, 1] / seen[:, 2] + camera.cy).astype(int)
-        inside = (u2 >= 0) & (v2 >= 0) & (u2 < camera.width) & (v2 < camera.height)
-        there = maps[b][v2[inside], u2[inside]].astype(np.float64)
+        row, column, inside = pixels_of(seen, camera)
+        there = maps[b][row[inside], column[inside]].astype(np.float64)
         relative = (there - seen[inside, 2]) / seen[inside, 2]
         differences.append(relative[(there > 0) & (np.abs(relative) < 0.04)])
     if not differences or sum(map(len, differences)) < 100:
         return 0.01
-    # The 80 % quantile rather than the median: errors have heavy tails, most of all on small things.
+    # The 80 % quantile instead of the median, as errors have heavy tails, most of all on small objects.
     sigma = np.percentile(np.abs(np.concatenate(differences)), 80) / 1.2816 / np.sqrt(2.0)
     return float(np.clip(sigma, 0.0005, 0.02))
 
@@ -86,8 +94,7 @@ def measure_noise(posed: PosedFrames, depth: DepthMaps) -> float:
 def object_noise(
     posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, seen: "SeenPoints", target: int
 ) -> float:
-    """Return the relative 1-sigma of depth on one object: small things are seen worse than the room as a whole."""
-    camera = depth.camera
+    """Return the relative 1-sigma of depth on one object, at least the scene's: small objects have noisier depth."""
     frames = np.unique(seen.frames)
     thin = slice(None, None, max(1, len(seen.points) // 6000))
     points, rows = seen.points[thin], np.searchsorted(frames, seen.frames[thin])
@@ -98,11 +105,8 @@ def object_noise(
         f = frames[other[valid]]
         local = np.einsum("nij,nj->ni", invert_rigid(posed.world_from_camera[f])[:, :3, :3], points[valid])
         local += invert_rigid(posed.world_from_camera[f])[:, :3, 3]
-        z = np.maximum(local[:, 2], 1e-3)
-        u = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(int)
-        v = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(int)
-        inside = (local[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        f, u, v, z = f[inside], u[inside], v[inside], z[inside]
+        row, column, inside = pixels_of(local, depth.camera)
+        f, u, v, z = f[inside], column[inside], row[inside], local[inside, 2]
         there = pixels.depth[f, v, u].astype(np.float64)
         same = (pixels.ids[f, v, u] == target) & (there > 0) & (pixels.cosine[f, v, u] > 0)
         relative = (there[same] - z[same]) / z[same]
@@ -116,18 +120,18 @@ def object_noise(
 
 @dataclass(frozen=True)
 class SeenPoints:
-    """Depth pixels of one object, lifted."""
+    """Depth pixels of one object, unprojected to world space."""
 
     points: np.ndarray  # float64 (k, 3) world
     normals: np.ndarray  # float64 (k, 3) world, towards the camera; zero where unknown
-    frames: np.ndarray  # int32 (k,) frame row
-    pixel_m: np.ndarray  # float64 (k,) size of a pixel at the point
+    frames: np.ndarray  # int32 (k,) row of the keyframe
+    pixel_m: np.ndarray  # float64 (k,) width of a pixel at the point
 
 
 def lift_object(
     posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, target: int, limit: int = 60_000
 ) -> SeenPoints:
-    """Lift the depth pixels of instance `target`, evenly thinned to about `limit` points, with normals."""
+    """Unproject the depth pixels of instance `target`, evenly thinned to `limit` points at most, with normals."""
     camera = depth.camera
     rows, v, u = np.nonzero((pixels.ids == target) & (pixels.depth > 0))
     if len(rows) > limit:
@@ -145,30 +149,22 @@ def lift_object(
 def within_outlines(
     seen: SeenPoints, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, target: int, votes: int = 20
 ) -> SeenPoints:
-    """Drop points that frames see past: they project beside the object's outline and nothing there hides them.
+    """Drop points that frames see past: they project outside the object's outline and nothing occludes them there.
 
-    Outlines follow the picture's edges, depth does not: what it says beyond them are skirts.
+    Outlines follow image edges; depth bleeds over them. Up to `votes` frames are asked.
     """
-    camera = depth.camera
-    shown = np.flatnonzero((pixels.ids == target).reshape(len(pixels.ids), -1).sum(axis=1) > 8)
+    shown = np.flatnonzero(pixels.counts(target) > FEW_PIXELS)
     if len(seen.points) == 0 or len(shown) < 4:
         return seen
     shown = shown[np.unique(np.linspace(0, len(shown) - 1, votes).round().astype(int))]
     inside, outside = np.zeros(len(seen.points), np.int32), np.zeros(len(seen.points), np.int32)
     for f in shown:
         local = transform_points(invert_rigid(posed.world_from_camera[f]), seen.points)
-        z = np.maximum(local[:, 2], 1e-3)
-        u = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(int)
-        v = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(int)
-        valid = (local[:, 2] > 0.05) & (u >= 1) & (v >= 1) & (u < camera.width - 1) & (v < camera.height - 1)
+        v, u, valid = pixels_of(local, depth.camera, border=1)
         row = np.flatnonzero(valid)
-        u, v, z = u[valid], v[valid], z[valid]
+        u, v, z = u[valid], v[valid], local[valid, 2]
         own = pixels.ids[f] == target
-        beside = own.copy()
-        beside[1:] |= own[:-1]
-        beside[:-1] |= own[1:]
-        beside[:, 1:] |= own[:, :-1]
-        beside[:, :-1] |= own[:, 1:]
+        beside = cv2.dilate(own.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0
         there = pixels.depth[f, v, u]
         agrees = own[v, u] & (np.abs(there - z) < 0.015 * z)
         passed = ~beside[v, u] & (there > z) & (pixels.cosine[f, v, u] > 0)
@@ -180,16 +176,15 @@ def within_outlines(
     return SeenPoints(seen.points[keep], seen.normals[keep], seen.frames[keep], seen.pixel_m[keep])
 
 
-def _pixel_normals(pixels: ScenePixels, camera, rows, v, u) -> np.ndarray:
-    """Normals in camera space from central differences over two pixels; zero at depth edges."""
+def _pixel_normals(
+    pixels: ScenePixels, camera: Camera, rows: np.ndarray, v: np.ndarray, u: np.ndarray
+) -> np.ndarray:
+    """Return normals (k, 3), camera frame, from central differences over two pixels; zero at depth discontinuities."""
     maps = pixels.depth
     height, width = maps.shape[1:]
 
     def lift(vv: np.ndarray, uu: np.ndarray) -> np.ndarray:
-        z = maps[rows, vv, uu].astype(np.float64)
-        return np.stack(
-            [(uu + 0.5 - camera.cx) / camera.fx * z, (vv + 0.5 - camera.cy) / camera.fy * z, z], -1
-        )
+        return camera.unproject(uu + 0.5, vv + 0.5, maps[rows, vv, uu].astype(np.float64))
 
     right, left = lift(v, np.minimum(u + 2, width - 1)), lift(v, np.maximum(u - 2, 0))
     down, up = lift(np.minimum(v + 2, height - 1), u), lift(np.maximum(v - 2, 0), u)

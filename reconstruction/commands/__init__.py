@@ -1,1 +1,1 @@
-"""The verbs of the `simrecon` command, one module each; nothing heavy is imported before a verb is chosen."""
+"""Verbs of the `simrecon` command, one module each; heavy modules are imported when the verb runs."""

@@ -1,42 +1,42 @@
-"""`simrecon benchmark`: a suite of tasks from scenes, policies in it, and what differs between them."""
+"""`simrecon benchmark`: generates suites of tasks, runs and compares policies, records demonstrations."""
 
 import argparse
-import textwrap
 from pathlib import Path
 
 from reconstruction.commands.environments import run_by_name
+from reconstruction.commands.options import add_common, add_verb
 
 _RUNNER = "simrecon_envs.benchmark.command"
 
 _EPILOG = """from scenes to a comparison:
-  simrecon benchmark generate --all --out suite.json --jobs 4        tasks that can be done, and are not by waiting
-  simrecon benchmark run suite.json --policy still --out still.json  0 %, or something is wrong
+  simrecon benchmark generate --all --out suite.json --jobs 4        feasible tasks that waiting does not solve
+  simrecon benchmark run suite.json --policy still --out still.json  succeeds in 0 %
   simrecon benchmark run suite.json --policy my_policy:Policy --split test --out mine.json --videos videos
   simrecon benchmark compare still.json mine.json                    paired by task and seed, with 95 % intervals
   simrecon benchmark demos suite.json --maniskill demos --lerobot dataset
 
-what each subcommand takes: `simrecon benchmark generate --help` and so on; docs/embodied_benchmarks.md says more."""
+options of a subcommand: `simrecon benchmark generate --help` and so on; see also docs/embodied_benchmarks.md."""
 
 _POLICY = """a policy:
   class Policy:                                              # in my_policy.py, in this folder or installed
-      policy_options = {"control_mode": "pd_joint_delta_pos", "obs_mode": "state"}   # what gym.make shall get
-      def __init__(self, env): self.env = env                # Gymnasium, NumPy, not batched; once a task
-      def reset(self): ...                                   # may be left out; after every reset
+      policy_options = {"control_mode": "pd_joint_delta_pos", "obs_mode": "state"}   # arguments of gym.make
+      def __init__(self, env): self.env = env                # Gymnasium, NumPy, not batched; once per task
+      def reset(self): ...                                   # optional; called after every reset
       def act(self, observation): return self.env.action_space.sample()
 
-Any callable that takes the environment and returns such an object will do. `--policy-option model=net.zip` is given to
-it as the keyword argument model="net.zip". What `simrecon train` trained is a policy, too:
+Any callable works that takes the environment and returns such an object. `--policy-option model=net.zip` passes the
+keyword argument model="net.zip" to it. Policies of `simrecon train` run as follows:
   simrecon benchmark run suite.json --policy simrecon_envs.training:trained --policy-option run=FOLDER"""
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Add the verb with its subcommands."""
-    parser = verbs.add_parser(
+    parser = add_verb(
+        verbs,
         "benchmark",
-        help="make a suite of tasks from scenes, run policies in it, compare them, record demonstrations",
-        description="Make a suite of tasks from scenes, run policies in it, compare them, record demonstrations.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "generate suites of tasks, run and compare policies, record demonstrations",
+        "Generate suites of tasks from scenes, run policies, compare their results, record demonstrations.",
+        _EPILOG,
     )
     parts = parser.add_subparsers(dest="part", metavar="SUBCOMMAND", required=True)
     _add_generate(parts)
@@ -46,47 +46,42 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
 
 
 def _add_generate(parts: argparse._SubParsersAction) -> None:
-    parser = _part(
+    parser = add_verb(
         parts,
         "generate",
-        "prove tasks in scenes and write them as a suite",
-        "Prove tasks in scenes and write them as a suite (JSON). A task is taken if the oracle does it from every "
-        "seed, it is not done at reset, and doing nothing to the end does not do it. What is left out is in the "
-        "suite, with the reason. A run that was killed goes on where it was when it is started again.",
+        "generate a suite of feasible tasks",
+        "Generate a suite (JSON) of feasible tasks. A task is accepted if the oracle solves it from every seed, it is "
+        "not solved at reset, and doing nothing does not solve it. The suite lists rejected tasks with the reason. "
+        "A killed run resumes when it is started again.",
     )
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="scenes of the registry")
-    parser.add_argument("--all", action="store_true", help="all scenes of the registry")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="the suite, such as suite.json"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("scenes", nargs="*", metavar="SCENE", help="scenes of the registry")
+    add("--all", action="store_true", help="all scenes of the registry")
+    add("--out", type=Path, required=True, metavar="FILE", help="the suite, such as suite.json")
+    add(
         "--kinds",
         type=_words,
         default=(),
         help="kinds of tasks, with commas: reach, pick, place, put, stack, push, rearrange, navigate, sequence (all)",
     )
-    parser.add_argument(
-        "--robots", type=_words, default=("panda", "fetch"), help="with commas (default: panda,fetch)"
+    add(
+        "--robots", type=_words, default=("panda", "fetch"), help="separated by commas (default: panda,fetch)"
     )
-    parser.add_argument(
-        "--per-scene", type=int, default=30, metavar="N", help="most tasks of a scene (default: 30)"
-    )
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="episodes of a task (default: 5)")
-    parser.add_argument(
-        "--seed", type=int, default=0, help="what the episodes' seeds are made of (default: 0)"
-    )
-    parser.add_argument(
+    add("--per-scene", type=int, default=30, metavar="N", help="most tasks of a scene (default: 30)")
+    add("--seeds", type=int, default=5, metavar="N", help="number of episodes of a task (default: 5)")
+    add("--seed", type=int, default=0, help="seed of the episodes' seeds (default: 0)")
+    add(
         "--test-share",
         type=float,
         default=0.2,
         metavar="SHARE",
-        help="how many scenes and objects are on the side test, by the hashes of their names (default: 0.2)",
+        help="share of scenes and objects in the test split, by the hashes of their names (default: 0.2)",
     )
-    parser.add_argument(
+    add(
         "--randomize",
         metavar="WHAT",
-        help="what differs from episode to episode: none, all, or such as shift_m=0.03,turn_rad=0.3 (the default); "
-        "see docs/environments.md",
+        help="randomization of episodes: none, all, or for example shift_m=0.03,turn_rad=0.3 (the default); see "
+        "docs/environments.md",
     )
     _add_demo_flags(parser)
     _add_work(parser)
@@ -94,100 +89,83 @@ def _add_generate(parts: argparse._SubParsersAction) -> None:
 
 
 def _add_run(parts: argparse._SubParsersAction) -> None:
-    parser = _part(
+    parser = add_verb(
         parts,
         "run",
         "run a policy in a suite",
-        "Run a policy in a suite: success rate, path efficiency (success times the oracle's way over the longer of "
-        "both), steps and seconds, with 95 % intervals, by kind, scene, robot and split. A run with --out that was "
-        "killed goes on where it was.",
+        "Run a policy in a suite. Reports success rate, path efficiency (success times the length of the oracle's path "
+        "over the longer of both paths), steps and seconds, with 95 % intervals, by kind, scene, robot and split. A "
+        "killed run with --out resumes when it is started again.",
         _POLICY,
     )
-    parser.add_argument("suite", type=Path, metavar="SUITE", help="a file of `simrecon benchmark generate`")
-    parser.add_argument(
-        "--policy",
-        required=True,
-        metavar="NAME",
-        help="oracle, still, random, or module:callable (see below)",
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("suite", type=Path, metavar="SUITE", help="output of `simrecon benchmark generate`")
+    add("--policy", required=True, metavar="NAME", help="oracle, still, random, or module:callable (below)")
+    add(
         "--policy-option",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="given to the callable as a keyword argument; may be repeated",
+        help="keyword argument; may be repeated",
     )
     _add_choice(parser)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="the results, such as results.json")
-    parser.add_argument("--videos", type=Path, metavar="DIR", help="a video of each task's first episode")
-    parser.add_argument(
+    add("--out", type=Path, metavar="FILE", help="output file, for example results.json")
+    add("--videos", type=Path, metavar="DIR", help="write a video of the first episode of each task")
+    add(
         "--fresh-seeds",
         type=int,
         default=0,
         metavar="N",
-        help="N episodes of each task from seeds that are not the suite's, in place of those",
+        help="run N episodes of each task from seeds that are not in the suite, instead of its own",
     )
     _add_work(parser)
     parser.set_defaults(run=run_by_name(f"{_RUNNER}:run"))
 
 
 def _add_compare(parts: argparse._SubParsersAction) -> None:
-    parser = _part(
+    parser = add_verb(
         parts,
         "compare",
-        "say what differs between two results",
-        "Say what differs between two results: the second less the first, over the episodes that both have. Intervals "
-        "draw whole tasks anew; p is McNemar's exact test over episodes.",
+        "compare two results",
+        "Compare two results: second minus first, over the episodes that both contain. Intervals resample whole tasks; "
+        "p is McNemar's exact test over episodes.",
     )
-    parser.add_argument("first", type=Path, metavar="A.json", help="results of `simrecon benchmark run`")
-    parser.add_argument("second", type=Path, metavar="B.json", help="others, of the same suite")
+    parser.add_argument("first", type=Path, metavar="A.json", help="output of `simrecon benchmark run`")
+    parser.add_argument("second", type=Path, metavar="B.json", help="another one of the same suite")
     parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
     parser.set_defaults(run=run_by_name(f"{_RUNNER}:compare"))
 
 
 def _add_demos(parts: argparse._SubParsersAction) -> None:
-    parser = _part(
+    parser = add_verb(
         parts,
         "demos",
-        "record the oracle's demonstrations of a suite",
-        "Record the oracle's demonstrations of a suite, one an episode: in ManiSkill's trajectory format (a folder a "
-        "task; `python -m mani_skill.trajectory.replay_trajectory` replays them) and as a LeRobot dataset (v3.0; needs "
-        "`pip install 'simrecon[lerobot]'`).",
+        "record demonstrations of the oracle",
+        "Record demonstrations of the oracle, one for each episode, in ManiSkill's trajectory format (one folder for "
+        "each task; `python -m mani_skill.trajectory.replay_trajectory` replays them) and as a LeRobot dataset (v3.0; "
+        "needs `pip install 'simrecon[lerobot]'`).",
     )
-    parser.add_argument("suite", type=Path, metavar="SUITE", help="a file of `simrecon benchmark generate`")
+    parser.add_argument("suite", type=Path, metavar="SUITE", help="output of `simrecon benchmark generate`")
     _add_choice(parser)
     _add_demo_flags(parser, long=True)
     _add_work(parser, jobs=False)
     parser.set_defaults(run=run_by_name(f"{_RUNNER}:demos"))
 
 
-def _part(
-    parts: argparse._SubParsersAction, name: str, summary: str, description: str, epilog: str | None = None
-) -> argparse.ArgumentParser:
-    return parts.add_parser(
-        name,
-        help=summary,
-        description=textwrap.fill(description, 100),
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter if epilog else argparse.HelpFormatter,
-    )
-
-
 def _add_choice(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--split", default="all", choices=("all", "train", "test"), help="default: all")
-    parser.add_argument(
+    add = parser.add_argument
+    add("--split", default="all", choices=("all", "train", "test"), help="default: all")
+    add(
         "--split-by",
         default="object",
         choices=("object", "scene"),
-        help="whose side counts: a task is on the side test by object if any of its objects is (default: object)",
+        help="object: a task is in the test split if any of its objects is; scene: if its scene is (default: object)",
     )
-    parser.add_argument("--tasks", default="*", metavar="GLOB", help="names, such as '*-push_*', with commas")
-    parser.add_argument("--kinds", type=_words, default=(), help="only these kinds, with commas")
-    parser.add_argument("--robots", type=_words, default=(), help="only these robots, with commas")
-    parser.add_argument("--episodes", type=int, metavar="N", help="most episodes of a task (default: all)")
-    parser.add_argument(
-        "--any-revision", action="store_true", help="go on where a scene has another revision, and note it"
-    )
+    add("--tasks", default="*", metavar="GLOB", help="names, for example '*-push_*', separated by commas")
+    add("--kinds", type=_words, default=(), help="only these kinds, separated by commas")
+    add("--robots", type=_words, default=(), help="only these robots, separated by commas")
+    add("--episodes", type=int, metavar="N", help="maximum number of episodes of a task (default: all)")
+    add("--any-revision", action="store_true", help="accept scenes of another revision, with a note")
 
 
 def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None:
@@ -196,26 +174,23 @@ def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None
         dest="maniskill",
         type=Path,
         metavar="DIR",
-        help="the oracle's demonstrations as trajectories of ManiSkill (.h5 and .json)",
+        help="write demonstrations as ManiSkill trajectories (.h5 and .json)",
     )
     parser.add_argument(
         "--lerobot",
         type=Path,
         metavar="DIR",
-        help="the oracle's demonstrations as LeRobot datasets v3.0, one a robot (needs the extra lerobot)",
+        help="write demonstrations as LeRobot datasets v3.0, one for each robot (needs the extra lerobot)",
     )
     parser.add_argument(
         "--demo-obs",
         default="state_dict",
         metavar="MODE",
-        help="what demonstrations observe: state_dict, or rgb and the like where this machine renders (default: "
-        "state_dict)",
+        help="observations: state_dict, or rgb and others if this machine can render (default: state_dict)",
     )
 
 
 def _add_work(parser: argparse.ArgumentParser, jobs: bool = True) -> None:
-    from reconstruction.commands.options import add_common
-
     if jobs:
         parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
@@ -225,5 +200,5 @@ def _add_work(parser: argparse.ArgumentParser, jobs: bool = True) -> None:
 def _words(text: str) -> tuple[str, ...]:
     words = tuple(word.strip() for word in text.split(",") if word.strip())
     if not words:
-        raise argparse.ArgumentTypeError(f"expected names with commas, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected names separated by commas, got {text!r}")
     return words

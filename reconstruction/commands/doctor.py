@@ -1,23 +1,26 @@
-"""`simrecon doctor`: what works on this machine, what is missing, how to get it."""
+"""`simrecon doctor`: checks of this machine."""
 
 import argparse
 import json
 from dataclasses import asdict
 
+from reconstruction.commands.options import add_verb
+
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
-    """Register the verb."""
-    parser = verbs.add_parser(
+    """Add the verb."""
+    parser = add_verb(
+        verbs,
         "doctor",
-        help="what works on this machine, what is missing, how to get it",
-        description="Check this machine. Exit code 4 if something that is required is missing.",
+        "what works on this machine, what is missing, how to get it",
+        "Check this machine; list installed plugins. Exit code 4: something required is missing.",
     )
     parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run all checks and print them."""
+    """Print all checks; return 4 if a required one fails."""
     from reconstruction.doctor import format_checks, run_checks
 
     checks = run_checks()

@@ -1,7 +1,6 @@
-"""Verbs about environments, whose work lives in `simrecon_envs`: this package parses, that one runs.
+"""Verbs that `simrecon_envs` runs.
 
-`reconstruction` never imports `simrecon_envs`; the command line is the one place where a person crosses over, so
-its runners are found by their names, when a verb was chosen.
+`reconstruction` does not import `simrecon_envs`: the functions of such verbs are imported by name when the verb runs.
 """
 
 import argparse
@@ -10,7 +9,7 @@ from importlib import import_module
 
 
 def run_by_name(name: str) -> Callable[[argparse.Namespace], int]:
-    """Return what runs a verb: the function `module:function`, imported when it is called."""
+    """Return a function that imports `module:function` when it is called, and calls it with the arguments."""
     module, function = name.split(":")
 
     def run(arguments: argparse.Namespace) -> int:

@@ -1,18 +1,21 @@
-"""`simrecon evaluate`: a scene against the truth."""
+"""`simrecon evaluate`: compares a scene with the ground truth."""
 
 import argparse
 import json
 from pathlib import Path
 
-_DESCRIPTION = """Measure SCENE against the truth: cameras, geometry, objects, relations, pictures, physics, and the
-stages that it was made by. Without --ground-truth only what needs none is measured: physics, pictures of kept-out
-frames, registration. With LABELS.json, outlines that were drawn by hand on a few frames, it is also measured
-which of the outlined things were found, which found objects are real, and who stands on whom."""
+from reconstruction.commands.options import add_common, add_scene, add_verb
+from reconstruction.commands.truth import add_ground_truth, split_truth
 
-_EPILOG = """the truth is a folder with scene.json (cameras, entities), meshes/, depth/ and instances/, or with
-cameras.json and depth/ alone; see docs/evaluation.md for the format and for what each figure means. Labels are
-the project's own format, COCO or labelme polygons (also a folder of labelme files), one name a thing; label
-frames whose number is a multiple of ten.
+_DESCRIPTION = """Compare SCENE with the ground truth: cameras, geometry, objects, relations, images, physics, and the
+results of each stage. Without --ground-truth, only figures that need none: physics, images of held-out frames,
+registration. With LABELS.json, outlines drawn by hand on a few frames, also: which outlined things were found, which
+found objects are real, and which object stands on which."""
+
+_EPILOG = """The ground truth is a folder with scene.json (cameras, entities), meshes/, depth/ and instances/, or with
+cameras.json and depth/ alone; docs/evaluation.md explains the format and each figure. Labels are in the project's own
+format, COCO, or labelme polygons (also a folder of labelme files), with one name for each thing. Label frames whose
+number is a multiple of ten.
 
 examples:
   simrecon evaluate scene0001 --ground-truth capture/ground_truth
@@ -24,41 +27,22 @@ examples:
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
-    """Register the verb."""
-    from reconstruction.commands.options import add_common
-    from reconstruction.commands.truth import add_ground_truth
-
-    parser = verbs.add_parser(
-        "evaluate",
-        help="measure a scene against the truth",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
-    add_ground_truth(parser, "the folder with the truth, or a file of outlines drawn by hand")
-    parser.add_argument(
-        "--json",
-        type=Path,
-        metavar="FILE",
-        help="also write everything as JSON; - prints it instead of the table",
-    )
-    parser.add_argument("--work-dir", type=Path, metavar="DIR", help="where the scene's stages are kept")
-    parser.add_argument(
-        "--video",
-        type=Path,
-        metavar="VIDEO",
-        help="for kept-out frames, and names of images, where stages are gone",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    """Add the verb."""
+    parser = add_verb(verbs, "evaluate", "compare a scene with the ground truth", _DESCRIPTION, _EPILOG)
+    add_scene(parser)
+    add_ground_truth(parser, "folder with the ground truth, or file of outlines drawn by hand")
+    add = parser.add_argument
+    add("--json", type=Path, metavar="FILE", help="also write JSON; -: print JSON instead of the table")
+    add("--work-dir", type=Path, metavar="DIR", help="stage cache of the scene")
+    add("--video", type=Path, metavar="VIDEO", help="for held-out frames, if the stage cache is gone")
+    add("--quiet", action="store_true", help="no progress")
     add_common(parser, json=False)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate, print the table, write the file."""
+    """Evaluate a scene, print the table, write the file."""
     from reconstruction.commands.reporting import make_listener
-    from reconstruction.commands.truth import split_truth
     from reconstruction.measure import StageResults, evaluate_scene
     from reconstruction.measure.table import as_table
     from registry import SceneRegistry
@@ -93,10 +77,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_writable(path: Path) -> None:
-    """Refuse a bad output path before minutes of measuring."""
+    """Raise now, not after minutes, if a file cannot be written.
+
+    Raises:
+        UsageError: the path is a folder, or its folder does not exist.
+    """
     from registry.errors import UsageError
 
     if path.is_dir():
-        raise UsageError(f"--json {path}: is a folder; give a file name, for example {path / 'figures.json'}")
+        raise UsageError(
+            f"--json {path}: this is a folder; give a file name, for example {path / 'figures.json'}"
+        )
     if not path.absolute().parent.is_dir():
         raise UsageError(f"--json {path}: the folder {path.absolute().parent} does not exist")

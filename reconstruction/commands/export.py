@@ -1,61 +1,51 @@
-"""`simrecon export`: a scene for MuJoCo, Isaac Sim, PyBullet, Blender."""
+"""`simrecon export`: writes a scene for MuJoCo, Isaac Sim, PyBullet, Blender."""
 
 import argparse
 import json
 from pathlib import Path
 
+from reconstruction.commands.options import add_common, add_scene, add_verb
 from registry import SceneRegistry
 
-_FORMATS = (
-    "mjcf",
-    "urdf",
-    "usd",
-    "glb",
-)  # as reconstruction.exports.FORMATS, which is not imported for --help
+_FORMATS = ("mjcf", "urdf", "usd", "glb")  # reconstruction.exports.FORMATS, not imported for --help
 
 _EPILOG = """formats:
-  mjcf   scene.xml for MuJoCo: things rest as they do in the scene; exact masses and inertias
-  urdf   scene.urdf with everything at its place, and one file an object: PyBullet, ROS, yourdfpy
+  mjcf   scene.xml for MuJoCo: objects rest as in the scene; exact masses and inertias
+  urdf   scene.urdf with everything in place, and one file for each object: PyBullet, ROS, yourdfpy
   usd    scene.usd with UsdPhysics: Isaac Sim, usdview (needs: pip install "simrecon[exports]")
-  glb    scene.glb, every thing a named node: Blender, three.js, any viewer
+  glb    scene.glb with a named node for each object: Blender, three.js, any viewer
 
 examples:
   simrecon export my_room --to mjcf --out my_room_mjcf
   python -m mujoco.viewer --mjcf=my_room_mjcf/scene.xml
   simrecon export my_room --to urdf,usd,glb --out my_room_export
 
-Collision shapes are the convex pieces of the scene; objects can move unless the scene has them fixed; what hangs
-on something is fixed to it. Units are metres and kilograms, +z is up (in scene.glb +y, as glTF has it).
+Collision shapes are the convex pieces of the scene. Objects can move unless they are fixed in the scene; attached
+objects are fixed to their parent. Units are metres and kilograms; +z is up (+y in scene.glb, as in every glTF).
 """
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
-    """Register the verb."""
-    from reconstruction.commands.options import add_common
-
-    parser = verbs.add_parser(
+    """Add the verb."""
+    parser = add_verb(
+        verbs,
         "export",
-        help="write a scene for MuJoCo (mjcf), Isaac Sim (usd), PyBullet and ROS (urdf), Blender (glb)",
-        description="Write a scene in the formats of other simulators and tools, with meshes, textures, masses, "
+        "write a scene for MuJoCo (mjcf), Isaac Sim (usd), PyBullet and ROS (urdf), Blender (glb)",
+        "Write a scene in formats of other simulators and tools, with meshes, textures, masses, "
         "inertias, friction and collision shapes.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EPILOG,
     )
-    parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
+    add_scene(parser)
     parser.add_argument(
         "--to",
         type=_formats,
         action="extend",
         required=True,
         metavar="FORMAT[,FORMAT]",
-        help=f"one or several of {', '.join(_FORMATS)}, with commas between them",
+        help=f"one or several of {', '.join(_FORMATS)}, separated by commas",
     )
     parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="a new or empty folder, or one with an export of the same scene",
+        "--out", type=Path, required=True, metavar="DIR", help="new folder, or one with an earlier export"
     )
     add_common(parser)
     parser.set_defaults(run=run)
@@ -70,7 +60,7 @@ def _formats(text: str) -> list[str]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the formats and say which file to open."""
+    """Export a scene, and print the main file of each format."""
     from reconstruction.exports import export_scene
 
     bundle = SceneRegistry(arguments.registry).load(arguments.scene)

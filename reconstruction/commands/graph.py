@@ -1,42 +1,40 @@
-"""`simrecon show SCENE --graph`: how the scene graph came about, a picture a step."""
+"""`simrecon show SCENE --graph`: draws the steps of the scene graph's merge."""
 
 import argparse
 import json
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from reconstruction.commands.options import output_errors
 from reconstruction.measure.report.graph_sheet import write_graph_steps
 from reconstruction.measure.stage_results import StageResults
 from registry import SceneBundle
-from registry.errors import EnvironmentMissing, UsageError
+from registry.errors import UsageError
 
 _STAGES = ("world", "gaussians", "surface", "instances", "assets", "poses")
 
 
 def show_graph(arguments: argparse.Namespace, bundle: SceneBundle, registry_root: Path) -> int:
-    """Write a picture of every step of the merge, and print the edges with who said them."""
+    """Write a picture of every merge step, and print the edges with their sources."""
     graph = bundle.scene["graph"]
     if "steps" not in graph:
         raise UsageError(
-            f"{arguments.scene}: its bundle is of a version that did not keep how its graph came about; "
+            f"{arguments.scene}: its bundle does not hold the steps of its graph, as it is of an earlier version; "
             f"reconstruct it again"
         )
     names = {item["id"]: item["label"] for item in (*bundle.scene["base"], *bundle.scene["objects"])}
     results = StageResults.find(bundle, registry_root, arguments.work_dir)
     views, missing = step_views(bundle, results)
     if missing:
-        print(f"only graphs are drawn: {missing}", file=sys.stderr)
+        print(f"only graphs are drawn, without views: {missing}", file=sys.stderr)
     folder = arguments.out or Path(f"{arguments.scene}_graph")
-    try:
+    with output_errors():
         files = write_graph_steps(graph["steps"], names, views, folder)
-    except OSError as error:
-        raise EnvironmentMissing(
-            f"cannot write {error.filename}: {error.strerror}; choose another --out"
-        ) from error
     if arguments.json:
         print(json.dumps({"edges": graph["edges"], "files": [str(f) for f in files]}, indent=2))
         return 0
@@ -51,13 +49,18 @@ def show_graph(arguments: argparse.Namespace, bundle: SceneBundle, registry_root
 
 
 def step_views(bundle: SceneBundle, results: StageResults) -> tuple[list[np.ndarray | None], str]:
-    """Return what each step looked at, and why views are missing.
+    """Return a view for each merge step, and the reason if some are missing.
 
-    They are drawn now, from the work folder, where no model was shown a picture.
+    Args:
+        bundle: the scene; it holds the pictures that a model was shown.
+        results: stage cache of the scene; the other views are rendered from it.
+
+    Returns:
+        Views uint8 (h, w, 3) RGB, None where there is none, and the reason ("" if none is missing).
     """
     from reconstruction.scene_graph import Question, SceneGraphConfig
     from reconstruction.scene_graph.looking import RegionViewer
-    from reconstruction.views import prepare_scene
+    from reconstruction.views import ViewScene, prepare_scene
 
     steps = bundle.scene["graph"]["steps"]
     kept = [_kept_picture(bundle, step) for step in steps]
@@ -67,9 +70,9 @@ def step_views(bundle: SceneBundle, results: StageResults) -> tuple[list[np.ndar
     gone = next((name for name in _STAGES if results.get(name) is None), None)
     if gone is not None:
         return kept, f"views need the stage {gone}, but {results.missing[gone]}"
-    done = {name: results.get(name) for name in _STAGES}
+    done: dict[str, Any] = {name: results.get(name) for name in _STAGES}
 
-    def make_scene():
+    def make_scene() -> ViewScene:
         gaussians = done["gaussians"].in_world(done["world"])
         return prepare_scene(gaussians, done["surface"], done["instances"], done["poses"].camera)
 

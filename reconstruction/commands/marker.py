@@ -1,16 +1,19 @@
-"""`simrecon marker`: a sheet with a marker to print, lay into the room and film, so that the scene is in metres."""
+"""`simrecon marker`: writes a fiducial marker to print; filmed in the room, it gives the metric scale."""
 
 import argparse
 from pathlib import Path
 
+from reconstruction.commands.options import add_verb
+
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
-    """Register the verb."""
-    parser = verbs.add_parser(
+    """Add the verb."""
+    parser = add_verb(
+        verbs,
         "marker",
-        help="write a marker to print: in view, it gives the scene its true size",
-        description="Write an A4 sheet with an AprilTag in its true size. Print it at 100 %, measure the black square, "
-        "lay it flat into the room, and give its side to `simrecon reconstruct --marker-size`.",
+        "write a marker to print; filmed, it gives the scene its true size",
+        "Write an A4 sheet with an AprilTag in its true size. Print it at 100 %, measure the black square, "
+        "lay it flat in the room, and pass its side to `simrecon reconstruct --marker-size`.",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="marker.pdf or marker.png")
     parser.add_argument(
@@ -22,7 +25,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the sheet and say what to do with it."""
+    """Write the sheet, and print how to use it."""
     from reconstruction.world.config import WorldConfig
     from reconstruction.world.marker_print import MarkerSheet, write_marker
 

@@ -1,17 +1,48 @@
-"""Flags that several verbs share."""
+"""What several verbs share: arguments, and the error of an output folder."""
 
 import argparse
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from registry.errors import EnvironmentMissing
+
+
+def add_verb(
+    verbs: argparse._SubParsersAction, name: str, summary: str, description: str, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    """Add a verb. Its epilog is shown as it is; its description too, if it has several lines."""
+    if "\n" not in description:
+        description = textwrap.fill(description, 100)
+    raw = argparse.RawDescriptionHelpFormatter
+    return verbs.add_parser(name, help=summary, description=description, epilog=epilog, formatter_class=raw)
+
+
+def add_scene(parser: argparse.ArgumentParser) -> None:
+    """Add the argument SCENE."""
+    parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
 
 
 def add_common(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
-    """Add the flags that several verbs share."""
+    """Add --registry, --verbose and, if asked for, --json."""
     parser.add_argument(
         "--registry",
         type=Path,
         metavar="DIR",
-        help="where scenes live (default: $SIMRECON_HOME/registry, or ~/.simrecon/registry)",
+        help="folder of the registry (default: $SIMRECON_HOME/registry, or ~/.simrecon/registry)",
     )
-    parser.add_argument("--verbose", action="store_true", help="log what each stage decides")
+    parser.add_argument("--verbose", action="store_true", help="log the decisions of each stage")
     if json:
         parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
+
+
+@contextmanager
+def output_errors() -> Iterator[None]:
+    """Turn an `OSError` from writing pictures into an `EnvironmentMissing` that names --out."""
+    try:
+        yield
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"cannot write {error.filename}: {error.strerror}; choose another --out"
+        ) from error

@@ -1,106 +1,95 @@
-"""`simrecon reconstruct`: a video becomes a registered environment."""
+"""`simrecon reconstruct`: turns a video into a registered environment."""
 
 import argparse
 import json
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from reconstruction.commands.options import add_common, add_verb
+
+if TYPE_CHECKING:
+    from reconstruction.config import PipelineConfig
+    from reconstruction.measure.oracle import Oracle
+    from reconstruction.video_to_scene import Reconstruction
 
 _DESCRIPTION = """Reconstruct VIDEO (any video file, or a folder of images) as a simulation-ready scene and register it
-as the Gymnasium environment SimRecon/SCENE. Stages are cached: an interrupted run goes on where it stopped, and a
-changed option redoes only what depends on it."""
+as the Gymnasium environment SimRecon/SCENE. Stages are cached: an interrupted run resumes after the last finished
+stage, and a changed option runs only the stages that depend on it."""
 
-_EPILOG = """how to film: walk slowly around the things you want, 10-60 s, keep them in view, do not just turn on the
-spot; light that stays the same; the floor in view helps.
+_EPILOG = """how to film: walk slowly around the objects for 10-60 s and keep them in view; do not only rotate on the
+spot. Keep the light constant. Some floor in view helps.
 
 metric scale, best first:
   --marker-size 0.10            an ArUco or AprilTag marker of 10 cm is in view
-  --scale camera-height=1.5     you held the camera 1.5 m above the floor on average
+  --scale camera-height=1.5     the mean height of the camera above the floor is 1.5 m
   --scale distance:40,100,200,300,210=1.2   pixels (100,200) and (300,210) of video frame 40 are 1.2 m apart
   --scale object:3.height=0.74  object 3 (see `simrecon show`) is 0.74 m high
-  (nothing)                     people hold cameras about 1.4 m high, give or take 15 %
+  (nothing)                     assumes a camera height of 1.4 m, 1 sigma 15 %
 
 examples:
   simrecon reconstruct room.mp4
   simrecon reconstruct room.mp4 --scene kitchen --preset quality
-  simrecon reconstruct my_scan.r3d            # Record3D or Polycam raw data: images, poses and metres from there
+  simrecon reconstruct my_scan.r3d            # Record3D or Polycam raw data, with its poses and metric scale
   simrecon reconstruct photos/ --scene dorm --set depth.depth_side_px=640
 """
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
-    """Register the verb."""
-    from reconstruction.commands.options import add_common
-
-    parser = verbs.add_parser(
-        "reconstruct",
-        help="turn a video into a registered environment",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    """Add the verb."""
+    parser = add_verb(
+        verbs, "reconstruct", "turn a video into a registered environment", _DESCRIPTION, _EPILOG
     )
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "video",
         metavar="VIDEO",
         type=Path,
         nargs="?",
         help="a video file, a folder of images, or an export of Record3D or Polycam with its poses",
     )
-    parser.add_argument(
-        "--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)"
-    )
-    parser.add_argument("--work-dir", type=Path, metavar="DIR", help="where finished stages are kept")
-    parser.add_argument(
-        "--keep-results",
-        type=int,
-        default=2,
-        metavar="N",
-        help="of each stage, in the work folder (default 2)",
-    )
-    parser.add_argument("--preset", choices=("fast", "default", "quality"), default="default")
-    parser.add_argument(
+    add("--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)")
+    add("--work-dir", type=Path, metavar="DIR", help="folder of the stage cache")
+    add("--keep-results", type=int, default=2, metavar="N", help="cached results of each stage (default 2)")
+    add("--preset", choices=("fast", "default", "quality"), default="default")
+    add(
         "--device",
         choices=("auto", "cpu", "cuda"),
         default="auto",
-        help="where Gaussians are fitted: cuda needs gsplat; auto takes it where it is there (default)",
+        help="device for fitting Gaussians: cuda needs gsplat; auto uses cuda if it is available (default)",
     )
-    parser.add_argument("--scale", metavar="HOW", help="where metres come from; see below")
-    parser.add_argument(
-        "--marker-size", type=float, metavar="METRES", help="side of a printed marker in view"
-    )
-    parser.add_argument(
+    add("--scale", metavar="HOW", help="source of the metric scale; see below")
+    add("--marker-size", type=float, metavar="METRES", help="side of a printed marker in view")
+    add(
         "--poses",
         type=Path,
         metavar="PATH",
-        help="poses that you have: a COLMAP model folder, nerfstudio's transforms.json, a Record3D recording "
+        help="known camera poses: a COLMAP model folder, nerfstudio's transforms.json, a Record3D recording "
         "(.r3d or unzipped) or Polycam's raw data; see docs/poses.md",
     )
-    parser.add_argument(
+    add(
         "--overrides",
         type=Path,
         metavar="FILE",
-        help="your corrections (YAML): relabel, merge, split, drop what you click on; see docs/overrides.md",
+        help="your corrections (YAML): relabel, merge, split or drop objects; see docs/overrides.md",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default 0)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="STAGE.FIELD=VALUE", help="set any option"
-    )
-    parser.add_argument("--list-options", action="store_true", help="print every option for --set and stop")
-    parser.add_argument(
-        "--require-stable", action="store_true", help="refuse to publish a scene that does not rest"
-    )
-    parser.add_argument(
+    add("--seed", type=int, default=0, help="seed of all random numbers (default 0)")
+    add("--set", action="append", default=[], metavar="STAGE.FIELD=VALUE", help="set any option")
+    add("--list-options", action="store_true", help="print all options for --set and exit")
+    add("--require-stable", action="store_true", help="do not publish a scene with a moving object")
+    add(
         "--oracle",
         metavar="STAGES",
-        help="for measuring: take poses, depth, world, instances (comma separated) from the ground truth",
+        help="for evaluation: take poses, depth, world, instances (comma separated) from the ground truth",
     )
-    parser.add_argument("--ground-truth", type=Path, metavar="DIR", help="the folder that --oracle reads")
-    parser.add_argument("--quiet", action="store_true", help="no progress, only the result")
+    add("--ground-truth", type=Path, metavar="DIR", help="folder with the ground truth for --oracle")
+    add("--quiet", action="store_true", help="print only the result, no progress")
     add_common(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Reconstruct and say what was found."""
+    """Reconstruct a video, and print the result."""
     from registry.errors import UsageError
 
     if arguments.list_options:
@@ -109,13 +98,11 @@ def run(arguments: argparse.Namespace) -> int:
         print(describe_options())
         return 0
     if arguments.video is None:
-        raise UsageError("which video? Give a file or a folder of images: simrecon reconstruct VIDEO")
+        raise UsageError("no video is given. Give a file or a folder of images: simrecon reconstruct VIDEO")
     if not arguments.video.exists():
         raise UsageError(f"{arguments.video}: no such file or folder")
     if arguments.keep_results < 1:
-        raise UsageError(
-            f"--keep-results {arguments.keep_results}: at least 1 result of each stage is needed"
-        )
+        raise UsageError(f"--keep-results {arguments.keep_results}: it must be at least 1")
     from reconstruction.commands.reporting import make_listener
     from reconstruction.editing.overrides import Overrides
     from reconstruction.video_to_scene import reconstruct
@@ -138,14 +125,18 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def oracle_of(arguments: argparse.Namespace) -> object | None:
-    """Read the truth that stands in for stages; without --oracle the truth is never touched."""
+def oracle_of(arguments: argparse.Namespace) -> "Oracle | None":
+    """Load the ground truth that replaces stages; None without --oracle.
+
+    Raises:
+        UsageError: --ground-truth is given without --oracle, or a stage has no ground truth.
+    """
     from registry.errors import UsageError
 
     if not arguments.oracle:
         if arguments.ground_truth:
             raise UsageError(
-                "--ground-truth is read by --oracle only; to measure a scene use: simrecon evaluate"
+                "--ground-truth needs --oracle here; to compare a scene with it, use: simrecon evaluate"
             )
         return None
     from reconstruction.measure.oracle import Oracle
@@ -155,10 +146,10 @@ def oracle_of(arguments: argparse.Namespace) -> object | None:
 
 
 def _gaussians_backend(device: str) -> str:
-    """Choose the rasterizer: gsplat for cuda, and for auto where both are there; every other stage uses the CPU.
+    """Return the rasterizer for a device: `gsplat` for cuda, and for auto if gsplat and CUDA are available.
 
     Raises:
-        EnvironmentMissing: `--device cuda` and something that it needs is not there.
+        EnvironmentMissing: `--device cuda`, but gsplat or CUDA is missing.
     """
     from importlib.util import find_spec
 
@@ -173,13 +164,13 @@ def _gaussians_backend(device: str) -> str:
         if device == "auto":
             return "cpu"
         raise EnvironmentMissing(
-            f"--device cuda: {error}. Leave --device out to compute on the CPU; docs/install.md says how to install "
-            "a CUDA build of torch"
+            f"--device cuda: {error}. Leave out --device to use the CPU; docs/install.md explains how to install a "
+            "CUDA build of torch"
         ) from error
 
 
-def config_of(arguments: argparse.Namespace) -> object:
-    """Return the pipeline's config that a command line asks for."""
+def config_of(arguments: argparse.Namespace) -> "PipelineConfig":
+    """Return the pipeline's config for a command line."""
     from reconstruction.config import PipelineConfig
 
     config = PipelineConfig.from_preset(arguments.preset).with_seed(arguments.seed)
@@ -195,7 +186,7 @@ def config_of(arguments: argparse.Namespace) -> object:
     return config
 
 
-def _print_result(result: object, arguments: argparse.Namespace) -> None:
+def _print_result(result: "Reconstruction", arguments: argparse.Namespace) -> None:
     from reconstruction.commands.scenes import describe_scene
     from reconstruction.costs import costs_json
     from registry import SceneRegistry

@@ -1,41 +1,36 @@
-"""`simrecon report`: one HTML page about a scene, to look at and to send."""
+"""`simrecon report`: writes one HTML page about a scene."""
 
 import argparse
 from pathlib import Path
 
+from reconstruction.commands.options import add_common, add_scene, add_verb
+from reconstruction.commands.truth import add_ground_truth, split_truth
+
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
-    """Register the verb."""
-    from reconstruction.commands.options import add_common
-    from reconstruction.commands.truth import add_ground_truth
-
-    parser = verbs.add_parser(
+    """Add the verb."""
+    parser = add_verb(
+        verbs,
         "report",
-        help="one HTML page that shows what every stage made, what it cost and where it is wrong",
-        description="Write one self-contained HTML page about a scene: frames, depth, surface, instances, objects, "
-        "scene graph, assembly, physics and timings; with --ground-truth also what is wrong, and by how much, or "
-        "outlines drawn by hand over what was found.",
+        "write an HTML page with the results, costs and errors of every stage",
+        "Write one self-contained HTML page about a scene: frames, depth, surface, instances, objects, "
+        "scene graph, assembly, physics and timings; with --ground-truth also error maps, or outlines drawn by hand "
+        "over the results.",
     )
-    parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE.html", help="where to write it (default: SCENE.html)"
-    )
+    add_scene(parser)
+    add = parser.add_argument
+    add("--out", type=Path, metavar="FILE.html", help="output file (default: SCENE.html)")
     add_ground_truth(
-        parser, "the truth of the video (docs/evaluation.md), adds error maps; or a file of outlines"
+        parser, "ground truth of the video (docs/evaluation.md), for error maps; or file of outlines"
     )
-    parser.add_argument(
+    add(
         "--evaluation",
         type=Path,
         metavar="FILE",
-        help="what `simrecon evaluate --json FILE` wrote, instead of measuring again (a minute)",
+        help="output of `simrecon evaluate --json FILE`, to save the minute of computing it",
     )
-    parser.add_argument(
-        "--work-dir",
-        type=Path,
-        metavar="DIR",
-        help="the folder that `simrecon reconstruct --work-dir` was given, if it was",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add("--work-dir", type=Path, metavar="DIR", help="as given to `simrecon reconstruct --work-dir`")
+    add("--quiet", action="store_true", help="no progress")
     add_common(parser, json=False)
     parser.set_defaults(run=run)
 
@@ -43,7 +38,6 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write the page."""
     from reconstruction.commands.reporting import make_listener
-    from reconstruction.commands.truth import split_truth
     from reconstruction.measure.report.collect import by_reason
     from reconstruction.measure.report.page import build_page, read_evaluation
     from reconstruction.measure.stage_results import StageResults
@@ -52,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = arguments.out or Path(f"{arguments.scene}.html")
     if out.is_dir() or not out.absolute().parent.is_dir():
-        raise UsageError(f"--out {out}: give the name of a file in a folder that exists")
+        raise UsageError(f"--out {out}: give a file name in an existing folder")
     ground_truth, labels = split_truth(arguments.ground_truth)
     registry = SceneRegistry(arguments.registry)
     bundle = registry.load(arguments.scene)

@@ -1,4 +1,4 @@
-"""How a running reconstruction is shown: bars on a terminal, plain lines elsewhere, nothing when asked."""
+"""Display of progress: bars on a terminal, lines elsewhere, or nothing."""
 
 import sys
 import time
@@ -12,7 +12,7 @@ _LINE_EVERY_S = 15.0
 
 
 class QuietListener(NoProgress):
-    """Shows nothing; the others add what they show."""
+    """Shows nothing; base of the others."""
 
     def __enter__(self) -> "QuietListener":
         """Begin."""
@@ -23,19 +23,19 @@ class QuietListener(NoProgress):
 
 
 class LineListener(QuietListener):
-    """One line when a stage begins and ends, and every 15 s within; for logs and pipes."""
+    """Prints a line when a stage begins and ends, and every 15 s between; for logs and pipes."""
 
     def begin_stage(self, name: str, number: int, total: int, cached: bool) -> None:
-        """Say which stage begins."""
+        """Print the name of the stage."""
         self._label = f"[{number}/{total}] {name}"
         self._total = self._done = 0
         self._last = self._began = time.perf_counter()
         self._say(f"{self._label}: {'already done, reusing it' if cached else '...'}")
 
     def end_stage(self, name: str, usage: Usage | None) -> None:
-        """Say what the stage cost."""
+        """Print the costs of the stage."""
         if usage:
-            self._say(f"{self._label}: {usage.wall_s:.1f} s, peak {usage.peak_memory_mb / 1024:.1f} GB")
+            self._say(f"{self._label}: {_cost(usage)}")
 
     def start(self, total: int, label: str) -> None:
         """Begin a step."""
@@ -43,7 +43,7 @@ class LineListener(QuietListener):
         self._began = time.perf_counter()
 
     def advance(self, n: int = 1) -> None:
-        """Report now and then."""
+        """Print progress every `_LINE_EVERY_S`."""
         self._done += n
         now = time.perf_counter()
         if now - self._last >= _LINE_EVERY_S and self._total:
@@ -61,16 +61,16 @@ class LineListener(QuietListener):
 
 
 class BarListener(QuietListener):
-    """A bar per step with the time left; for terminals."""
+    """Shows a bar with the remaining time for each step; for terminals."""
 
     _bar: tqdm | None = None
 
     def __exit__(self, *exc: object) -> None:
-        """Leave the terminal clean."""
+        """Remove the bar."""
         self._close()
 
     def begin_stage(self, name: str, number: int, total: int, cached: bool) -> None:
-        """Show the stage's name."""
+        """Show the name of the stage."""
         self._stage = f"[{number}/{total}] {name}"
         if cached:
             tqdm.write(f"{self._stage}: already done, reusing it", file=sys.stderr)
@@ -78,16 +78,13 @@ class BarListener(QuietListener):
             self.start(0, "starting")
 
     def end_stage(self, name: str, usage: Usage | None) -> None:
-        """Replace the bar with what the stage cost."""
+        """Replace the bar by the costs of the stage."""
         self._close()
         if usage:
-            tqdm.write(
-                f"{self._stage}: {usage.wall_s:.1f} s, peak {usage.peak_memory_mb / 1024:.1f} GB",
-                file=sys.stderr,
-            )
+            tqdm.write(f"{self._stage}: {_cost(usage)}", file=sys.stderr)
 
     def start(self, total: int, label: str) -> None:
-        """Begin a step's bar."""
+        """Start the bar of a step."""
         self._close()
         layout = "{desc} {bar} {n_fmt}/{total_fmt} {remaining} left" if total else "{desc} {elapsed}"
         self._bar = tqdm(
@@ -114,7 +111,11 @@ class BarListener(QuietListener):
 
 
 def make_listener(quiet: bool) -> QuietListener:
-    """Choose how to show progress: nothing, bars on a terminal, lines elsewhere."""
+    """Return the listener for standard error: bars if it is a terminal, else lines; or none."""
     if quiet:
         return QuietListener()
     return BarListener() if sys.stderr.isatty() else LineListener()
+
+
+def _cost(usage: Usage) -> str:
+    return f"{usage.wall_s:.1f} s, peak {usage.peak_memory_mb / 1024:.1f} GB"

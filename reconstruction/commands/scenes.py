@@ -1,4 +1,4 @@
-"""`simrecon list`, `show`, `verify`, `remove`: what is in the registry."""
+"""`simrecon list`, `show`, `verify`, `remove`: the scenes of the registry."""
 
 import argparse
 import json
@@ -6,77 +6,71 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from reconstruction.commands.options import add_common, add_scene, add_verb, output_errors
 from registry import SceneBundle, SceneRecord, SceneRegistry
-from registry.errors import EnvironmentMissing, UsageError
+from registry.errors import UsageError
 
 
-def add_parsers(verbs: argparse._SubParsersAction) -> None:
-    """Register the verbs."""
-    from reconstruction.commands.options import add_common
+def add_parser(verbs: argparse._SubParsersAction) -> None:
+    """Add the verbs."""
 
     def add(name: str, text: str, run: object, scene: bool = True) -> argparse.ArgumentParser:
-        parser = verbs.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        parser = add_verb(verbs, name, text, text[0].upper() + text[1:] + ".")
         if scene:
-            parser.add_argument("scene", metavar="SCENE", help="a scene id, for example scene0001")
+            add_scene(parser)
         add_common(parser)
         parser.set_defaults(run=run)
         return parser
 
     add("list", "list the scenes of the registry", run_list, scene=False)
-    show = add("show", "show what a scene holds: objects, relations, scale, stability, files", run_show)
+    show = add("show", "show objects, relations, scale, stability and files of a scene", run_show)
     show.add_argument(
         "--instances",
         action="store_true",
-        help="list every thing with an anchor for --overrides, and write contact sheets: frames with outlined, "
-        "numbered things, and a picture of each thing",
+        help="list every object with an anchor for --overrides, and write contact sheets: frames with outlined, "
+        "numbered objects, and a picture of each object",
     )
     show.add_argument(
         "--views",
         action="store_true",
-        help="write contact sheets of the views that show most of every thing (docs/avo.md): as it is, and without "
-        "what hides it; made from the work folder of the scene, and kept there",
+        help="write contact sheets of the views that show most of each object (docs/avo.md), with and without its "
+        "occluders; computed from the stage cache of the scene, and kept there",
     )
     show.add_argument(
         "--graph",
         action="store_true",
-        help="print who said each edge of the scene graph and why, and write a picture of every step that led to it: "
-        "the view, what it said, the graph after it (docs/scene_graph.md); views are drawn from the work folder",
+        help="print the source of each edge of the scene graph, and write a picture of each merge step: the view, the "
+        "edges found in it, the graph after it (docs/scene_graph.md); views are rendered from the stage cache",
     )
     show.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="avo.OPTION=VALUE",
-        help="with --views: an option of the views, for example avo.strategy=canonical",
+        help="with --views: an option of avo, for example avo.strategy=canonical",
     )
     show.add_argument(
-        "--work-dir",
-        type=Path,
-        metavar="DIR",
-        help="with --views and --graph: the folder that `simrecon reconstruct --work-dir` was given, if it was",
+        "--work-dir", type=Path, metavar="DIR", help="with --views or --graph: as given to reconstruct"
     )
     show.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="where pictures go (default: SCENE_instances, SCENE_views or SCENE_graph here)",
+        "--out", type=Path, metavar="DIR", help="folder of the pictures (default: SCENE_instances and so on)"
     )
     show.add_argument(
         "--overrides-template",
         type=Path,
         metavar="FILE",
-        help="with --instances: also write a file for --overrides with a commented line for every thing",
+        help="with --instances: also write a file for --overrides with a commented line for each object",
     )
     verify = add("verify", "check every file of a scene against its hash and its schema", run_verify)
     verify.add_argument(
-        "--physics", action="store_true", help="also simulate 10 s and recompute the report card"
+        "--physics", action="store_true", help="also simulate 10 s, and recompute the physics report"
     )
     remove = add("remove", "remove a scene and its files from the registry", run_remove)
     remove.add_argument("--yes", action="store_true", help="do not ask")
 
 
 def run_list(arguments: argparse.Namespace) -> int:
-    """Print one line a scene."""
+    """Print one line for each scene."""
     registry = SceneRegistry(arguments.registry)
     records = registry.list()
     if arguments.json:
@@ -101,14 +95,7 @@ def run_show(arguments: argparse.Namespace) -> int:
     registry = SceneRegistry(arguments.registry)
     record = registry.get(arguments.scene)
     bundle = registry.load(arguments.scene)
-    if arguments.instances + arguments.views + arguments.graph > 1:
-        raise UsageError("--instances, --views and --graph write different pictures; ask for one of them")
-    if arguments.set and not arguments.views:
-        raise UsageError("--set belongs to: simrecon show SCENE --views")
-    if arguments.work_dir and not (arguments.views or arguments.graph):
-        raise UsageError("--work-dir belongs to: simrecon show SCENE --views, or --graph")
-    if arguments.overrides_template and not arguments.instances:
-        raise UsageError("--overrides-template belongs to: simrecon show SCENE --instances")
+    _check_show_flags(arguments)
     if arguments.instances:
         return _show_instances(arguments, bundle)
     if arguments.views:
@@ -119,8 +106,6 @@ def run_show(arguments: argparse.Namespace) -> int:
         from reconstruction.commands.graph import show_graph
 
         return show_graph(arguments, bundle, registry.root)
-    if arguments.out:
-        raise UsageError("--out belongs to: simrecon show SCENE --instances, --views or --graph")
     if arguments.json:
         from reconstruction.costs import costs_json
 
@@ -131,36 +116,42 @@ def run_show(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _check_show_flags(arguments: argparse.Namespace) -> None:
+    """Raise `UsageError` for flags of `show` that do not go together."""
+    asked = [flag for flag in ("instances", "views", "graph") if getattr(arguments, flag)]
+    if len(asked) > 1:
+        raise UsageError("--instances, --views and --graph write different pictures; give only one of them")
+    for flag, partners in (
+        ("set", ("views",)),
+        ("work_dir", ("views", "graph")),
+        ("overrides_template", ("instances",)),
+        ("out", ("instances", "views", "graph")),
+    ):
+        if getattr(arguments, flag) and not set(partners) & set(asked):
+            with_one = " or ".join(f"--{partner}" for partner in partners)
+            raise UsageError(
+                f"--{flag.replace('_', '-')} needs {with_one}: simrecon show SCENE --{partners[0]}"
+            )
+
+
 def _show_instances(arguments: argparse.Namespace, bundle: SceneBundle) -> int:
-    """Write contact sheets and print every thing with its anchor."""
+    """Write contact sheets, and print every object with its anchor."""
     from reconstruction.measure.report.contact_page import overrides_template, write_contact_sheets
     from reconstruction.measure.report.contact_sheet import ContactSheet, anchor_text
 
     sheet = ContactSheet.of(bundle)
     folder = arguments.out or Path(f"{arguments.scene}_instances")
     template = arguments.overrides_template
-    try:
+    with output_errors():
         if template is not None:
             if template.exists():
-                raise UsageError(
-                    f"{template} is there already; it may hold your corrections and is not overwritten"
-                )
+                raise UsageError(f"{template} exists; it may hold your corrections and is not overwritten")
             template.write_text(overrides_template(sheet), encoding="utf-8")
         files = write_contact_sheets(sheet, folder)
-    except OSError as error:
-        raise EnvironmentMissing(
-            f"cannot write {error.filename}: {error.strerror}; choose another --out"
-        ) from error
     if arguments.json:
+        keys = ("label", "label_confidence", "scale", "anchor")
         things = [
-            {
-                "id": number,
-                "label": item["label"],
-                "label_confidence": item["label_confidence"],
-                "scale": item["scale"],
-                "anchor": item.get("anchor"),
-            }
-            for number, item in sheet.objects.items()
+            {"id": number} | {key: item.get(key) for key in keys} for number, item in sheet.objects.items()
         ]
         print(json.dumps({"things": things, "files": [str(path) for path in files]}, indent=2))
         return 0
@@ -174,7 +165,7 @@ def _show_instances(arguments: argparse.Namespace, bundle: SceneBundle) -> int:
 
 
 def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
-    """Say what was found, how sure it is, what it cost, and where the files are."""
+    """Return a text with the objects, scale, physics, notes, costs and files of a scene."""
     from reconstruction.costs import describe_costs
 
     scene = bundle.scene
@@ -197,16 +188,15 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
         )
     scale = scene["scale"]
     lines.append(
-        f"scale: {scale['method']}, sure to {100 * scale['uncertainty']:.0f} % (1 sigma). {scale.get('detail', '')}"
+        f"scale: {scale['method']}, 1 sigma {100 * scale['uncertainty']:.0f} %. {scale.get('detail', '')}"
     )
     physics = scene["report"]["physics"]
     if "stable_rate" in physics:
         lines.append(
-            f"physics: {physics['stable_rate']:.0%} of the movable objects stay put for 10 s; deepest overlap "
+            f"physics: {physics['stable_rate']:.0%} of the movable objects stay at rest for 10 s; deepest overlap "
             f"{physics['spawn_penetration_mm']:.1f} mm; {physics['floating_rate']:.0%} float"
         )
-    for note in scene["report"].get("notes", []):
-        lines.append(f"note: {note}")
+    lines += [f"note: {note}" for note in scene["report"].get("notes", [])]
     if scene["report"]["timings_s"]:
         lines.append(describe_costs(scene["report"]))
     lines.append(f"files: {record.path}")
@@ -214,7 +204,7 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
-    """Verify one scene."""
+    """Check the files of a scene against their hashes, and its physics if asked for."""
     registry = SceneRegistry(arguments.registry)
     report = registry.verify(arguments.scene)
     result = asdict(report)
@@ -230,7 +220,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
         for problem in report.problems:
             print(problem)
         print(
-            f"{arguments.scene}: {'all files are as published' if report.ok else 'damaged; reconstruct it again'}"
+            f"{arguments.scene}: {'all files are intact' if report.ok else 'damaged; reconstruct it again'}"
         )
         if "physics" in result:
             print("\n".join(describe_physics(result["physics"])))
@@ -238,7 +228,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 
 
 def describe_physics(physics: dict) -> list[str]:
-    """Return a report card in lines."""
+    """Return a physics report as lines of text."""
     from registry.report_card import failures
 
     contacts = physics["contacts"]
@@ -248,22 +238,19 @@ def describe_physics(physics: dict) -> list[str]:
         f"physics: stable {physics['stable_rate']:.0%}, "
         f"deepest overlap {physics['spawn_penetration_mm']:.2f} mm, floating {physics['floating_rate']:.0%}, "
         f"{physics['energy_at_rest_j']:.1e} J left after {physics['duration_s']:g} s",
-        f"contacts: {real} of {edges} edges are real; of {contacts['main_supports']} supports that bear half of an "
-        f"object or more, {len(contacts['supports_without_edge'])} are no edge",
+        f"contacts: {real} of {edges} edges are in contact; of {contacts['main_supports']} supports that bear half "
+        f"of an object or more, {len(contacts['supports_without_edge'])} have no edge",
     ]
     lines += [
-        f"  {e['child']} {e['relation']} {e['parent']} is no contact"
-        for e in contacts["edges_without_contact"]
+        f"  {e['child']} {e['relation']} {e['parent']}: no contact" for e in contacts["edges_without_contact"]
     ]
-    lines += [
-        f"  {e['child']} rests on {e['carrier']}, which is no edge" for e in contacts["supports_without_edge"]
-    ]
+    lines += [f"  {e['child']} rests on {e['carrier']}: no edge" for e in contacts["supports_without_edge"]]
     lines += [f"  {name.replace('_', ' ')} has no collision shape" for name in physics["without_collision"]]
     return lines + [f"  {line}" for line in failures(physics)]
 
 
 def run_remove(arguments: argparse.Namespace) -> int:
-    """Remove one scene, after asking where a person is there to answer."""
+    """Remove a scene; ask first if standard input is a terminal."""
     registry = SceneRegistry(arguments.registry)
     record = registry.get(arguments.scene)
     if not arguments.yes and sys.stdin.isatty():

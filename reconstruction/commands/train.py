@@ -1,21 +1,22 @@
-"""`simrecon train`: a policy for a task in a scene, by reinforcement learning."""
+"""`simrecon train`: trains a policy for a task in a scene by reinforcement learning."""
 
 import argparse
 from pathlib import Path
 
 from reconstruction.commands.environments import run_by_name
+from reconstruction.commands.options import add_common, add_verb
 
-_DESCRIPTION = """Train a policy for a task in SCENE by reinforcement learning (stable-baselines3), on the processor:
-one environment a process. At the end it is evaluated on seeds that it was not trained on, and filmed. Everything is
-in one folder: what was asked for, checkpoints, TensorBoard's curves, results.json, video.mp4."""
+_DESCRIPTION = """Train a policy for a task in SCENE by reinforcement learning (stable-baselines3), on the CPU, with one
+process for each environment. The trained policy is evaluated on unseen seeds and recorded on video. One folder holds
+the settings, checkpoints, TensorBoard curves, results.json and video.mp4."""
 
 _EPILOG = """what to know:
-  success      `simrecon show SCENE` and simrecon_envs.list_tasks say what can be done; reach takes a few minutes,
-               picking up and what follows from it some millions of steps
-  start        every episode begins differently (--randomize start): things shifted by up to 5 cm and turned, the
-               arm's joints by up to 0.05 rad; all of it by --seed. The same seed and --envs give the same policy
-  interrupt    Ctrl-C finishes the update and writes a checkpoint; what a kill leaves is the checkpoint of at most a
-               minute before. --resume goes on with either, to the same number of steps
+  tasks        `simrecon show SCENE` and simrecon_envs.list_tasks list them; reach takes a few minutes, pick and tasks
+               that contain it some millions of steps
+  start        every episode starts differently (--randomize start): objects shifted by up to 5 cm and rotated, joints
+               of the arm by up to 0.05 rad, seeded by --seed. The same --seed and --envs give the same policy
+  interrupt    Ctrl-C finishes the update and writes a checkpoint; after a kill, the last checkpoint is at most a
+               minute old. --resume continues from it, to the same number of steps
   curves       tensorboard --logdir ~/.simrecon/runs
   afterwards   simrecon_envs.training.load_policy(FOLDER) is the policy: observation -> action
 
@@ -24,67 +25,40 @@ examples:
   simrecon train scene0001 --task push_tray --algo sac --steps 100000 --seed 3
   simrecon train scene0001 --task reach --set learning_rate=3e-4 --set net_arch=128,128
   simrecon train scene0001 --resume                      the last run of this scene, task and algorithm
-  simrecon train scene0001 --resume --out FOLDER --steps 300000       longer than it was begun with
+  simrecon train scene0001 --resume --out FOLDER --steps 300000       with more steps
   simrecon train --algo sac --list-settings
 """
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
-    """Register the verb."""
-    from reconstruction.commands.options import add_common
-
-    parser = verbs.add_parser(
-        "train",
-        help="train a policy for a task in a scene",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("scene", metavar="SCENE", nargs="?", help="a scene id, for example scene0001")
-    parser.add_argument(
-        "--task", default="reach", help="a kind (reach, pick ...) or a task's name (default: reach)"
-    )
-    parser.add_argument("--algo", default="ppo", choices=("ppo", "sac"), help="default: ppo")
-    parser.add_argument("--robot", help="a robot of ManiSkill (default: panda)")
-    parser.add_argument("--obs-mode", choices=("state", "rgb"), help="what is observed (default: state)")
-    parser.add_argument(
+    """Add the verb."""
+    parser = add_verb(verbs, "train", "train a policy for a task in a scene", _DESCRIPTION, _EPILOG)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", nargs="?", help="a scene id, for example scene0001")
+    add("--task", default="reach", help="kind (reach, pick ...) or name of a task (default: reach)")
+    add("--algo", default="ppo", choices=("ppo", "sac"), help="default: ppo")
+    add("--robot", help="robot of ManiSkill (default: panda)")
+    add("--obs-mode", choices=("state", "rgb"), help="observations (default: state)")
+    add(
         "--control-mode",
         metavar="MODE",
-        help="how the robot is driven (default: auto: pd_ee_delta_pos, shifts of the hand, where the robot has it)",
+        help="controller of the robot (default: auto: pd_ee_delta_pos, displacements of the hand, if available)",
     )
-    parser.add_argument(
-        "--steps", type=int, metavar="N", help="of all environments together (default: ppo 50000, sac 30000)"
-    )
-    parser.add_argument(
-        "--envs", type=int, metavar="N", help="environments, a process each (default: the cores, at most 8)"
-    )
-    parser.add_argument("--seed", type=int, metavar="N", help="of everything that is drawn (default: 0)")
-    parser.add_argument(
+    add("--steps", type=int, metavar="N", help="steps of all environments (default: ppo 50000, sac 30000)")
+    add("--envs", type=int, metavar="N", help="environments, one process each (default: cores, at most 8)")
+    add("--seed", type=int, metavar="N", help="seed of all random numbers (default: 0)")
+    add(
         "--randomize",
         metavar="WHAT",
-        help="none, start, all, or JSON of what differs by how much (default: start)",
+        help="randomization of episodes: none, start, all, or JSON (docs/environments.md; default: start)",
     )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a hyperparameter; may be given again (--list-settings)",
-    )
-    parser.add_argument("--list-settings", action="store_true", help="show --algo's hyperparameters and exit")
-    parser.add_argument("--device", help="where the network is computed: cpu or cuda (default: cpu)")
-    parser.add_argument(
-        "--eval-episodes", type=int, metavar="N", help="at the end; 0: do not evaluate (default: 100)"
-    )
-    parser.add_argument("--no-video", action="store_true", help="do not film the policy at the end")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="the run's folder (default: a new one in $SIMRECON_HOME/runs)"
-    )
-    parser.add_argument(
-        "--resume",
-        action="store_true",
-        help="go on with the run in --out, or the last of this scene and task",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add("--set", action="append", default=[], metavar="NAME=VALUE", help="hyperparameter; may be repeated")
+    add("--list-settings", action="store_true", help="show --algo's hyperparameters and exit")
+    add("--device", help="device of the network: cpu or cuda (default: cpu)")
+    add("--eval-episodes", type=int, metavar="N", help="episodes of the evaluation; 0: none (default: 100)")
+    add("--no-video", action="store_true", help="do not record a video of the policy")
+    add("--out", type=Path, metavar="DIR", help="folder of the run (default: new in $SIMRECON_HOME/runs)")
+    add("--resume", action="store_true", help="continue the run in --out, or the last of this task")
+    add("--quiet", action="store_true", help="no progress")
     add_common(parser)
     parser.set_defaults(run=run_by_name("simrecon_envs.training.command:run"))

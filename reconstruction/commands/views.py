@@ -1,4 +1,4 @@
-"""`simrecon show SCENE --views`: views of every thing, made from what the work folder holds, as contact sheets."""
+"""`simrecon show SCENE --views`: writes contact sheets of the views of every object, made from the stage cache."""
 
 import argparse
 import json
@@ -6,34 +6,35 @@ from dataclasses import replace
 from pathlib import Path
 
 from reconstruction.cache import StageStore
+from reconstruction.commands.options import output_errors
 from reconstruction.commands.reporting import make_listener
 from reconstruction.config import PipelineConfig
 from reconstruction.measure.report.view_sheet import write_view_sheets
 from reconstruction.measure.stage_results import StageResults
 from reconstruction.pipeline import STAGES
 from reconstruction.runner import Run
+from reconstruction.views import AvoConfig, SceneViews
 from registry import SceneBundle
-from registry.errors import EnvironmentMissing, UsageError
+from registry.errors import UsageError
 
 
 def show_views(arguments: argparse.Namespace, bundle: SceneBundle, registry_root: Path) -> int:
-    """Choose views of every thing of a scene, or take them from the work folder, and write their sheets."""
-    from reconstruction.views import AvoConfig
-
+    """Compute the views of a scene's objects, or load them from the stage cache, and write contact sheets."""
     results = StageResults.find(bundle, registry_root, arguments.work_dir)
     stage = next(s for s in STAGES if s.name == "views")
     for name in stage.needs:
         if results.get(name) is None:
             raise UsageError(
-                f"{arguments.scene}: views are made from the stage {name}, but {results.missing[name]}. Was it made "
-                f"with --work-dir? Then name that folder here, too."
+                f"{arguments.scene}: views need the stage {name}, but {results.missing[name]}. If it was reconstructed "
+                f"with --work-dir, give the same folder here."
             )
+    assert results.work_dir is not None  # the results are from there
     kept = bundle.scene["report"]["config"].get("avo")
     config = replace(PipelineConfig(), avo=AvoConfig(**kept) if kept else AvoConfig())
     for text in arguments.set:
         if not text.strip().startswith("avo."):
             raise UsageError(
-                f"--set {text}: `show --views` takes options of avo alone, as in avo.strategy=canonical"
+                f"--set {text}: `show --views` takes options of avo only, for example avo.strategy=canonical"
             )
         config = config.with_option(text)
     run = Run(
@@ -49,12 +50,8 @@ def show_views(arguments: argparse.Namespace, bundle: SceneBundle, registry_root
     views = run.results[stage.name]
     names = {item["id"]: item["label"] for item in bundle.scene["objects"]}
     folder = arguments.out or Path(f"{arguments.scene}_views")
-    try:
+    with output_errors():
         files = write_view_sheets(views, names, folder)
-    except OSError as error:
-        raise EnvironmentMissing(
-            f"cannot write {error.filename}: {error.strerror}; choose another --out"
-        ) from error
     if arguments.json:
         print(
             json.dumps(
@@ -63,28 +60,22 @@ def show_views(arguments: argparse.Namespace, bundle: SceneBundle, registry_root
         )
         return 0
     for target in views.targets:
-        seen = (
-            ", ".join(f"{view.visibility:.0%}" for view in target.views) or "nothing: it is seen from nowhere"
-        )
+        seen = ", ".join(f"{view.visibility:.0%}" for view in target.views) or "nothing: no view shows it"
         print(f"{target.ids[0]:4d}  {names.get(target.ids[0], ''):<22} visible in its views: {seen}")
     print(
-        f"contact sheets ({views.strategy}): {', '.join(str(file) for file in files) or 'none, there are no things'}"
+        f"contact sheets ({views.strategy}): {', '.join(str(file) for file in files) or 'none, there are no objects'}"
     )
     return 0
 
 
-def _facts(views: object) -> list[dict]:
+def _facts(views: SceneViews) -> list[dict]:
+    names = ("visibility", "gain", "fronts", "origin")
     return [
         {
             "id": target.ids[0],
             "views": [
-                {
-                    "world_from_camera": view.world_from_camera.tolist(),
-                    "visibility": view.visibility,
-                    "gain": view.gain,
-                    "fronts": view.fronts,
-                    "origin": view.origin,
-                }
+                {"world_from_camera": view.world_from_camera.tolist()}
+                | {name: getattr(view, name) for name in names}
                 for view in target.views
             ],
         }

@@ -1,1 +1,1 @@
-"""What every stage needs: artifact types, cameras, progress, compiled kernels, mesh graphs, the mesh rasterizer."""
+"""Shared basics of all stages: artifact types, cameras, progress, plugins, profiling, mesh graphs, mesh rasterizer."""

@@ -1,7 +1,7 @@
-"""Save and load the dataclasses of `reconstruction.core.types`: arrays as .npy, the rest as strict JSON. No pickle.
+"""Save and load dataclasses of arrays and plain values as a folder, without pickle.
 
-A dataclass becomes a folder: `data.json` holds plain values and the structure, every array is one `.npy` beside it,
-numbered in the order met. Large arrays load memory-mapped, so a stage reads only what it touches.
+`data.json` holds structure and plain values as strict JSON. Each array is one `.npy` file, numbered in the order of
+fields. Large arrays are loaded as memory maps.
 """
 
 import dataclasses
@@ -16,11 +16,16 @@ import numpy as np
 from registry.errors import BundleError
 
 T = TypeVar("T")
-_MMAP_ABOVE_BYTES = 1 << 22
+_MMAP_ABOVE_BYTES = 1 << 22  # larger files are memory-mapped
 
 
 def save(value: Any, folder: Path) -> None:
-    """Write a dataclass of arrays and plain values into `folder` (created, must be empty)."""
+    """Write a dataclass into `folder`, which is created and must be empty.
+
+    Raises:
+        TypeError: a value is of a type that cannot be saved.
+        ValueError: a number is not finite.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     arrays: list[np.ndarray] = []
 
@@ -38,7 +43,7 @@ def save(value: Any, folder: Path) -> None:
             return {str(k): encode(v) for k, v in item.items()}
         if item is None or isinstance(item, bool | int | float | str):
             return item
-        raise TypeError(f"cannot save a {type(item).__name__} in an artifact")
+        raise TypeError(f"an artifact cannot hold a {type(item).__name__}")
 
     data = encode(value)
     for number, array in enumerate(arrays):
@@ -47,10 +52,11 @@ def save(value: Any, folder: Path) -> None:
 
 
 def load(cls: type[T], folder: Path) -> T:
-    """Read what `save` wrote as an instance of `cls`.
+    """Read a folder written by `save` as an instance of `cls`.
 
     Raises:
-        BundleError: it was written by a version of the program whose dataclass has other fields.
+        BundleError: another version of the program wrote it, with other fields.
+        ValueError: an array has another dtype or shape than its field.
     """
 
     def decode(hint: Any, item: Any) -> Any:
@@ -59,10 +65,10 @@ def load(cls: type[T], folder: Path) -> T:
             if item is None:
                 return None
             return decode(next(a for a in typing.get_args(hint) if a is not type(None)), item)
-        if dataclasses.is_dataclass(hint):
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             hints = typing.get_type_hints(hint)
             if set(item) != {f.name for f in dataclasses.fields(hint)}:
-                raise BundleError(f"{folder}: its {hint.__name__} is of another version of the program")
+                raise BundleError(f"{folder}: {hint.__name__} is of another version of the program")
             return hint(**{f.name: decode(hints[f.name], item[f.name]) for f in dataclasses.fields(hint)})
         if hint is np.ndarray:
             path = folder / f"{item['array']:05d}.npy"

@@ -1,7 +1,7 @@
-"""First use of a kernel compiles it, which takes seconds: whoever waits is told. Numba says when it compiles what.
+"""Report just-in-time compilation of Numba kernels as progress, from Numba's compile events.
 
-Kernels carry `cache=True`, so a machine compiles each once after an installation or an update. `Run` wraps every
-stage with `compilation_shown`; a stage need not know of it, and no list of kernels has to be kept.
+Compilation takes seconds per kernel. Kernels have `cache=True`, so a machine compiles each once after an installation
+or update. `Run` wraps every stage with `compilation_shown`; stages need no code for it.
 """
 
 import threading
@@ -17,9 +17,9 @@ _PAUSE_NOTE = (
 
 
 class CompilationShown:
-    """Passes progress on; while Numba compiles, the step is the compilation, and then it is the old one again.
+    """A progress sink that forwards to a listener and replaces the current step while Numba compiles.
 
-    What is said of compiling is for whoever watches: it goes to the listener and into no manifest.
+    Notes on compilation go to the listener only, into no manifest.
     """
 
     def __init__(self, listener: Progress) -> None:
@@ -27,7 +27,7 @@ class CompilationShown:
         self._lock = threading.RLock()  # kernels may compile in any thread
         self._step: tuple[int, str] | None = None
         self._done = 0
-        self._depth = 0  # a kernel compiles the kernels that it calls
+        self._depth = 0  # of nested compilations: a kernel compiles the kernels that it calls
         self._began = 0.0
         self.kernels: list[str] = []
         self.seconds = 0.0
@@ -50,7 +50,7 @@ class CompilationShown:
             self._listener.note(message)
 
     def compiling(self, kernel: str) -> None:
-        """A kernel begins to compile."""
+        """Handle the start of the compilation of a kernel."""
         with self._lock:
             self._depth += 1
             if self._depth > 1:
@@ -62,7 +62,7 @@ class CompilationShown:
             self._listener.start(0, f"compiling {kernel} (first use)")
 
     def compiled(self) -> None:
-        """The kernel that began last is compiled."""
+        """Handle the end of the last started compilation; show the former step again."""
         with self._lock:
             self._depth -= 1
             if self._depth > 0:
@@ -73,7 +73,7 @@ class CompilationShown:
                 self._listener.advance(self._done)
 
     def sum_up(self) -> None:
-        """Say what was compiled, if anything."""
+        """Note how many kernels were compiled, if any, and in what time."""
         if self.kernels:
             count = len(self.kernels)
             self._listener.note(f"compiled {count} kernel{'s'[: count > 1]} in {self.seconds:.0f} s")
@@ -81,7 +81,7 @@ class CompilationShown:
 
 @contextmanager
 def compilation_shown(listener: Progress) -> Iterator[CompilationShown]:
-    """Give a progress sink that also shows what Numba compiles within the block."""
+    """Yield a progress sink that also reports Numba compilations within the block."""
     from numba.core import event
 
     shown = CompilationShown(listener)

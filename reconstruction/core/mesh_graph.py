@@ -1,4 +1,4 @@
-"""The surface mesh as a graph of vertices: adjacency, areas, smoothed normals and colors, connected pieces."""
+"""The vertex graph of the surface mesh: adjacency, areas, smoothed normals and colors, connected components."""
 
 from dataclasses import dataclass
 
@@ -6,32 +6,31 @@ import cv2
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from reconstruction.core.types import Surface
 
 
 @dataclass(frozen=True)
 class MeshGraph:
-    """What segmentation needs to know of each vertex and of its neighbors."""
+    """Vertices of the surface with their attributes, and the edges between them."""
 
-    points: np.ndarray  # float64 (v, 3) world metres
-    normals: np.ndarray  # float64 (v, 3) unit, smoothed over neighbors
-    lab: np.ndarray  # float32 (v, 3) CIELAB, slightly smoothed
-    areas: np.ndarray  # float64 (v,) a third of the adjacent triangles' area
+    points: np.ndarray  # float64 (v, 3) world space, metres
+    normals: np.ndarray  # float64 (v, 3) unit, smoothed
+    lab: np.ndarray  # float32 (v, 3) CIELAB, smoothed
+    areas: np.ndarray  # float64 (v,) m^2, a third of the area of adjacent triangles
     edges: np.ndarray  # int32 (e, 2) each mesh edge once, smaller index first
-    spacing_m: float  # typical distance of neighbors
+    spacing_m: float  # median edge length
 
     @classmethod
     def from_surface(cls, surface: Surface) -> "MeshGraph":
-        """Build the graph; the smoothing is two rounds of averaging over mesh neighbors."""
+        """Build the graph of a surface; normals are averaged over mesh neighbors twice, colors once."""
         points = np.asarray(surface.vertices, np.float64)
         faces = np.asarray(surface.faces, np.int64)
         count = len(points)
         corners = points[faces]
-        doubled = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
+        spanned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        doubled = np.linalg.norm(spanned, axis=1)
         areas = np.bincount(faces.ravel(), weights=np.repeat(doubled / 6.0, 3), minlength=count)
         pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
         keys = np.unique(pairs[:, 0] * count + pairs[:, 1]) if count else np.zeros(0, np.int64)
@@ -48,7 +47,7 @@ class MeshGraph:
         return cls(points, normals, lab, areas, edges, max(spacing, 1e-3))
 
     def edges_within(self, chosen: np.ndarray) -> np.ndarray:
-        """Return the edges (k, 2) between vertices `chosen`, in their order."""
+        """Return the edges, int32 (k, 2), between vertices `chosen` (indices or mask), in the order of `edges`."""
         inside = np.zeros(len(self.points), bool)
         inside[chosen] = True
         return self.edges[inside[self.edges[:, 0]] & inside[self.edges[:, 1]]]
@@ -63,18 +62,19 @@ def lab_from_rgb(colors: np.ndarray) -> np.ndarray:
 
 
 def _averaging_matrix(edges: np.ndarray, count: int) -> csr_matrix:
+    """Return the matrix (v, v) that averages each vertex and its neighbors."""
     rows = np.concatenate([edges[:, 0], edges[:, 1], np.arange(count)])
     columns = np.concatenate([edges[:, 1], edges[:, 0], np.arange(count)])
-    matrix = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
+    matrix = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
     degree = np.asarray(matrix.sum(axis=1)).ravel()
     matrix.data /= np.repeat(degree, np.diff(matrix.indptr))
     return matrix
 
 
 def pieces(graph: MeshGraph, chosen: np.ndarray, bridge_m: float = 0.0) -> list[np.ndarray]:
-    """Split vertices `chosen` (sorted indices) into connected pieces, the largest area first.
+    """Split vertices `chosen` (sorted indices) into connected components, the largest area first.
 
-    With `bridge_m` > 0 vertices closer than that are connected too, across holes of the mesh.
+    With `bridge_m` > 0 vertices closer than that are connected as well, across holes of the mesh.
     """
     chosen = np.asarray(chosen)
     if len(chosen) == 0:
@@ -83,7 +83,7 @@ def pieces(graph: MeshGraph, chosen: np.ndarray, bridge_m: float = 0.0) -> list[
     local[chosen] = np.arange(len(chosen))
     links = local[graph.edges_within(chosen)]
     if bridge_m > 0:
-        near = cKDTree(graph.points[chosen]).query_pairs(bridge_m, output_type="ndarray")
+        near = KDTree(graph.points[chosen]).query_pairs(bridge_m, output_type="ndarray")
         links = np.concatenate([links, near])
     adjacency = coo_matrix(
         (np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(len(chosen),) * 2

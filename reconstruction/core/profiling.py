@@ -1,4 +1,4 @@
-"""Wall time, CPU time and peak memory of the process tree while a body of code runs."""
+"""Measure wall time, CPU time and peak memory of the process tree while a block of code runs."""
 
 import contextlib
 import re
@@ -9,31 +9,30 @@ from pathlib import Path
 
 import psutil
 
-_INTERVAL_S = 0.05
+_INTERVAL_S = 0.05  # between samples of memory
 _STATUS = Path("/proc/self/status")
 
 
 @dataclass(frozen=True)
 class Usage:
-    """What a stage cost."""
+    """Resources that a stage used."""
 
     wall_s: float
     cpu_s: float
-    peak_memory_mb: float
+    peak_memory_mb: float  # MiB
 
     def followed_by(self, later: "Usage") -> "Usage":
-        """Return what both cost, one after the other."""
+        """Return the usage of both, run one after the other."""
         peak = max(self.peak_memory_mb, later.peak_memory_mb)
         return Usage(self.wall_s + later.wall_s, self.cpu_s + later.cpu_s, peak)
 
 
 class UsageMeter:
-    """Context manager that measures this process and everything that it starts while the body runs.
+    """Context manager that measures this process and its descendants while the body runs.
 
-    Memory is what the whole tree occupied at once: this process's resident set plus what each descendant has for
-    itself (pages that a fork shares with its parent count once). It is sampled every 50 ms; where the kernel keeps a
-    high-water mark, a peak of this process that falls between two samples is still seen. CPU time covers descendants
-    that ended as well as those that still run.
+    Memory is the resident set of this process plus the unique set of each descendant, so that pages shared after a fork
+    count once. It is sampled every 50 ms. Where the kernel keeps a high-water mark, peaks of this process between two
+    samples count, too. CPU time includes descendants that have ended.
     """
 
     def __enter__(self) -> "UsageMeter":
@@ -52,7 +51,9 @@ class UsageMeter:
         self._stop.set()
         self._thread.join()
         high_water = _high_water_bytes()
-        if high_water > self._high_water_start:  # The mark is of the process's life; it rose within the body.
+        if (
+            high_water > self._high_water_start
+        ):  # The mark is of the whole life of the process: it rose in the body.
             self._peak = max(self._peak, high_water)
         self.usage = Usage(
             wall_s=time.perf_counter() - self._start,
@@ -61,7 +62,7 @@ class UsageMeter:
         )
 
     def _cpu(self) -> float:
-        """Return the CPU seconds of the tree so far: its own, of children that were waited for, of living ones."""
+        """Return the CPU seconds of the tree so far, including children that have been waited for."""
         total = 0.0
         for process in self._tree():
             try:
@@ -86,27 +87,27 @@ class UsageMeter:
             if process == self._process:
                 return own.rss
             other = process.memory_full_info()
-            # Between vfork and exec a child has no memory of its own, but the parent's: it must not count twice.
-            # The two are read one after the other, while the parent goes on, so that they agree but nearly.
+            # Between vfork and exec a child has its parent's memory, which must not count twice. Parent and child are
+            # read one after the other while the parent runs, hence the tolerances.
             alike = abs(other.vms - own.vms) < 0.05 * own.vms and abs(other.rss - own.rss) < 0.1 * own.rss
             borrowed = alike and other.uss > 0.5 * own.rss
-            # If it began its own program between the two reads, what it had for itself is the parent's still.
+            # If exec falls between the two reads of the child, `uss` is still the parent's.
             return 0 if borrowed else min(other.uss, other.rss)
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             return 0
 
 
 def _descendants(process: psutil.Process) -> list[psutil.Process]:
-    """Return the children of a process and theirs.
+    """Return all descendants of a process.
 
-    Linux lists the children of a thread; asking for all processes of the machine, as psutil does, costs milliseconds.
+    Linux lists the children of each thread. Listing all processes of the machine, as psutil does, costs milliseconds.
     """
     if not Path(f"/proc/{process.pid}/task/{process.pid}/children").exists():
         return process.children(recursive=True)
     found, todo = [], [process.pid]
     while todo:
         for listing in Path(f"/proc/{todo.pop()}/task").glob("*/children"):
-            with contextlib.suppress(OSError):  # The thread ended in the meantime, or below, the child.
+            with contextlib.suppress(OSError):  # the thread has ended; below, the child
                 todo += (pids := [int(text) for text in listing.read_text().split()])
                 for pid in pids:
                     with contextlib.suppress(psutil.NoSuchProcess):
@@ -115,7 +116,7 @@ def _descendants(process: psutil.Process) -> list[psutil.Process]:
 
 
 def _high_water_bytes() -> int:
-    """Return the largest resident set that this process ever had, 0 where the kernel does not tell."""
+    """Return the largest resident set that this process ever had, 0 if the kernel does not report it."""
     try:
         found = re.search(r"^VmHWM:\s*(\d+) kB", _STATUS.read_text(), re.MULTILINE)
     except OSError:

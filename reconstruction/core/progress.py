@@ -1,4 +1,4 @@
-"""Progress reporting as an argument: stages call it, only the command line shows it."""
+"""Interfaces of progress reporting: stages call them, the command line displays them."""
 
 from typing import TYPE_CHECKING, Protocol
 
@@ -7,26 +7,26 @@ if TYPE_CHECKING:
 
 
 class Progress(Protocol):
-    """What a stage may report while it works."""
+    """A sink for the progress of a stage."""
 
     def start(self, total: int, label: str) -> None:
         """Begin a step of `total` units within the stage."""
 
     def advance(self, n: int = 1) -> None:
-        """`n` units are done."""
+        """Report `n` more units as done."""
 
     def note(self, message: str) -> None:
-        """One line worth telling the user: a decision, a fallback, something dropped."""
+        """Report one line to the user: a decision, a fallback, dropped data."""
 
 
 class StageListener(Progress, Protocol):
-    """A progress sink that is also told when stages begin and end."""
+    """A progress sink that also receives the begin and end of stages."""
 
     def begin_stage(self, name: str, number: int, total: int, cached: bool) -> None:
-        """A stage begins, or is taken from the cache."""
+        """Report the begin of a stage, or that it is taken from the cache."""
 
     def end_stage(self, name: str, usage: "Usage | None") -> None:
-        """A stage is done; `usage` is None if it came from the cache."""
+        """Report the end of a stage; `usage` is None if it came from the cache."""
 
 
 class NoProgress:

@@ -1,7 +1,7 @@
-"""A z-buffer triangle rasterizer for the CPU: depth, triangle and barycentric coordinates per pixel.
+"""Rasterize a triangle mesh with a z-buffer on the CPU: depth, triangle and barycentric coordinates per pixel.
 
-Used to decide what a camera sees (texture baking, instance maps, ground truth of generated rooms) and to draw
-pictures of a scene without any graphics driver.
+Used for visibility (texture baking, instance maps, ground truth of generated rooms) and to draw without a graphics
+driver.
 """
 
 from dataclasses import dataclass
@@ -12,30 +12,29 @@ from numba import njit
 from reconstruction.core.types import Camera
 from registry.geometry import invert_rigid
 
-_NEAR_M = 1e-3
+_NEAR_M = 1e-3  # distance of the near plane
 
 
 @dataclass(frozen=True)
 class Raster:
-    """What a camera sees of a mesh."""
+    """The visible triangle of each pixel."""
 
-    depth: np.ndarray  # float32 (h, w) z-depth, 0 = nothing
-    face: np.ndarray  # int32 (h, w) index of the triangle, -1 = nothing
+    depth: np.ndarray  # float32 (h, w) z-depth in units of the mesh, 0 = nothing
+    face: np.ndarray  # int32 (h, w) row of the triangle in `faces`, -1 = nothing
     barycentric: np.ndarray  # float32 (h, w, 3) perspective-correct weights of the triangle's vertices
 
     def interpolate(self, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Interpolate per-vertex values (v, c) to float32 (h, w, c); zero where nothing is seen."""
+        """Interpolate per-vertex values (v, c) over faces (f, 3) to float32 (h, w, c); zero where nothing is seen."""
         out = np.zeros((*self.face.shape, values.shape[1]), np.float32)
         hit = self.face >= 0
-        out[hit] = np.einsum(
-            "nk,nkc->nc", self.barycentric[hit], values[faces[self.face[hit]]].astype(np.float32)
-        )
+        corners = values[faces[self.face[hit]]].astype(np.float32)
+        out[hit] = np.einsum("nk,nkc->nc", self.barycentric[hit], corners)
         return out
 
 
 @njit(cache=True, nogil=True)
 def _clip_near(triangle, near, out):  # pragma: no cover - compiled
-    """Clip a camera-space triangle (3, 6: xyz + barycentric) at z = near into `out` (4, 6); return its corners."""
+    """Clip a camera-space triangle (3, 6: xyz, barycentric) at z = near into `out` (4, 6); return the corner count."""
     count = 0
     for i in range(3):
         a, b = triangle[i], triangle[(i + 1) % 3]
@@ -51,6 +50,7 @@ def _clip_near(triangle, near, out):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _draw(points, faces, fx, fy, cx, cy, near, depth, face_map, bary):  # pragma: no cover - compiled
+    """Draw camera-space triangles into depth, face_map and bary; triangles clipped to four corners become a fan."""
     height, width = depth.shape
     triangle = np.empty((3, 6))
     poly = np.empty((4, 6))
@@ -102,16 +102,17 @@ def _draw(points, faces, fx, fy, cx, cy, near, depth, face_map, bary):  # pragma
                     face_map[y, x] = f
                     for k in range(3):
                         bary[y, x, k] = z * (
-                            wa * iz[a] * poly[a, 3 + k]
-                            + wb * iz[b] * poly[b, 3 + k]
-                            + wc * iz[c] * poly[c, 3 + k]
-                        )
+                            wa * iz[a] * poly[a, 3 + k] + wb * iz[b] * poly[b, 3 + k] + wc * iz[c] * poly[c, 3 + k]
+                        )  # fmt: skip
 
 
 def rasterize_mesh(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, world_from_camera: np.ndarray
 ) -> Raster:
-    """Draw a mesh (v, 3) in world space, (f, 3) as a camera sees it; both sides of a triangle are visible."""
+    """Rasterize a mesh, vertices (v, 3) in world space and faces (f, 3); both sides of triangles are visible.
+
+    The near plane is at 1 mm if the mesh is in metres. `world_from_camera` (4, 4) is rigid.
+    """
     camera_from_world = invert_rigid(world_from_camera)
     points = np.asarray(vertices, np.float64) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
     shape = (camera.height, camera.width)

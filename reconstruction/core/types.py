@@ -1,27 +1,56 @@
-"""What crosses stages: frozen dataclasses of NumPy arrays and plain values, in the order of the data flow.
+"""Artifacts that stages exchange: frozen dataclasses of NumPy arrays and plain values, in the order of the data flow.
 
-Conventions (docs/conventions.md): transforms are `b_from_a` 4x4 float64; cameras are OpenCV (+x right, +y down,
-+z forward); `sfm` space has arbitrary scale and orientation; `world` is metres, +z up, floor at z = 0. Images are
-uint8 RGB (h, w, 3). Depth is z-depth, float32, 0 = unknown. Pixel centres lie at (0.5, 0.5). Instance ids are
-integers >= 1 that mean the same thing everywhere; 0 = none. Quaternions are wxyz.
-All of them are saved and loaded by `reconstruction.core.artifacts`.
+Conventions (docs/conventions.md): transforms are `b_from_a`, float64 4x4. Camera frames are OpenCV: +x right, +y down,
++z forward. `sfm` space has arbitrary scale and orientation. `world` is in metres, +z up, floor at z = 0. Images are
+sRGB. Depth is z-depth, 0 = unknown. The centre of the first pixel is (0.5, 0.5). Instance ids are integers >= 1 with
+one meaning in all artifacts; 0 = none. Quaternions are wxyz. `reconstruction.core.artifacts` saves and loads them.
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from registry.geometry import split_similarity
 
 
+def check_arrays(owner: Any, **expected: str) -> None:
+    """Check dtype and shape of the array fields of `owner`, e.g. `check_arrays(self, points="float64 p 3")`.
+
+    Args:
+        owner: instance of a dataclass.
+        **expected: for a field, its dtype and its axes. Axes of the same name have the same length in all fields of
+            the call. A field that is None passes.
+
+    Raises:
+        ValueError: a field has another dtype, rank or length; names the class and the field.
+    """
+    lengths: dict[str, int] = {}
+    for name, text in expected.items():
+        array, (dtype, *axes) = getattr(owner, name), text.split()
+        if array is None:
+            continue
+        shape = np.shape(array)
+        fits = len(shape) == len(axes) and all(
+            size == (int(axis) if axis.isdigit() else lengths.setdefault(axis, size))
+            for axis, size in zip(axes, shape)
+        )
+        if not fits or getattr(array, "dtype", None) != dtype:
+            known = "".join(f", {axis} = {lengths[axis]}" for axis in axes if axis in lengths)
+            raise ValueError(
+                f"{type(owner).__name__}.{name}: expected {dtype} ({', '.join(axes)}){known}; "
+                f"got {getattr(array, 'dtype', type(array).__name__)} {shape}"
+            )
+
+
 @dataclass(frozen=True)
 class VideoSource:
-    """Where the frames came from."""
+    """The video file that frames were decoded from."""
 
     file: str
     sha256: str
-    width: int
-    height: int
+    width: int  # pixels
+    height: int  # pixels
     fps: float
     frame_count: int
     duration_s: float
@@ -29,27 +58,30 @@ class VideoSource:
 
 @dataclass(frozen=True)
 class FrameSet:
-    """Stage 1: chosen frames, upright, at working resolution."""
+    """Stage 1: n keyframes and m held-out frames, upright, at working resolution."""
 
     source: VideoSource
-    images: np.ndarray  # uint8 (n, h, w, 3) keyframes, in time order; none of them held out
-    indices: np.ndarray  # int32 (n,) decoded video frame number of each
+    images: np.ndarray  # uint8 (n, h, w, 3) RGB keyframes in time order
+    indices: np.ndarray  # int32 (n,) decoded video frame numbers
     times_s: np.ndarray  # float64 (n,)
-    sharpness: np.ndarray  # float32 (n,) larger is sharper, comparable within one video only
-    held_out_images: (
-        np.ndarray
-    )  # uint8 (m, h, w, 3) every tenth video frame (index % 10 == 0), for evaluation only
-    held_out_indices: np.ndarray  # int32 (m,)
+    sharpness: np.ndarray  # float32 (n,) larger is sharper; comparable within one video only
+    held_out_images: np.ndarray  # uint8 (m, h, w, 3) frames with index % 10 == 0, for evaluation only
+    held_out_indices: np.ndarray  # int32 (m,) decoded video frame numbers; disjoint from `indices`
     held_out_times_s: np.ndarray  # float64 (m,)
-    focal_prior_px: float  # from metadata, 0 where unknown
-    ordered: (
-        bool  # True for a video, False for a folder of images (neighbours in name order may be far apart)
-    )
+    focal_prior_px: float  # focal length from metadata, 0 = unknown
+    ordered: bool  # True: video; False: image folder, where neighbours in name order may be far apart
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(
+            self, images="uint8 n h w 3", indices="int32 n", times_s="float64 n", sharpness="float32 n",
+            held_out_images="uint8 m h w 3", held_out_indices="int32 m", held_out_times_s="float64 m",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion; pixel centres at (0.5, 0.5)."""
+    """A pinhole camera without distortion; all values in pixels, the centre of the first pixel is (0.5, 0.5)."""
 
     width: int
     height: int
@@ -60,106 +92,123 @@ class Camera:
 
     @property
     def matrix(self) -> np.ndarray:
-        """Return the 3x3 intrinsic matrix K."""
+        """Return the intrinsic matrix K, float64 (3, 3)."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera of the same view sampled at another resolution."""
+        """Return the camera of the same view at another resolution, in pixels."""
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
     @property
     def intrinsics(self) -> np.ndarray:
-        """Return fx, fy, cx, cy as float64 (4,), as compiled kernels take them."""
+        """Return fx, fy, cx, cy as float64 (4,), for compiled kernels."""
         return np.array([self.fx, self.fy, self.cx, self.cy], np.float64)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project points (..., 3) of the camera's frame; return columns and rows (...), in pixels.
+        """Project points (..., 3) from the camera frame; return columns and rows (...), in pixels.
 
-        Points need z > 0; others project to what the formula gives, without a check.
+        Points with z <= 0 are not checked: their result has no meaning.
         """
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         return self.fx * x / z + self.cx, self.fy * y / z + self.cy
 
-    def unproject(self, columns: np.ndarray, rows: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Return the points (..., 3) of the camera's frame at pixels, in the units of `z`.
+    def unproject(
+        self, columns: np.ndarray | float, rows: np.ndarray | float, z: np.ndarray | float
+    ) -> np.ndarray:
+        """Return the points (..., 3) at pixels, in the camera frame and the units of `z`.
 
         Args:
             columns: pixel coordinates, the centre of the first pixel is 0.5.
             rows: the same.
-            z: depth along the optical axis, 1 for rays.
+            z: z-depth; 1 gives rays.
         """
         x, y = (columns - self.cx) / self.fx * z, (rows - self.cy) / self.fy * z
         return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
     def pixel_rays(self) -> np.ndarray:
-        """Return the rays float64 (height, width, 3) through the centres of all pixels, z = 1."""
+        """Return the rays through all pixel centres, float64 (height, width, 3), with z = 1."""
         columns, rows = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
         return self.unproject(columns[None, :], rows[:, None], np.ones((self.height, self.width)))
 
 
 @dataclass(frozen=True)
 class PosedFrames:
-    """Stage 2: undistorted keyframes with cameras, in `sfm` space (in `world` after `WorldFrame.apply_to`)."""
+    """Stage 2: undistorted frames with cameras and sparse points, in `sfm` space; `WorldFrame.apply_to` moves them."""
 
     source: VideoSource
     camera: Camera  # shared by all frames, at the resolution of `images`
-    images: np.ndarray  # uint8 (n, h, w, 3), undistorted
-    indices: np.ndarray  # int32 (n,)
+    images: np.ndarray  # uint8 (n, h, w, 3) RGB keyframes
+    indices: np.ndarray  # int32 (n,) decoded video frame numbers
     times_s: np.ndarray  # float64 (n,)
-    world_from_camera: np.ndarray  # float64 (n, 4, 4)
-    sharpness: np.ndarray  # float32 (n,)
-    held_out_images: np.ndarray  # uint8 (m, h, w, 3), undistorted; only those that could be registered
-    held_out_indices: np.ndarray  # int32 (m,)
+    world_from_camera: np.ndarray  # float64 (n, 4, 4) rigid
+    sharpness: np.ndarray  # float32 (n,) as in `FrameSet`
+    held_out_images: np.ndarray  # uint8 (m, h, w, 3) RGB; only frames that could be registered
+    held_out_indices: np.ndarray  # int32 (m,) decoded video frame numbers
     held_out_times_s: np.ndarray  # float64 (m,)
-    held_out_world_from_camera: np.ndarray  # float64 (m, 4, 4)
+    held_out_world_from_camera: np.ndarray  # float64 (m, 4, 4) rigid
     points: np.ndarray  # float64 (p, 3) sparse points
-    point_colors: np.ndarray  # uint8 (p, 3)
+    point_colors: np.ndarray  # uint8 (p, 3) RGB
     point_errors_px: np.ndarray  # float32 (p,) mean reprojection error
-    observations: np.ndarray  # int32 (o, 2) pairs (frame row, point row): which frame saw which point
+    observations: np.ndarray  # int32 (o, 2) pairs (frame row, point row): the frame sees the point
     chosen_frames: (
-        int  # how many keyframes were given, so that len(images) / chosen_frames is the registered share
+        int  # number of keyframes before registration; len(images) / chosen_frames is the registered share
     )
-    ordered: bool  # frames follow each other in time
-    reprojection_error_px: float
-    metric: bool = False  # poses were imported from a tracker that measures metres (ARKit)
+    ordered: bool  # rows are in time order
+    reprojection_error_px: float  # mean
+    metric: bool = False  # `sfm` is in metres: poses were imported from a metric tracker (ARKit)
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(
+            self, images="uint8 n h w 3", indices="int32 n", times_s="float64 n", world_from_camera="float64 n 4 4",
+            sharpness="float32 n", held_out_images="uint8 m h w 3", held_out_indices="int32 m",
+            held_out_times_s="float64 m", held_out_world_from_camera="float64 m 4 4", points="float64 p 3",
+            point_colors="uint8 p 3", point_errors_px="float32 p", observations="int32 o 2",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Stage 3: one depth map per posed keyframe, in the units of its poses."""
+    """Stage 3: one depth map per keyframe of `PosedFrames`, in the units of its poses."""
 
-    camera: Camera  # the frames' camera at depth resolution
+    camera: Camera  # of the keyframes, at depth resolution
     depth: np.ndarray  # float32 (n, h, w) z-depth, 0 = unknown
-    confidence: (
-        np.ndarray
-    )  # uint8 (n, h, w): 0 unknown, 1 completed (a plane that its surroundings support), 2 measured
+    confidence: np.ndarray  # uint8 (n, h, w) 0 unknown, 1 completed by a plane around it, 2 measured
     affinity: np.ndarray | None = (
         None  # uint8 (n, 6, ceil(h / 2), ceil(w / 2)), see `depth.mending.pack_affinities`
     )
 
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, depth="float32 n h w", confidence="uint8 n h w", affinity="uint8 n 6 h2 w2")
+
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """How metres were found."""
+    """Source and accuracy of the metric scale."""
 
     # "marker" | "user-camera-height" | "user-distance" | "user-object" | "user-factor" | "imported-poses" |
     # "metric-depth" | "camera-height-prior" | "table-height-prior" | "subject-distance-prior" | "unknown"
     method: str
-    uncertainty: float  # relative 1-sigma of the scale
-    detail: str  # one sentence for people
+    uncertainty: float  # relative standard deviation of the scale
+    detail: str  # one sentence for users
 
 
 @dataclass(frozen=True)
 class WorldFrame:
-    """Stage 4: the similarity that takes `sfm` to `world`, and how it was found."""
+    """Stage 4: the similarity transform from `sfm` to `world`, and how it was estimated."""
 
-    world_from_sfm: np.ndarray  # float64 (4, 4), scale inside the 3x3 block
+    world_from_sfm: np.ndarray  # float64 (4, 4), scale in the 3x3 block
     scale: ScaleEstimate
     gravity_method: str  # e.g. "planes+cameras" | "cameras"
-    gravity_sigma_deg: float
-    floor_observed: bool  # False: the floor is assumed below everything seen
-    yaw_snapped: bool  # walls (or furniture edges) are parallel to x and y
+    gravity_sigma_deg: float  # standard deviation of the up direction
+    floor_observed: bool  # False: the floor is assumed below all seen surface
+    yaw_snapped: bool  # walls (or furniture faces) are parallel to x and y
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, world_from_sfm="float64 4 4")
 
     def apply_to(self, posed: PosedFrames) -> PosedFrames:
         """Return the frames with cameras and points in world space, in metres."""
@@ -186,14 +235,18 @@ class WorldFrame:
 
 @dataclass(frozen=True)
 class SpaceGrid:
-    """What is known of space, on a coarse regular grid in world space; later stages carve with it."""
+    """Occupancy of a regular voxel grid, axis-aligned in world space."""
 
-    origin: np.ndarray  # float64 (3,) corner of voxel (0, 0, 0)
+    origin: np.ndarray  # float64 (3,) corner of voxel (0, 0, 0), metres
     voxel_size_m: float
-    state: np.ndarray  # uint8 (nx, ny, nz): 0 unknown, 1 free (a ray passed through), 2 surface
+    state: np.ndarray  # uint8 (nx, ny, nz) 0 unknown, 1 free (a ray passed through), 2 surface
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, origin="float64 3", state="uint8 nx ny nz")
 
     def lookup(self, points: np.ndarray) -> np.ndarray:
-        """Return the state (n,) at world points (n, 3); outside the grid is unknown."""
+        """Return the state, uint8 (n,), at world points (n, 3); 0 outside of the grid."""
         cell = np.floor((np.asarray(points) - self.origin) / self.voxel_size_m).astype(np.int64)
         inside = np.all((cell >= 0) & (cell < self.state.shape), axis=1)
         out = np.zeros(len(cell), np.uint8)
@@ -204,40 +257,55 @@ class SpaceGrid:
 
 @dataclass(frozen=True)
 class Plane:
-    """A bounded plane: n . x + d = 0, n towards free space."""
+    """A bounded plane n . x + d = 0 in world space; n is unit and points towards free space."""
 
-    plane: np.ndarray  # float64 (4,) nx, ny, nz, d
-    polygon: np.ndarray  # float64 (k, 3) outline in world space, k >= 3
+    plane: np.ndarray  # float64 (4,) nx, ny, nz, d in metres
+    polygon: np.ndarray  # float64 (k, 3) outline, metres, k >= 3
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, plane="float64 4", polygon="float64 k 3")
 
 
 @dataclass(frozen=True)
 class SurfacePlane:
-    """A plane of the room of which some was seen: what bounds it, or something level that can carry things."""
+    """A partly seen plane of the room: floor, wall, ceiling, or a support plane (level, can carry things)."""
 
     label: str  # "floor" | "wall" | "ceiling" | "support"
-    surface: Plane  # outline of what was seen: a convex one, of a support one that follows its bays
-    area_m2: float  # of the seen surface on it
-    band_m: float  # surface within this distance belongs to it
-    vertices: np.ndarray  # int32 (k,) vertices of the surface on it, ascending; no vertex is on two planes
+    surface: Plane  # outline of the seen part: convex, except that of a support, which may be concave
+    area_m2: float  # seen surface on the plane
+    band_m: float  # largest distance to the plane of surface that belongs to it
+    vertices: np.ndarray  # int32 (k,) rows of `Surface.vertices`, ascending; no vertex is on two planes
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, vertices="int32 k")
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Stage 5: the fused visible surface in world space, as one triangle mesh, and the state of space."""
+    """Stage 5: the fused visible surface as one triangle mesh in world space, and the occupancy grid."""
 
     vertices: np.ndarray  # float32 (v, 3) metres
-    faces: np.ndarray  # int32 (f, 3), counter-clockwise seen from free space
+    faces: np.ndarray  # int32 (f, 3) rows of `vertices`, counter-clockwise seen from free space
     normals: np.ndarray  # float32 (v, 3) unit, towards free space
-    colors: np.ndarray  # uint8 (v, 3)
-    weights: np.ndarray  # float32 (v,) how many views support the vertex
-    voxel_size_m: float
+    colors: np.ndarray  # uint8 (v, 3) RGB
+    weights: np.ndarray  # float32 (v,) number of views that support the vertex
+    voxel_size_m: float  # of the fusion
     space: SpaceGrid
-    planes: tuple[SurfacePlane, ...] = ()  # floor, walls, ceiling, then supports from the lowest up
+    planes: tuple[SurfacePlane, ...] = ()  # floor, walls, ceiling, then supports by ascending height
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(
+            self, vertices="float32 v 3", faces="int32 f 3", normals="float32 v 3", colors="uint8 v 3",
+            weights="float32 v",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class BaseEntity:
-    """Floor, wall or ceiling: static and never an object."""
+    """A floor, wall or ceiling: static, never an object."""
 
     id: int
     label: str  # "floor" | "wall" | "ceiling"
@@ -247,49 +315,67 @@ class BaseEntity:
 
 @dataclass(frozen=True)
 class Instance:
-    """One separate thing, as seen."""
+    """One object, as segmented from the seen surface."""
 
     id: int
-    label: str  # coarse: "table", "shelf", "box", … "unknown"
+    label: str  # coarse class: "table", "shelf", "box", … "unknown"
     label_confidence: float
-    center: np.ndarray  # float64 (3,) of its box in world space
-    yaw_rad: float  # of its upright box
-    extents_m: np.ndarray  # float64 (3,) of its box
-    support_hint: int  # id of the thing that it seems to rest on or hang from (0: not known)
-    attached_hint: bool  # hangs on a wall rather than stands
+    center: np.ndarray  # float64 (3,) of its upright box, world space, metres
+    yaw_rad: float  # of its upright box, about +z
+    extents_m: np.ndarray  # float64 (3,) of its upright box
+    support_hint: int  # id of what it probably rests on or hangs from, 0 = not known
+    attached_hint: bool  # True: hangs on a wall; False: stands
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, center="float64 3", extents_m="float64 3")
 
 
 @dataclass(frozen=True)
 class InstanceSet:
-    """Stage 6: the surface cut into things."""
+    """Stage 6: instance segmentation of the surface and of the keyframes."""
 
-    vertex_instance: np.ndarray  # int32 (v,) per surface vertex; base entities have ids too; 0 = none
+    vertex_instance: np.ndarray  # int32 (v,) id per vertex of `Surface`, base entities included, 0 = none
     base: tuple[BaseEntity, ...]
     objects: tuple[Instance, ...]
-    id_maps: np.ndarray  # uint16 (n, h, w) per keyframe at depth resolution: which id is seen at each pixel
+    id_maps: np.ndarray  # uint16 (n, h, w) id seen at each pixel, per keyframe at depth resolution
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, vertex_instance="int32 v", id_maps="uint16 n h w")
 
 
 @dataclass(frozen=True)
 class TexturedMesh:
     """A textured triangle mesh; vertices are duplicated at texture seams."""
 
-    vertices: np.ndarray  # float32 (v, 3) in its own space, +z up, metres
-    faces: np.ndarray  # int32 (f, 3)
-    uvs: np.ndarray  # float32 (v, 2), origin at the lower left (glTF readers flip as they need)
+    vertices: np.ndarray  # float32 (v, 3) metres, +z up, in the space that its owner names
+    faces: np.ndarray  # int32 (f, 3) rows of `vertices`
+    uvs: np.ndarray  # float32 (v, 2) in [0, 1], origin at the lower left
     texture: np.ndarray  # uint8 (t, t, 3) sRGB, row 0 at v = 1
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(
+            self, vertices="float32 v 3", faces="int32 f 3", uvs="float32 v 2", texture="uint8 t t 3"
+        )
 
 
 @dataclass(frozen=True)
 class ConvexPart:
-    """One convex piece of a collision shape, in object space."""
+    """One convex part of a collision shape, in object space."""
 
-    vertices: np.ndarray  # float32 (v, 3)
-    faces: np.ndarray  # int32 (f, 3)
+    vertices: np.ndarray  # float32 (v, 3) metres
+    faces: np.ndarray  # int32 (f, 3) rows of `vertices`
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, vertices="float32 v 3", faces="int32 f 3")
 
 
 @dataclass(frozen=True)
 class PhysicalRanges:
-    """Between what values a simulation may draw: (low, high), the value itself within."""
+    """Ranges (low, high) for domain randomization; each holds the nominal value of `PhysicalAttributes`."""
 
     mass_kg: tuple[float, float]
     friction: tuple[float, float]
@@ -298,59 +384,71 @@ class PhysicalRanges:
 
 @dataclass(frozen=True)
 class PhysicalAttributes:
-    """What the simulator needs besides shape; provenance is `AssetProvenance.physics`."""
+    """Physical properties of an object; `AssetProvenance.physics` says where they come from."""
 
     material: str
-    density_kg_m3: float  # of the solid matter, before hollowness
+    density_kg_m3: float  # of the solid material, before hollowness
     mass_kg: float
-    center_of_mass: np.ndarray  # float64 (3,) object space
+    center_of_mass: np.ndarray  # float64 (3,) object space, metres
     inertia: np.ndarray  # float64 (3, 3) about the centre of mass, object axes, kg m^2
     friction: float
     restitution: float
     ranges: PhysicalRanges
 
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, center_of_mass="float64 3", inertia="float64 3 3")
+
 
 @dataclass(frozen=True)
 class AssetProvenance:
-    """Where each part of an asset came from."""
+    """Sources of the parts of an asset."""
 
     geometry: str  # "observed+completed", or the backend's name
     appearance: str
     physics: str
-    observed_fraction: float  # share of the final surface area that some frame saw
+    observed_fraction: float  # share of the final surface area that at least one frame saw
 
 
 @dataclass(frozen=True)
 class ObjectAsset:
-    """Stage 7: one complete object. Object space: origin at the bottom centre of its box, +z up, metres."""
+    """Stage 7: one complete object. Object space: metres, +z up, origin at the bottom centre of its box."""
 
     id: int
     label: str
     label_confidence: float
-    world_from_object: np.ndarray  # float64 (4, 4) rigid, as reconstructed (before assembly)
-    visual: TexturedMesh  # closed surface
+    world_from_object: np.ndarray  # float64 (4, 4) rigid, as reconstructed, before assembly
+    visual: TexturedMesh  # closed surface, object space
     collision: tuple[ConvexPart, ...]
     physics: PhysicalAttributes
     provenance: AssetProvenance
     views: np.ndarray  # int32 (k,) video frame numbers that textured it, best first
-    support_hint: int
-    attached_hint: bool
+    support_hint: int  # as in `Instance`
+    attached_hint: bool  # as in `Instance`
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, world_from_object="float64 4 4", views="int32 k")
 
 
 @dataclass(frozen=True)
 class BaseAsset:
-    """Stage 7: a floor, wall or ceiling with its looks. The mesh is in world space."""
+    """Stage 7: a floor, wall or ceiling with its textured mesh in world space."""
 
     id: int
-    label: str
-    plane: np.ndarray  # float64 (4,) n . x + d = 0, n into the room
+    label: str  # "floor" | "wall" | "ceiling"
+    plane: np.ndarray  # float64 (4,) n . x + d = 0 in metres, n unit and into the room
     visual: TexturedMesh
     observed: bool
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, plane="float64 4")
 
 
 @dataclass(frozen=True)
 class AssetSet:
-    """Stage 7: everything that the scene is built from."""
+    """Stage 7: all assets of the scene."""
 
     base: tuple[BaseAsset, ...]
     objects: tuple[ObjectAsset, ...]
@@ -358,7 +456,7 @@ class AssetSet:
 
 @dataclass(frozen=True)
 class Edge:
-    """(child, relation, parent) of the scene graph."""
+    """Edge (child, relation, parent) of the scene graph; child and parent are instance ids."""
 
     child: int
     relation: str  # "supported_by" | "attached_to"
@@ -369,29 +467,33 @@ class Edge:
 
 @dataclass(frozen=True)
 class SceneGraph:
-    """Stage 8: every object has exactly one parent; rooted in the base; no cycle."""
+    """Stage 8: a forest rooted in the base: each object has exactly one parent, without cycles."""
 
     edges: tuple[Edge, ...]
 
 
 @dataclass(frozen=True)
 class PlacedObject:
-    """Stage 9: where an object ended, and how."""
+    """Stage 9: the final pose of an object and how it was reached."""
 
     id: int
-    world_from_object: np.ndarray  # float64 (4, 4)
+    world_from_object: np.ndarray  # float64 (4, 4) rigid
     dynamic: bool
-    moved_m: float  # from the reconstructed pose
-    turned_deg: float
-    repair: str  # "" or what was done to make it stand
+    moved_m: float  # distance from the reconstructed pose
+    turned_deg: float  # rotation from the reconstructed pose
+    repair: str  # what made it stand, "" = nothing was needed
     stable: bool
-    collision: tuple[ConvexPart, ...] | None = None  # object space; what a repair made of the asset's own
+    collision: tuple[ConvexPart, ...] | None = None  # object space; replaces the asset's own after a repair
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, world_from_object="float64 4 4")
 
 
 @dataclass(frozen=True)
 class AssembledScene:
-    """Stage 9: the scene at rest, with the physics report card of CONTRACT section 4."""
+    """Stage 9: the scene at rest, with the physics report of CONTRACT section 4."""
 
     placed: tuple[PlacedObject, ...]
-    graph: SceneGraph  # may differ from stage 8 where a repair chose another parent
+    graph: SceneGraph  # differs from stage 8 where a repair changed a parent
     physics_report: dict = field(default_factory=dict)  # JSON values only

@@ -1,5 +1,6 @@
-"""Threads that work on frames beside each other."""
+"""A thread pool over frames."""
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -7,16 +8,18 @@ from reconstruction.core.progress import Progress
 
 
 class Workers:
-    """Runs a function for every frame on a few threads; the kernels release the interpreter."""
+    """Runs a function for every frame on a few threads; kernels release the interpreter lock.
 
-    def __init__(self, threads: int):
-        import os
+    Args:
+        threads: number of threads; 0 is the number of usable cores.
+    """
 
-        self.threads = (
-            threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads or 2
-        )
+    def __init__(self, threads: int) -> None:
+        usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
+        self.threads = threads or usable
 
     def each(self, n: int, work: Callable[[int], None], label: str, progress: Progress) -> None:
+        """Call work(i) for i < n and report each call as one unit of the step `label`."""
         progress.start(n, label)
         with ThreadPoolExecutor(self.threads) as pool:
             for _ in pool.map(work, range(n)):

@@ -75,7 +75,7 @@ class DepthConfig:
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""
 
-    monocular: Literal["none", "transformers"] = "none"
+    monocular: Literal["none", "transformers"] | str = "none"
     """Learned depth from single images for what nothing else reaches; needs `pip install 'simrecon[depth-models]'`."""
 
     monocular_model: str = "depth-anything/Depth-Anything-V2-Small-hf"

@@ -11,6 +11,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from reconstruction.core.plugins import load_plugin
 from reconstruction.core.types import Camera, PosedFrames
 from reconstruction.depth.config import DepthConfig
 from reconstruction.depth.scene import DepthScene
@@ -56,7 +57,11 @@ class TransformersMonocular:
 
 def load_monocular(config: DepthConfig) -> MonocularBackend | None:
     """Return the backend that the config asks for, or None."""
-    return TransformersMonocular(config.monocular_model) if config.monocular == "transformers" else None
+    if config.monocular == "none":
+        return None
+    if config.monocular == "transformers":
+        return TransformersMonocular(config.monocular_model)
+    return load_plugin("depth.monocular", config.monocular, DepthConfig)(config)
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""The user's corrections (`--overrides FILE`): read, addressed to objects, applied to results of stages."""
+"""The user's corrections (`--overrides FILE`): parsing, addressing of objects, application to the results of stages."""

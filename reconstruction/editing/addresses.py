@@ -1,7 +1,7 @@
-"""How a user points at a thing: by id, by a point in the world, or by a click in a frame of the film.
+"""Addresses of objects in an overrides file: an id, a point in the world, or a click in a frame of the film.
 
-Ids are given by size and change with settings; world coordinates change with the scale. A frame number and a pixel of
-the film mean the same thing in every reconstruction of it: the anchor to keep in a file. See docs/overrides.md.
+Ids change with settings, world coordinates change with the scale. A frame number and a pixel address the same object in
+every reconstruction of a film, so that clicks suit files that are kept. See docs/overrides.md.
 """
 
 from dataclasses import dataclass
@@ -16,18 +16,17 @@ KINDS = ("id", "at", "pixel")
 
 @dataclass(frozen=True)
 class Address:
-    """One way to say which thing is meant."""
+    """One address; the fields after `kind` that belong to other kinds keep their defaults."""
 
     kind: str  # one of KINDS
     id: int = 0
-    near: tuple[float, float, float] | None = None  # guards an id
-    at: tuple[float, float, float] | None = None  # world metres
+    near: tuple[float, float, float] | None = None  # world metres; the object of `id` must be near this point
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world metres
     frame: int = 0  # video frame number
-    pixel: tuple[float, float] = (0.0, 0.0)  # in the video as filmed, upright
-    size: tuple[int, int] | None = None  # of the picture that `pixel` counts in; None: the video's own
+    pixel: tuple[float, float] = (0.0, 0.0)  # x, y in the video as filmed, upright
+    size: tuple[int, int] | None = None  # width, height that `pixel` counts in; None: the video's
 
     def __str__(self) -> str:
-        """Return it as in the file."""
         if self.kind == "id":
             return f"id {self.id}"
         if self.kind == "at":
@@ -36,33 +35,34 @@ class Address:
 
 
 def parse_address(value: Any, where: str) -> Address:
-    """Read an address: a number, or a mapping with `id`, `at` or `pixel`; other keys of the mapping are ignored.
+    """Parse an address: a number, or a mapping with one of `id`, `at`, `pixel`; its other keys are ignored.
 
     Raises:
-        UsageError: it is none of these.
+        UsageError: it is none of these; the message starts with `where`.
     """
     if isinstance(value, int) and not isinstance(value, bool):
         return Address("id", value)
-    given = [k for k in KINDS if k in value] if isinstance(value, dict) else []
+    entry = value if isinstance(value, dict) else {}
+    given = [kind for kind in KINDS if kind in entry]
     if len(given) != 1:
         raise UsageError(
             f"{where}: needs one of `id: N`, `at: [x, y, z]` and `pixel: {{frame: N, x: X, y: Y}}`, "
             f"got {value!r}"
         )
-    if "near" in value and given[0] != "id":
-        raise UsageError(f"{where}: `near` belongs to `id`; {given[0]} says where on its own")
+    if "near" in entry and given[0] != "id":
+        raise UsageError(f"{where}: `near` can only be used with `id`; remove it beside `{given[0]}`")
     if given[0] == "at":
-        return Address("at", at=vector(value["at"], f"{where}: at"))
+        return Address("at", at=vector(entry["at"], f"{where}: at"))
     if given[0] == "pixel":
-        return _click(value["pixel"], where)
-    if not isinstance(value["id"], int) or isinstance(value["id"], bool):
-        raise UsageError(f"{where}: id must be the number of a thing in `simrecon show`, got {value['id']!r}")
-    near = vector(value["near"], f"{where}: near") if "near" in value else None
-    return Address("id", value["id"], near)
+        return _click(entry["pixel"], where)
+    if not isinstance(entry["id"], int) or isinstance(entry["id"], bool):
+        raise UsageError(f"{where}: id must be the number of a thing in `simrecon show`, got {entry['id']!r}")
+    near = vector(entry["near"], f"{where}: near") if "near" in entry else None
+    return Address("id", entry["id"], near)
 
 
 def parse_addresses(values: Any, where: str, fewest: int) -> list[Address]:
-    """Read a list of addresses."""
+    """Parse a list of at least `fewest` different addresses."""
     if not isinstance(values, list) or len(set(map(repr, values))) < fewest:
         raise UsageError(
             f"{where} needs a list of at least {fewest} different things (ids or other addresses), got {values!r}"
@@ -71,7 +71,7 @@ def parse_addresses(values: Any, where: str, fewest: int) -> list[Address]:
 
 
 def parse_parts(values: Any, where: str) -> list[list[Address]]:
-    """Read the points of a split: for each part one point (`pixel` or `at`), or a list of points."""
+    """Parse the points of a split: for each part one point (`pixel` or `at`), or a list of points."""
     if not isinstance(values, list) or len(values) < 2:
         raise UsageError(
             f"{where} needs a plane {{point: [x, y, z], normal: [x, y, z]}}, or a list with a point on each part such "
@@ -87,14 +87,15 @@ def parse_parts(values: Any, where: str) -> list[list[Address]]:
 
 
 def vector(value: Any, where: str) -> tuple[float, float, float]:
-    """Check three finite numbers."""
+    """Parse three finite numbers."""
     try:
         numbers = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         numbers = np.zeros(0)
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise UsageError(f"{where} must be three numbers, got {value!r}")
-    return tuple(float(x) for x in numbers)
+    x, y, z = numbers.tolist()
+    return x, y, z
 
 
 def _click(value: Any, where: str) -> Address:
@@ -110,12 +111,9 @@ def _click(value: Any, where: str) -> Address:
         or not (size is None or (isinstance(size, list) and len(size) == 2 and all(map(number, size))))
     ):
         raise UsageError(
-            f"{where}: pixel needs {{frame: N, x: X, y: Y}}, the video's frame number and a pixel of it "
-            f"(with `size: [width, height]` where another size than the video's is counted in), got {value!r}"
+            f"{where}: pixel needs {{frame: N, x: X, y: Y}}, the video's frame number and a pixel in it "
+            f"(with `size: [width, height]` if x and y count in another size than the video's), got {value!r}"
         )
-    return Address(
-        "pixel",
-        frame=int(value["frame"]),
-        pixel=(float(value["x"]), float(value["y"])),
-        size=tuple(int(x) for x in size) if size else None,
-    )
+    pixel = float(value["x"]), float(value["y"])
+    in_size = (int(size[0]), int(size[1])) if size else None
+    return Address("pixel", frame=int(value["frame"]), pixel=pixel, size=in_size)

@@ -1,9 +1,10 @@
-"""Which thing an address (`addresses`) means: looked up in the cut, the surface and the film's frames."""
+"""Resolution of addresses (`addresses`) to objects, surface vertices and points."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from reconstruction.core.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
 from reconstruction.editing.addresses import Address
@@ -11,26 +12,28 @@ from reconstruction.instances.id_maps import seen_vertices
 from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
 
-NEAR_M = 0.3  # how far `near` may be from a thing's box
-AT_M = 0.05  # how far `at` may be from a thing's surface
-_REACH_PX = 2.0  # how far a click may miss, at depth resolution
-_GAP_S = 1.0  # between posed frames further apart than this no camera is interpolated
+NEAR_M = 0.3  # largest distance of `near` to the object's box
+AT_M = 0.05  # largest distance of `at` to the object's surface
+_REACH_PX = 2.0  # a click may miss the object by this many pixels at depth resolution
+_GAP_S = 1.0  # cameras are interpolated between posed frames at most this far apart
 
 
 @dataclass(frozen=True)
 class Footage:
-    """What clicks are looked up in: the film's frames with cameras, and the surface that they show."""
+    """The film as clicks need it: frames with cameras, the surface, and the lens distortion."""
 
     posed: PosedFrames  # world space
-    depth: DepthMaps  # only its camera is used: the resolution of the id maps
+    depth: DepthMaps  # only its camera is used, at the resolution of the id maps
     surface: Surface
     lens: Lens
 
     def camera_of(self, frame: int) -> tuple[int | None, np.ndarray]:
-        """Return the keyframe's row (None where it is none) and world_from_camera of a video frame.
+        """Return the row (None if it is no keyframe) and world_from_camera of a video frame.
+
+        Between posed frames less than a second apart the pose is interpolated.
 
         Raises:
-            UsageError: no camera of that frame is known.
+            UsageError: the camera of that frame is not known.
         """
         posed = self.posed
         row = np.flatnonzero(np.asarray(posed.indices) == frame)
@@ -46,7 +49,8 @@ class Footage:
         if posed.ordered and 0 < after < len(known):
             a, b = order[after - 1], order[after]
             if known[b] - known[a] <= _GAP_S * posed.source.fps:
-                return None, _between(poses[a], poses[b], (frame - known[a]) / (known[b] - known[a]))
+                share = float((frame - known[a]) / (known[b] - known[a]))
+                return None, _between(poses[a], poses[b], share)
         nearest = sorted(sorted(known.tolist(), key=lambda k: abs(k - frame))[:6])
         raise UsageError(
             f"overrides: no camera is known of frame {frame} (the film has {posed.source.frame_count}); "
@@ -54,10 +58,10 @@ class Footage:
         )
 
     def depth_pixel(self, address: Address) -> np.ndarray:
-        """Return the pixel (2,) that a click means in the straightened frame at depth resolution.
+        """Return the pixel x, y (2,) of a click in the undistorted frame at depth resolution.
 
         Raises:
-            UsageError: it lies outside the frame.
+            UsageError: it lies outside of the frame, or in the margin that undistortion cuts off.
         """
         width, height = address.size or (self.posed.source.width, self.posed.source.height)
         x, y = address.pixel
@@ -68,17 +72,16 @@ class Footage:
         scale = np.array([camera.width / self.lens.width, camera.height / self.lens.height])
         pixel = self.lens.straightened(working)[0] * scale
         if not ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all():
-            raise UsageError(f"overrides: {address} lies in the film's margin that straightening cuts off")
+            raise UsageError(f"overrides: {address} lies in the margin that lens undistortion cuts off")
         return np.minimum(pixel, [camera.width - 1e-6, camera.height - 1e-6])
 
     def seen_vertices(self, world_from_camera: np.ndarray) -> np.ndarray:
-        """Return int32 (h, w) at depth resolution: the surface vertex that each pixel shows, -1 = none."""
+        """Return the surface vertex int32 (h, w) at each pixel at depth resolution, -1 = none."""
         return seen_vertices(self.surface, self.depth.camera, world_from_camera)[0]
 
 
 def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
-    from scipy.spatial.transform import Rotation, Slerp
-
+    """Interpolate two poses (4, 4)."""
     out = np.eye(4)
     turns = Rotation.from_matrix(np.stack([a[:3, :3], b[:3, :3]]))
     out[:3, :3] = Slerp([0, 1], turns)([share]).as_matrix()[0]
@@ -88,64 +91,59 @@ def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Pointer:
-    """Looks addresses up in one state of the cut."""
+    """Resolves addresses in one state of the instances."""
 
     found: InstanceSet
     surface: Surface
     footage: Footage | None = None  # needed for clicks
 
     def thing(self, address: Address) -> Instance:
-        """Return the thing that an address means.
+        """Return the object that an address means.
 
         Raises:
-            UsageError: there is none; the message says what is there.
+            UsageError: there is none; the message has what is there instead, and the nearest object.
         """
         number = self._number(address)
-        item = next((o for o in self.found.objects if o.id == number), None)
+        item = self._things.get(number)
         if item is None:
-            raise UsageError(
-                f"overrides: {address} shows {self._name(number)}, not a thing{self._beside(address)}"
-            )
+            shown = self._name(number)
+            raise UsageError(f"overrides: {address} shows {shown}, not a thing{self._beside(address)}")
         return item
 
     def entity(self, address: Address) -> Instance | BaseEntity:
-        """Return the thing or the part of the room (floor, wall, ceiling) that an address means."""
-        if address.kind == "id":
-            number = address.id
-        else:
-            number = self._number(address, base_too=True)
-        everything = (*self.found.objects, *self.found.base)
-        item = next((o for o in everything if o.id == number), None)
+        """Return the object or base entity that an address means.
+
+        Raises:
+            UsageError: there is none.
+        """
+        number = address.id if address.kind == "id" else self._number(address, base_too=True)
+        item = self._things.get(number) or self._base.get(number)
         if item is None:
             raise UsageError(f"overrides: {address} shows {self._name(number)}")
         return item
 
     def vertex(self, address: Address, item: Instance) -> int:
-        """Return the surface vertex of a thing that a point on it means."""
+        """Return the surface vertex of an object that is nearest to a point or a click on it."""
         mine = np.flatnonzero(self.found.vertex_instance == item.id)
         points = np.asarray(self.surface.vertices, np.float64)[mine]
         if address.kind == "at":
-            return int(mine[np.argmin(np.linalg.norm(points - address.at, axis=1))])
-        pixel, (_, pose) = self._footage().depth_pixel(address), self._footage().camera_of(address.frame)
-        seen = self._footage().seen_vertices(pose)
+            return int(mine[np.argmin(np.linalg.norm(points - np.asarray(address.at), axis=1))])
+        pixel, (_, pose) = self._film.depth_pixel(address), self._film.camera_of(address.frame)
+        seen = self._film.seen_vertices(pose)
         direct = seen[int(pixel[1]), int(pixel[0])]
         if direct >= 0 and self.found.vertex_instance[direct] == item.id:
             return int(direct)
-        shown = np.stack(np.nonzero(np.isin(seen, mine)), axis=1)
-        if len(shown):
-            row, column = shown[np.argmin(np.hypot(*(shown + 0.5 - pixel[::-1]).T))]
-            return int(seen[row, column])
+        shown = _nearest_pixel(np.isin(seen, mine), pixel)
+        if shown is not None:
+            return int(seen[shown[0], shown[1]])
         local = points @ pose[:3, :3] - pose[:3, 3] @ pose[:3, :3]
-        camera = self._footage().depth.camera
         z = np.maximum(local[:, 2], 1e-3)
-        off = np.hypot(
-            camera.fx * local[:, 0] / z + camera.cx - pixel[0],
-            camera.fy * local[:, 1] / z + camera.cy - pixel[1],
-        )
-        return int(mine[np.argmin(np.where(local[:, 2] > 0, off, np.inf))])
+        u, v = self._film.depth.camera.project(np.column_stack([local[:, :2], z]))
+        away = np.hypot(u - pixel[0], v - pixel[1])
+        return int(mine[np.argmin(np.where(local[:, 2] > 0, away, np.inf))])
 
     def point(self, address: Address) -> np.ndarray:
-        """Return the world point (3,) that an address means: itself, or the surface that a click hits."""
+        """Return the world point (3,) of an address: itself, or the surface vertex at a click or of an id."""
         if address.kind == "at":
             return np.asarray(address.at)
         item = self.entity(address)
@@ -154,11 +152,12 @@ class Pointer:
         raise UsageError(f"overrides: {address} shows {self._name(item.id)}, not a thing")
 
     def _number(self, address: Address, base_too: bool = False) -> int:
+        """Return the id at an address, 0 = nothing."""
         if address.kind == "id":
             return self._guarded(address)
         if address.kind == "at":
             return self._at(np.asarray(address.at), base_too)
-        ids, pixel = self._ids(address.frame), self._footage().depth_pixel(address)
+        ids, pixel = self._ids(address.frame), self._film.depth_pixel(address)
         hit = int(ids[int(pixel[1]), int(pixel[0])])
         if hit in self._things or (base_too and hit):
             return hit
@@ -168,13 +167,12 @@ class Pointer:
         return int(np.bincount(near).argmax()) if len(near) else hit
 
     def _guarded(self, address: Address) -> int:
-        item = next((o for o in self.found.objects if o.id == address.id), None)
+        """Return the id of an address after a check of its guard `near`."""
+        item = self._things.get(address.id)
         if item is None:
-            raise UsageError(
-                f"overrides: no object {address.id}; objects are {[o.id for o in self.found.objects]}"
-            )
+            raise UsageError(f"overrides: no object {address.id}; objects are {[*self._things]}")
         if address.near is not None:
-            # The anchor may lie anywhere on the thing: measured to its box's center, less half its diagonal.
+            # `near` may be anywhere on the object: distance to the center, less half the diagonal of the box.
             away = np.linalg.norm(np.asarray(address.near) - item.center)
             if away > NEAR_M + 0.5 * np.linalg.norm(item.extents_m):
                 where = ", ".join(f"{x:.2f}" for x in item.center)
@@ -185,8 +183,8 @@ class Pointer:
         return item.id
 
     def _at(self, point: np.ndarray, base_too: bool) -> int:
-        vertices = np.asarray(self.surface.vertices, np.float64)
-        away = np.linalg.norm(vertices - point, axis=1)
+        """Return the id at a world point: of the nearest surface, else of the smallest box that contains it."""
+        away = np.linalg.norm(np.asarray(self.surface.vertices, np.float64) - point, axis=1)
         nearest = int(np.argmin(away)) if len(away) else -1
         owner = np.asarray(self.found.vertex_instance)
         if base_too and nearest >= 0 and owner[nearest] and away[nearest] < AT_M:
@@ -202,49 +200,61 @@ class Pointer:
         return int(owner[nearest]) if nearest >= 0 and away[nearest] <= AT_M else 0
 
     @cached_property
-    def _things(self) -> set[int]:
-        return {o.id for o in self.found.objects}
+    def _things(self) -> dict[int, Instance]:
+        return {o.id: o for o in self.found.objects}
+
+    @cached_property
+    def _base(self) -> dict[int, BaseEntity]:
+        return {b.id: b for b in self.found.base}
 
     def _ids(self, frame: int) -> np.ndarray:
-        """Return what the frame shows, (h, w) at depth resolution: a keyframe's id map, else the surface drawn."""
-        row, pose = self._footage().camera_of(frame)
+        """Return the ids (h, w) of a video frame: the id map of a keyframe, else the rendered surface."""
+        row, pose = self._film.camera_of(frame)
         if row is not None and len(self.found.id_maps):
             return np.asarray(self.found.id_maps[row])
-        seen = self._footage().seen_vertices(pose)
+        seen = self._film.seen_vertices(pose)
         return np.where(seen >= 0, np.asarray(self.found.vertex_instance)[seen], 0)
 
-    def _footage(self) -> Footage:
+    @property
+    def _film(self) -> Footage:
         if self.footage is None:
             raise ValueError("clicks need the footage that they were made in")
         return self.footage
 
     def _name(self, number: int) -> str:
-        base = next((b for b in self.found.base if b.id == number), None)
-        if base is not None:
-            return f"the {base.label} ({base.id})"
-        item = next((o for o in self.found.objects if o.id == number), None)
+        if number in self._base:
+            return f"the {self._base[number].label} ({number})"
+        item = self._things.get(number)
         return f"{item.label} {item.id}" if item else "nothing that was reconstructed"
 
     def _beside(self, address: Address) -> str:
-        """Say what thing is nearest to a place without one."""
-        if not self.found.objects:
+        """Return the end of an error message: the object that is nearest to an address without one."""
+        if not self._things:
             return "; nothing was found in this scene"
         if address.kind == "pixel":
-            ids, pixel = self._ids(address.frame), self._footage().depth_pixel(address)
-            shown = np.stack(np.nonzero(np.isin(ids, list(self._things))), axis=1)
-            if not len(shown):
+            ids = self._ids(address.frame)
+            shown = _nearest_pixel(np.isin(ids, list(self._things)), self._film.depth_pixel(address))
+            if shown is None:
                 return "; no thing shows in this frame"
-            off = np.hypot(*(shown + 0.5 - pixel[::-1]).T)
-            row, column = shown[np.argmin(off)]
-            size = address.size or (self.footage.posed.source.width, self.footage.posed.source.height)
-            distance = f"{off.min() * size[0] / ids.shape[1]:.0f} pixels"
-            number = int(ids[row, column])
+            row, column, away = shown
+            size = address.size or (self._film.posed.source.width, self._film.posed.source.height)
+            number, distance = int(ids[row, column]), f"{away * size[0] / ids.shape[1]:.0f} pixels"
         else:
             vertices = np.asarray(self.surface.vertices, np.float64)
             things = np.isin(self.found.vertex_instance, list(self._things))
-            away = np.where(things, np.linalg.norm(vertices - np.asarray(address.at), axis=1), np.inf)
-            number, distance = int(self.found.vertex_instance[np.argmin(away)]), f"{away.min():.2f} m"
+            off = np.where(things, np.linalg.norm(vertices - np.asarray(address.at), axis=1), np.inf)
+            number, distance = int(self.found.vertex_instance[np.argmin(off)]), f"{off.min():.2f} m"
         return f"; the nearest is {self._name(number)}, {distance} away"
+
+
+def _nearest_pixel(mask: np.ndarray, pixel: np.ndarray) -> tuple[int, int, float] | None:
+    """Return row, column and distance of the set pixel of a mask (h, w) nearest to a pixel x, y; None without any."""
+    shown = np.stack(np.nonzero(mask), axis=1)
+    if not len(shown):
+        return None
+    away = np.hypot(*(shown + 0.5 - pixel[::-1]).T)
+    row, column = shown[np.argmin(away)]
+    return int(row), int(column), float(away.min())
 
 
 def _in_box(item: Instance, point: np.ndarray) -> bool:

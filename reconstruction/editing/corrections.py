@@ -1,4 +1,4 @@
-"""A stage's result and the user's corrections in, the corrected result out."""
+"""Apply the user's corrections to the result of a stage."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,27 +10,22 @@ from reconstruction.editing.overrides import Overrides
 
 
 def corrected(
-    stage: str,
-    plain: Any,
-    results: Mapping[str, Any],
-    options: Any,
-    overrides: Overrides,
-    pointer: Pointer,
+    stage: str, plain: Any, results: Mapping[str, Any], options: Any, overrides: Overrides, pointer: Pointer,
     progress: Progress,
-) -> Any:
-    """Return a stage's result as the user's entries correct it.
+) -> Any:  # fmt: skip
+    """Return the result of a stage with the user's corrections.
 
     Args:
-        stage: its name, a key of `overrides.ACTIONS`.
-        plain: the result without corrections.
-        results: of the stages that it reads.
-        options: of the stage.
-        overrides: the user's entries.
-        pointer: what their addresses are looked up in.
-        progress: told of decisions.
+        stage: name of the stage, a key of `overrides.ACTIONS`.
+        plain: its result without corrections.
+        results: results of the stages that it reads.
+        options: its config.
+        overrides: the corrections.
+        pointer: resolves their addresses.
+        progress: receives notes.
 
     Raises:
-        UsageError: an entry names what is not there, or asks for what cannot be.
+        UsageError: an entry addresses a missing object, or its change is impossible.
     """
     if stage == "instances":
         return overrides.apply_to_instances(pointer)

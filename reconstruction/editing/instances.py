@@ -1,4 +1,4 @@
-"""The user's corrections to the cut: relabel, drop, merge, split, make base."""
+"""Corrections of the instances: relabel, drop, merge, split, make base."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from reconstruction.instances.labels import coarse_label, shape_facts
 from reconstruction.surface.base_planes import base_outline
 from registry.errors import UsageError
 
-_STEP_M = 0.03  # a part this much higher than the lowest may rest on it
+_STEP_M = 0.03  # a part whose bottom is higher than the lowest part's by more than this may rest on that
 
 
 def apply_overrides(
@@ -23,16 +23,16 @@ def apply_overrides(
 ) -> InstanceSet:
     """Apply entries of an overrides file (docs/overrides.md) in their order.
 
-    Ids of things that an entry does not touch stay as they are; the further parts of a split get the next free ids.
+    Other objects keep their ids. The first part of a split keeps the id, the others get the next free ones.
 
     Args:
-        found: the cut to correct.
-        surface: the surface that was cut.
+        found: the instances to correct.
+        surface: the surface that was segmented.
         overrides: the entries; those of other stages are ignored.
-        footage: the film; needed by clicks and by `split`, which also cuts the id maps.
+        footage: frames and cameras; needed by clicks and by `split`, which also changes the id maps.
 
     Raises:
-        UsageError: an entry means a thing that is not there, or says something impossible.
+        UsageError: an entry addresses a missing object, or its change is impossible.
     """
     for entry in overrides:
         pointer = Pointer(found, surface, footage)
@@ -53,7 +53,7 @@ def apply_overrides(
 
 
 def _thing(pointer: Pointer, entry: dict) -> Instance:
-    """Return the thing that an entry is about; a split by clicks says it by its clicks."""
+    """Return the object of an entry; a split by clicks may address it by these clicks alone."""
     if isinstance(entry.get("split"), list) and not set(entry) & set(KINDS):
         return _split_thing(pointer, entry["split"])
     return pointer.thing(parse_address(entry, "overrides"))
@@ -62,9 +62,7 @@ def _thing(pointer: Pointer, entry: dict) -> Instance:
 def _merged_things(pointer: Pointer, values: object) -> list[Instance]:
     items = [pointer.thing(a) for a in parse_addresses(values, "overrides: merge", fewest=2)]
     if len({item.id for item in items}) < 2:
-        raise UsageError(
-            f"overrides: merge: all addresses mean the same thing, {items[0].label} {items[0].id}"
-        )
+        raise UsageError(f"overrides: merge: all addresses mean the same thing, object {items[0].id}")
     return list({item.id: item for item in items}.values())
 
 
@@ -73,7 +71,7 @@ def _with(found: InstanceSet, item: Instance) -> InstanceSet:
 
 
 def _renamed(found: InstanceSet, old: int, new: int) -> InstanceSet:
-    """Give vertices and pixels of id `old` to `new`, and point support hints there."""
+    """Replace the id `old` by `new` in vertices, id maps and support hints."""
     vertices = np.where(found.vertex_instance == old, new, found.vertex_instance).astype(np.int32)
     maps = np.where(found.id_maps == old, np.uint16(new), found.id_maps).astype(np.uint16)
     objects = tuple(
@@ -84,18 +82,19 @@ def _renamed(found: InstanceSet, old: int, new: int) -> InstanceSet:
 
 
 def _refit(item: Instance, found: InstanceSet, surface: Surface) -> Instance:
+    """Return an object with the box of its vertices."""
     chosen = found.vertex_instance == item.id
     if not chosen.any():
-        return item  # its box is that of its masks' outlines
+        return item  # its box comes from mask outlines
     box = upright_box(np.asarray(surface.vertices, np.float64)[chosen], np.ones(chosen.sum()))
     return replace(item, center=box.center, yaw_rad=box.yaw_rad, extents_m=box.extents_m)
 
 
 def _surface_of(item: Instance, found: InstanceSet) -> np.ndarray:
-    """Return the vertices of a thing, int (k,).
+    """Return the vertices int (k,) of an object.
 
     Raises:
-        UsageError: it has none: its box is that of its masks' outlines.
+        UsageError: it has none, since its box comes from mask outlines.
     """
     chosen = np.flatnonzero(found.vertex_instance == item.id)
     if len(chosen) == 0:
@@ -109,7 +108,7 @@ def _surface_of(item: Instance, found: InstanceSet) -> np.ndarray:
 def _drop(found: InstanceSet, item: Instance) -> InstanceSet:
     carrier = item.support_hint
     dropped = _renamed(found, item.id, 0)
-    # What stood on it stands on what it stood on.
+    # Objects that rested on it get its support.
     objects = [
         replace(new, support_hint=carrier) if old.support_hint == item.id else new
         for old, new in zip(found.objects, dropped.objects)
@@ -131,16 +130,18 @@ def _merge(found: InstanceSet, surface: Surface, items: list[Instance]) -> Insta
 
 
 def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
-    found, surface = pointer.found, pointer.surface
-    if pointer.footage is None:
-        raise ValueError("a split needs the footage: it also cuts the id maps")
+    """Split an object; each part gets a box, a label by its shape, and a support."""
+    found, surface, footage = pointer.found, pointer.surface, pointer.footage
+    if footage is None:
+        raise ValueError("a split needs the footage: it also changes the id maps")
     chosen = _surface_of(item, found)
-    part = _beyond_plane(pointer, item, how, chosen) if isinstance(how, dict) else None
-    if part is None:
+    if isinstance(how, dict):
+        part = _beyond_plane(pointer, item, how, chosen)
+    else:
         seeds = [[pointer.vertex(a, item) for a in clicks] for clicks in parse_parts(how, "overrides: split")]
         if len({v for seed in seeds for v in seed}) < sum(map(len, seeds)):
             raise UsageError(
-                f"overrides: split of {item.label} {item.id}: two points are the same spot of it"
+                f"overrides: split of {item.label} {item.id}: two points are the same spot of it; move one of them"
             )
         part = grown_parts(surface, chosen, seeds)
     first = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
@@ -148,7 +149,6 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
     labels = np.array(found.vertex_instance)
     labels[chosen] = numbers[part]
     maps = np.array(found.id_maps)
-    footage = pointer.footage
     split_maps(
         maps, lambda row: footage.seen_vertices(np.asarray(footage.posed.world_from_camera[row])), labels,
         item.id, numbers.tolist(),
@@ -166,7 +166,7 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
 
 
 def _stacked(parts: list[Instance]) -> list[Instance]:
-    """Let parts that lie over the lowest one rest on it; the others keep what the whole rested on."""
+    """Set the support of parts above the lowest one to that; the others keep the support of the whole."""
     bottoms = [float(part.center[2] - 0.5 * part.extents_m[2]) for part in parts]
     lowest = parts[int(np.argmin(bottoms))]
     out = []
@@ -178,7 +178,7 @@ def _stacked(parts: list[Instance]) -> list[Instance]:
 
 
 def _renamed_by_shape(part: Instance, found: InstanceSet, graph: MeshGraph) -> Instance:
-    """Return a part of a thing with a label of its own: what the whole was called says little about it."""
+    """Return a part with a label by its own shape."""
     on_floor = any(b.id == part.support_hint and b.label == "floor" for b in found.base)
     carries = sum(o.support_hint == part.id for o in found.objects)
     chosen = np.flatnonzero(found.vertex_instance == part.id)
@@ -190,7 +190,7 @@ def _renamed_by_shape(part: Instance, found: InstanceSet, graph: MeshGraph) -> I
 
 
 def _split_thing(pointer: Pointer, how: object) -> Instance:
-    """Return the thing that all clicks of a split lie on."""
+    """Return the object that all clicks of a split lie on."""
     clicks = [a for part in parse_parts(how, "overrides: split") for a in part]
     hit = [(a, pointer.thing(a)) for a in clicks]
     if len({item.id for _, item in hit}) > 1:
@@ -200,7 +200,7 @@ def _split_thing(pointer: Pointer, how: object) -> Instance:
 
 
 def _beyond_plane(pointer: Pointer, item: Instance, how: dict, chosen: np.ndarray) -> np.ndarray:
-    """Return for each vertex of a thing whether it lies beyond the plane: int (k,) 0 or 1."""
+    """Return int (k,): 1 for the vertices of an object on the side of the plane that its normal points to, else 0."""
     if set(how) != {"point", "normal"}:
         raise UsageError(
             f"overrides: split of object {item.id} needs {{point: [x, y, z], normal: [x, y, z]}}, "
@@ -216,12 +216,12 @@ def _beyond_plane(pointer: Pointer, item: Instance, how: dict, chosen: np.ndarra
     beyond = (np.asarray(pointer.surface.vertices, np.float64)[chosen] - point) @ normal > 0
     if not 0 < beyond.sum() < len(chosen):
         where = ", ".join(f"{x:.2f}" for x in item.center)
-        raise UsageError(f"overrides: the split plane misses object {item.id}, which is around [{where}]")
+        raise UsageError(f"overrides: the split plane misses object {item.id}, whose center is [{where}]")
     return beyond.astype(np.int64)
 
 
 def _make_base(found: InstanceSet, surface: Surface, item: Instance, label: object) -> InstanceSet:
-    """Turn a thing into a base entity: the plane through its vertices, its normal towards free space."""
+    """Turn an object into a base entity: a plane through its vertices with the normal towards free space."""
     if label not in BASE_LABELS:
         raise UsageError(f"overrides: make_base of object {item.id} must be one of {', '.join(BASE_LABELS)}")
     chosen = _surface_of(item, found)

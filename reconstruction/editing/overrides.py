@@ -1,25 +1,21 @@
-"""The user's corrections (`--overrides FILE`), read once, checked at once, and applied by the stage that they concern.
+"""The overrides file (`--overrides FILE`): load and validate its entries, and apply them to the results of stages.
 
-The file is a YAML list; each entry says which thing it means, by `id`, `at` or `pixel`
-(`reconstruction.editing.addresses`), and what to do with it. See docs/overrides.md.
+The file is a YAML list. An entry addresses an object by `id`, `at` or `pixel` (`reconstruction.editing.addresses`) and
+has one or more actions. See docs/overrides.md.
 """
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from reconstruction.editing.addresses import KINDS, parse_address, parse_addresses, parse_parts
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
-    from reconstruction.core.types import (
-        AssetSet,
-        InstanceSet,
-        ObjectAsset,
-        SceneGraph,
-    )
+    from reconstruction.core.types import AssetSet, InstanceSet, ObjectAsset, SceneGraph
     from reconstruction.editing.anchors import Pointer
 
-# What an entry may do, by the stage that does it.
+# Actions of an entry, by the stage that applies them.
 ACTIONS: dict[str, tuple[str, ...]] = {
     "instances": ("relabel", "drop", "merge", "split", "make_base"),
     "assets": ("mass_kg", "material", "friction", "mesh"),
@@ -31,14 +27,14 @@ _ADDRESS = ("id", "near", "at", "pixel", "relation")
 
 @dataclass(frozen=True)
 class Overrides:
-    """Checked entries of an overrides file."""
+    """Validated entries of an overrides file."""
 
     entries: list[dict] = field(default_factory=list)
-    folder: Path = Path()
+    folder: Path = Path()  # of the file; paths of meshes are relative to it
 
     @classmethod
     def load(cls, path: Path) -> "Overrides":
-        """Read and check an overrides file.
+        """Read and validate an overrides file.
 
         Raises:
             UsageError: the file is missing or malformed; the message names the entry and what is allowed.
@@ -46,7 +42,7 @@ class Overrides:
         import yaml
 
         try:
-            entries = yaml.safe_load(Path(path).read_text())
+            entries = yaml.safe_load(path.read_text())
         except OSError as error:
             raise UsageError(f"--overrides {path}: {error.strerror or error}") from error
         except yaml.YAMLError as error:
@@ -59,15 +55,15 @@ class Overrides:
             )
         for number, entry in enumerate(entries, start=1):
             _check(entry, f"--overrides {path}: entry {number}")
-        return cls(entries, Path(path).resolve().parent)
+        return cls(entries, path.resolve().parent)
 
     def of_stage(self, stage: str) -> list[dict]:
-        """Return the entries that change this stage's result."""
+        """Return the entries with an action of this stage."""
         actions = ACTIONS.get(stage, ())
         return [entry for entry in self.entries if any(action in entry for action in actions)]
 
     def fingerprint_of_stage(self, stage: str) -> list:
-        """Return what belongs into a stage's fingerprint: its entries, and the bytes of meshes that they name."""
+        """Return the part of a stage's cache key: its entries, and digests of the meshes that they name."""
         from reconstruction.cache import digest_input
 
         entries = self.of_stage(stage)
@@ -75,13 +71,13 @@ class Overrides:
         return [*entries, *(digest_input(file) for file in files if file.exists())]
 
     def apply_to_instances(self, pointer: "Pointer") -> "InstanceSet":
-        """Relabel, drop, merge, split, make base what the pointer's cut holds."""
+        """Apply relabel, drop, merge, split and make_base to the instances of the pointer."""
         from reconstruction.editing.instances import apply_overrides
 
         return apply_overrides(pointer.found, pointer.surface, self.of_stage("instances"), pointer.footage)
 
     def apply_to_assets(self, assets: "AssetSet", pointer: "Pointer") -> "AssetSet":
-        """Set mass, material or friction, or replace a mesh."""
+        """Apply mass_kg, material, friction and mesh."""
         objects = {item.id: item for item in assets.objects}
         for entry in self.of_stage("assets"):
             item = _addressed(entry, objects, pointer)
@@ -89,9 +85,11 @@ class Overrides:
         return replace(assets, objects=tuple(objects[item.id] for item in assets.objects))
 
     def apply_to_graph(self, graph: "SceneGraph", assets: "AssetSet", pointer: "Pointer") -> "SceneGraph":
-        """Give objects other parents; refuses a parent that does not exist or that makes a cycle."""
-        from reconstruction.editing.addresses import parse_address
+        """Apply parent and relation.
 
+        Raises:
+            UsageError: a parent does not exist, or would make a cycle.
+        """
         objects = {item.id: item for item in assets.objects}
         known = set(objects) | {item.id for item in assets.base}
         edges = {edge.child: edge for edge in graph.edges}
@@ -104,9 +102,8 @@ class Overrides:
                     f"overrides: object {item.id} cannot have parent {parent}; ids are {sorted(known)}"
                 )
             relation = entry.get("relation", edges[item.id].relation)
-            edges[item.id] = replace(
-                edges[item.id], parent=parent, relation=relation, confidence=1.0, evidence="user"
-            )
+            edge = replace(edges[item.id], parent=parent, relation=relation)
+            edges[item.id] = replace(edge, confidence=1.0, evidence="user")
             step, seen = parent, {item.id}
             while step in edges:
                 if step in seen:
@@ -116,7 +113,11 @@ class Overrides:
         return replace(graph, edges=tuple(edges[edge.child] for edge in graph.edges))
 
     def movable(self, assets: "AssetSet", graph: "SceneGraph", pointer: "Pointer") -> dict[int, bool]:
-        """Return which objects shall be able to move, and which not; refuses it of what is attached to something."""
+        """Return by object id whether it is dynamic, for the objects whose entries say so.
+
+        Raises:
+            UsageError: an object is attached to another one.
+        """
         objects = {item.id: item for item in assets.objects}
         attached = {edge.child: edge.parent for edge in graph.edges if edge.relation == "attached_to"}
         out: dict[int, bool] = {}
@@ -124,8 +125,8 @@ class Overrides:
             item = _addressed(entry, objects, pointer)
             if item.id in attached:
                 raise UsageError(
-                    f"overrides: dynamic of object {item.id}: it is attached to {attached[item.id]} and moves as that "
-                    "does; give it a parent with relation: supported_by first"
+                    f"overrides: dynamic of object {item.id}: it is attached to {attached[item.id]} and moves with "
+                    "that; give it a parent with relation: supported_by first"
                 )
             out[item.id] = entry["dynamic"]
         return out
@@ -139,7 +140,7 @@ class Overrides:
 
 
 def _check(entry: Any, where: str) -> None:
-    """Refuse what no stage would understand."""
+    """Raise UsageError for an entry that no stage can apply."""
     allowed = [action for actions in ACTIONS.values() for action in actions]
     if not isinstance(entry, dict):
         raise UsageError(f"{where}: expected a mapping such as {{id: 3, relabel: mug}}, got {entry!r}")
@@ -149,12 +150,15 @@ def _check(entry: Any, where: str) -> None:
             f"{where}: unknown {', '.join(map(repr, unknown))}; an entry may have {', '.join(allowed)}"
         )
     if not set(entry) & set(allowed):
-        raise UsageError(f"{where}: says nothing to do; use one of {', '.join(allowed)}")
+        raise UsageError(f"{where}: has no action; use one of {', '.join(allowed)}")
     _check_addresses(entry, where)
     for name in ("mass_kg", "friction"):
-        value = entry.get(name)
-        if value is not None and not (isinstance(value, int | float) and 0 < value < 1e5):
+        value = entry.get(name, 1.0)
+        if isinstance(value, bool) or not (isinstance(value, int | float) and 0 < value < 1e5):
             raise UsageError(f"{where}: {name} must be a positive number, got {value!r}")
+    for name in ("material", "mesh"):
+        if not isinstance(entry.get(name, ""), str):
+            raise UsageError(f"{where}: {name} must be text, got {entry[name]!r}")
     if not isinstance(entry.get("dynamic", True), bool):
         raise UsageError(f"{where}: dynamic must be true or false, got {entry['dynamic']!r}")
     if entry.get("relation", "supported_by") not in ("supported_by", "attached_to"):
@@ -162,16 +166,14 @@ def _check(entry: Any, where: str) -> None:
 
 
 def _check_addresses(entry: dict, where: str) -> None:
-    """Refuse an entry that does not say which thing it means."""
-    from reconstruction.editing.addresses import KINDS, parse_address, parse_addresses, parse_parts
-
+    """Raise UsageError for an entry without a valid address."""
     clicked = isinstance(entry.get("split"), list)
     if clicked:
         parse_parts(entry["split"], f"{where}: split")
     if "merge" in entry:
         parse_addresses(entry["merge"], f"{where}: merge", fewest=2)
         if set(entry) != {"merge"}:
-            raise UsageError(f"{where}: merge stands alone; say the rest in an entry after it")
+            raise UsageError(f"{where}: merge cannot be combined with other keys; use another entry after it")
     elif not (clicked and not set(entry) & set(KINDS)):
         parse_address(entry, where)
     if "parent" in entry:
@@ -179,8 +181,6 @@ def _check_addresses(entry: dict, where: str) -> None:
 
 
 def _addressed(entry: dict, objects: dict[int, "ObjectAsset"], pointer: "Pointer") -> "ObjectAsset":
-    from reconstruction.editing.addresses import parse_address
-
     found = pointer.thing(parse_address(entry, "overrides"))
     if found.id not in objects:
         raise UsageError(f"overrides: {found.label} {found.id} was not built; objects are {sorted(objects)}")
@@ -203,16 +203,11 @@ def _with_physics(item: "ObjectAsset", entry: dict) -> "ObjectAsset":
         mass = physics.mass_kg * factor
         spread = (mass * density.low / density.value, mass * density.high / density.value)
         physics = replace(
-            physics,
-            material=entry["material"],
-            density_kg_m3=density.value,
-            friction=chosen.friction.value,
-            restitution=chosen.restitution.value,
-            mass_kg=mass,
-            inertia=physics.inertia * factor,
+            physics, material=entry["material"], density_kg_m3=density.value, friction=chosen.friction.value,
+            restitution=chosen.restitution.value, mass_kg=mass, inertia=physics.inertia * factor,
             ranges=PhysicalRanges(spread, chosen.friction[1:], chosen.restitution[1:]),
-        )
-    if "mass_kg" in entry:  # what the user says is so, not about so
+        )  # fmt: skip
+    if "mass_kg" in entry:  # values by the user have a range of zero width
         mass = float(entry["mass_kg"])
         inertia = physics.inertia * (mass / physics.mass_kg)
         ranges = replace(physics.ranges, mass_kg=(mass, mass))

@@ -1,4 +1,4 @@
-"""A scene bundle for other simulators and tools: MJCF, URDF, USD, GLB. See docs/exports.md."""
+"""Export a scene bundle to MJCF, URDF, USD or GLB. See docs/exports.md."""
 
 from reconstruction.exports.write import FORMATS, ExportResult, export_scene
 

@@ -1,4 +1,4 @@
-"""GLB: `scene.glb` of the whole scene, a named node for every object and base surface with its facts as extras."""
+"""Merge the `.glb` files of a scene into one `scene.glb`: one named node per body, its properties in `extras`."""
 
 import json
 import struct
@@ -9,12 +9,16 @@ from registry.errors import BundleError
 from registry.geometry import GLTF_FROM_WORLD, WORLD_FROM_GLTF, quat_from_matrix
 
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-# The lists of a glTF document that are joined, in this order in the file.
+# Top-level arrays of a glTF document that are concatenated, in the order of the file.
 _LISTS = ("nodes", "meshes", "materials", "textures", "images", "samplers", "accessors", "bufferViews")
 
 
 def write_glb_scene(scene: ExportScene, folder: Path) -> list[str]:
-    """Write `scene.glb`, +y up as glTF has it; return its path in the folder."""
+    """Write `scene.glb`, +y up as glTF demands; return its path relative to the folder.
+
+    Raises:
+        BundleError: a visual mesh uses a glTF feature that cannot be merged.
+    """
     document: dict = {
         "asset": {"version": "2.0", "generator": "SimRecon"},
         "scene": 0,
@@ -36,19 +40,15 @@ def write_glb_scene(scene: ExportScene, folder: Path) -> list[str]:
 
 
 def _append(document: dict, binary: bytearray, body: ExportBody) -> None:
-    """Add the meshes of one file under a node of their own; nothing is decoded, so nothing is lost."""
+    """Append the buffers and index-shifted entries of one `.glb`, without decoding, so that nothing is lost."""
     part, data = _read(body.visual)
     first = {name: len(document[name]) for name in _LISTS}
     for view in part.get("bufferViews", []):
         document["bufferViews"].append({**view, "byteOffset": view.get("byteOffset", 0) + len(binary)})
     binary += data + b"\0" * (-len(data) % 4)
-    for item in part.get("accessors", []):
-        document["accessors"].append(_shifted(item, {"bufferView": first["bufferViews"]}))
-    for item in part.get("images", []):
-        document["images"].append(_shifted(item, {"bufferView": first["bufferViews"]}))
-    document["samplers"] += part.get("samplers", [])
-    for item in part.get("textures", []):
-        document["textures"].append(_shifted(item, {"source": first["images"], "sampler": first["samplers"]}))
+    shifts = {"bufferView": first["bufferViews"], "source": first["images"], "sampler": first["samplers"]}
+    for name in ("accessors", "images", "samplers", "textures"):
+        document[name] += [_shifted(item, shifts) for item in part.get(name, [])]
     document["materials"] += [
         {**_textures_shifted(item, first["textures"]), "name": body.name}
         for item in part.get("materials", [])
@@ -64,7 +64,7 @@ def _add_nodes(document: dict, part: dict, first: dict, body: ExportBody) -> Non
     nodes = part["nodes"]
     top = {"name": body.name, "extras": _facts(body), **_pose(body)}
     document["scenes"][0]["nodes"].append(first["nodes"])
-    # A file of ours is one node with one mesh: that becomes the named node itself.
+    # Our own files have one node with one mesh, which becomes the named node itself.
     if len(nodes) == 1 and nodes[roots[0]].keys() <= {"mesh", "name"}:
         document["nodes"].append({**top, "mesh": nodes[0]["mesh"] + first["meshes"]})
         return
@@ -102,12 +102,12 @@ def _primitive(primitive: dict, first: dict) -> dict:
 
 
 def _shifted(item: dict, shifts: dict[str, int]) -> dict:
-    """Return a copy whose references are moved on."""
+    """Return a copy whose index under each key of `shifts` is increased."""
     return {key: value + shifts[key] if key in shifts else value for key, value in item.items()}
 
 
 def _textures_shifted(material: dict, shift: int) -> dict:
-    """Return a copy of a material whose `...Texture` entries refer to moved textures."""
+    """Return a copy of a material with the texture index of every `...Texture` entry increased."""
     out = {}
     for key, value in material.items():
         if isinstance(value, dict):
@@ -119,7 +119,7 @@ def _textures_shifted(material: dict, shift: int) -> dict:
 
 
 def _read(path: Path) -> tuple[dict, bytes]:
-    """Return the JSON and the binary chunk of a .glb whose parts can be joined as they are."""
+    """Read the JSON and binary chunks of a `.glb`; reject what cannot be merged by shifting indices."""
     try:
         raw = path.read_bytes()
         magic, _, _, length, kind = struct.unpack("<5I", raw[:20])
@@ -129,11 +129,11 @@ def _read(path: Path) -> tuple[dict, bytes]:
         if document.get("extensionsUsed") or any("sparse" in a for a in document.get("accessors", [])):
             raise ValueError("it uses glTF extensions or sparse accessors")
         if not document["meshes"] or not document["scenes"][document.get("scene", 0)]["nodes"]:
-            raise ValueError("it shows nothing")
+            raise ValueError("it has no mesh or no root node")
         size = document["buffers"][0]["byteLength"]
         data = raw[28 + length : 28 + length + size]
         if len(document["buffers"]) != 1 or len(data) != size:
-            raise ValueError("its buffer is not inside it")
+            raise ValueError("its buffer is external or truncated")
     except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
-        raise BundleError(f"{path}: cannot be joined into a scene ({error})") from error
+        raise BundleError(f"{path}: cannot be merged into scene.glb ({error})") from error
     return document, data

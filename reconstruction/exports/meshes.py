@@ -1,44 +1,43 @@
-"""Mesh files beside MJCF and URDF: Wavefront with texture for the eye, bare hulls for contacts. +z up, metres."""
+"""Write the OBJ files that MJCF and URDF refer to: textured visual meshes and convex hulls; +z up, metres."""
 
 from pathlib import Path
 
 import numpy as np
 
 from reconstruction.assets.gltf import read_glb, vertex_normals
-from reconstruction.core.types import ConvexPart, TexturedMesh
-from reconstruction.exports.scene import ExportBody
+from reconstruction.core.types import TexturedMesh
+from reconstruction.exports.scene import ExportBody, Hull
 from registry.errors import SimReconError
 
 FOLDER = "meshes"
 
 
-def stem(body: ExportBody) -> str:
-    """Return how the files of a body begin: `meshes/012_cup`."""
+def _stem(body: ExportBody) -> str:
     return f"{FOLDER}/{body.id:03d}_{body.name.rsplit('_', 1)[0]}"
 
 
 def visual_obj(body: ExportBody) -> str:
-    """Return the path of the visual mesh."""
-    return f"{stem(body)}_visual.obj"
+    """Return the path of the visual mesh, relative to the export folder."""
+    return f"{_stem(body)}_visual.obj"
 
 
 def texture_png(body: ExportBody) -> str:
-    """Return the path of the texture."""
-    return f"{stem(body)}.png"
+    """Return the path of the texture, relative to the export folder."""
+    return f"{_stem(body)}.png"
 
 
 def collision_obj(body: ExportBody, number: int) -> str:
-    """Return the path of a convex piece."""
-    return f"{stem(body)}_collision_{number:03d}.obj"
+    """Return the path of a convex part, relative to the export folder."""
+    return f"{_stem(body)}_collision_{number:03d}.obj"
 
 
-def hulls_of(body: ExportBody) -> list[tuple[int, ConvexPart]]:
-    """Return the parts that no primitive stands for, with their numbers."""
+def hulls_of(body: ExportBody) -> list[tuple[int, Hull]]:
+    """Return the indices and meshes of the parts that are not exported as primitives."""
     return [(k, part) for k, part in enumerate(body.parts) if body.primitives[k] is None]
 
 
 def write_meshes(bodies: tuple[ExportBody, ...], folder: Path) -> None:
-    """Write all meshes and textures below a folder."""
+    """Write the meshes and textures of all bodies into `folder/meshes`."""
     (folder / FOLDER).mkdir(exist_ok=True)
     for body in bodies:
         mesh = read_glb(body.visual)
@@ -49,7 +48,11 @@ def write_meshes(bodies: tuple[ExportBody, ...], folder: Path) -> None:
 
 
 def write_texture(mesh: TexturedMesh, path: Path) -> None:
-    """Write the texture of a mesh as PNG."""
+    """Write the texture of a mesh as PNG.
+
+    Raises:
+        SimReconError: OpenCV cannot encode it.
+    """
     import cv2
 
     done, png = cv2.imencode(".png", np.ascontiguousarray(mesh.texture[..., ::-1]))
@@ -71,7 +74,7 @@ def _write_textured_obj(mesh: TexturedMesh, path: Path, texture: str) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def _write_hull(part: ConvexPart, path: Path) -> None:
+def _write_hull(part: Hull, path: Path) -> None:
     lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in part.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (part.faces + 1).tolist()]
     path.write_text("\n".join(lines) + "\n")

@@ -1,4 +1,4 @@
-"""MJCF: `scene.xml` for MuJoCo, with options under which what rests in the bundle rests there, too."""
+"""Write a scene as MJCF (`scene.xml`), with solver options that keep resting objects at rest in MuJoCo."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -12,8 +12,8 @@ from registry.geometry import invert_rigid, quat_from_matrix
 from registry.primitives import Primitive
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
-# An elliptic cone and a high ratio of frictional to normal impedance keep things from creeping; noslip stops the rest.
-# Contacts as stiff as the time step allows (time constant 2 steps) keep them from sinking in.
+# The elliptic friction cone and the high impratio (frictional over normal impedance) reduce creep; noslip removes the
+# remaining slip. Contacts are as stiff as the time step allows (time constant 2 steps), which limits penetration.
 OPTIONS = {
     "timestep": "0.002",
     "integrator": "implicitfast",
@@ -26,11 +26,14 @@ OPTIONS = {
     "gravity": "0 0 -9.81",
 }
 CONTACT = {"solref": "0.004 1", "solimp": "0.95 0.99 0.001 0.5 2", "condim": "4"}
-_TORSION_M, _ROLLING_M = 0.002, 0.0001  # radii of contact patches; MuJoCo's own defaults are 5 mm and 0.1 mm
+_TORSION_M, _ROLLING_M = (
+    0.002,
+    0.0001,
+)  # torsional and rolling friction; MuJoCo's defaults are 5 mm and 0.1 mm
 
 
 def write_mjcf(scene: ExportScene, folder: Path) -> list[str]:
-    """Write `scene.xml` beside `meshes/`; return its path in the folder."""
+    """Write `scene.xml`, which refers to `meshes/`; return its path relative to the folder."""
     root = ET.Element("mujoco", model=scene.id)
     ET.SubElement(root, "compiler", angle="radian", meshdir=FOLDER, texturedir=FOLDER, autolimits="true")
     option = ET.SubElement(root, "option", OPTIONS)
@@ -39,14 +42,13 @@ def write_mjcf(scene: ExportScene, folder: Path) -> list[str]:
     ET.SubElement(visual, "headlight", ambient="0.5 0.5 0.5", diffuse="0.5 0.5 0.5", specular="0 0 0")
     ET.SubElement(visual, "map", znear="0.01", zfar="50")
     defaults = ET.SubElement(root, "default")
-    looks = ET.SubElement(defaults, "default", {"class": "visual"})
-    ET.SubElement(looks, "geom", type="mesh", group=str(VISUAL_GROUP), contype="0", conaffinity="0", mass="0")
-    touch = ET.SubElement(defaults, "default", {"class": "collision"})
+    visuals = ET.SubElement(defaults, "default", {"class": "visual"})
     ET.SubElement(
-        touch,
-        "geom",
-        {"type": "mesh", "group": str(COLLISION_GROUP), "mass": "0", "rgba": "0.6 0.7 0.8 0.5"} | CONTACT,
+        visuals, "geom", type="mesh", group=str(VISUAL_GROUP), contype="0", conaffinity="0", mass="0"
     )
+    contacts = ET.SubElement(defaults, "default", {"class": "collision"})
+    geom = {"type": "mesh", "group": str(COLLISION_GROUP), "mass": "0", "rgba": "0.6 0.7 0.8 0.5"}
+    ET.SubElement(contacts, "geom", geom | CONTACT)
     assets, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", pos="0 0 4", dir="0 0 -1", directional="true", castshadow="false")
     elements: dict[int, ET.Element] = {}
@@ -62,7 +64,7 @@ def write_mjcf(scene: ExportScene, folder: Path) -> list[str]:
 
 
 def _parents_first(scene: ExportScene) -> list[ExportBody]:
-    """Order bodies so that what others are welded to comes before them."""
+    """Sort bodies topologically: the body that others are welded to comes first."""
 
     def depth(body: ExportBody) -> int:
         return 0 if body.weld is None else 1 + depth(scene.body(body.weld))
@@ -71,7 +73,7 @@ def _parents_first(scene: ExportScene) -> list[ExportBody]:
 
 
 def _add_assets(assets: ET.Element, body: ExportBody) -> None:
-    # inertia="shell": looks need no volume; mass and inertia come from <inertial>.
+    # inertia="shell" accepts visual meshes that are not closed; mass and inertia come from <inertial>.
     file = Path(visual_obj(body)).name
     ET.SubElement(assets, "mesh", name=f"{body.name}_visual", file=file, inertia="shell")
     ET.SubElement(assets, "texture", name=body.name, type="2d", file=Path(texture_png(body)).name)
@@ -82,25 +84,14 @@ def _add_assets(assets: ET.Element, body: ExportBody) -> None:
 
 
 def _add_body(parent: ET.Element, body: ExportBody, parent_from_body: np.ndarray) -> ET.Element:
-    element = ET.SubElement(
-        parent,
-        "body",
-        name=body.name,
-        pos=text_of(parent_from_body[:3, 3]),
-        quat=text_of(quat_from_matrix(parent_from_body[:3, :3])),
-    )
+    element = ET.SubElement(parent, "body", {"name": body.name} | _pose(parent_from_body))
     if body.moves and body.weld is None:
         ET.SubElement(element, "freejoint", name=f"{body.name}_free")
     if not body.base:
         i = body.inertia
         full = text_of([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]])
-        ET.SubElement(
-            element,
-            "inertial",
-            pos=text_of(body.center_of_mass),
-            mass=text_of([body.mass_kg]),
-            fullinertia=full,
-        )
+        center, mass = text_of(body.center_of_mass), text_of([body.mass_kg])
+        ET.SubElement(element, "inertial", pos=center, mass=mass, fullinertia=full)
     mesh = {"class": "visual", "name": f"{body.name}_visual", "mesh": f"{body.name}_visual"}
     ET.SubElement(element, "geom", mesh | {"material": body.name})
     for number, primitive in enumerate(body.primitives):
@@ -112,10 +103,8 @@ def _add_body(parent: ET.Element, body: ExportBody, parent_from_body: np.ndarray
 
 
 def _primitive(primitive: Primitive) -> dict[str, str]:
-    pose = primitive.pose
-    return {
-        "type": primitive.shape,
-        "size": text_of(primitive.size),
-        "pos": text_of(pose[:3, 3]),
-        "quat": text_of(quat_from_matrix(pose[:3, :3])),
-    }
+    return {"type": primitive.shape, "size": text_of(primitive.size)} | _pose(primitive.pose)
+
+
+def _pose(pose: np.ndarray) -> dict[str, str]:
+    return {"pos": text_of(pose[:3, 3]), "quat": text_of(quat_from_matrix(pose[:3, :3]))}

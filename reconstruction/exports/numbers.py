@@ -1,4 +1,4 @@
-"""Numbers as text: every digit that a float64 has."""
+"""Format numbers and rotations for XML without losing precision."""
 
 from collections.abc import Iterable
 
@@ -6,15 +6,15 @@ import numpy as np
 
 
 def text_of(values: Iterable[float]) -> str:
-    """Return numbers with spaces between them, as XML attributes have them; they read back as the same floats."""
+    """Return numbers separated by spaces, with all digits of a float64; -0.0 becomes 0.0."""
     return " ".join(repr(float(value) + 0.0) for value in values)
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
-    """Return URDF's fixed-axis angles (radians) of a rotation (3, 3): Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Convert a rotation (3, 3) to URDF's fixed-axis angles in radians: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     r = np.asarray(rotation, np.float64)
     flat = float(np.hypot(r[0, 0], r[1, 0]))
     pitch = float(np.arctan2(-r[2, 0], flat))
-    if flat < 1e-9:  # straight up or down: roll and yaw turn about the same axis, yaw is taken as 0
+    if flat < 1e-8:  # gimbal lock: roll and yaw share an axis; yaw is set to 0
         return float(np.arctan2(-r[1, 2], r[1, 1])), pitch, 0.0
     return float(np.arctan2(r[2, 1], r[2, 2])), pitch, float(np.arctan2(r[1, 0], r[0, 0]))

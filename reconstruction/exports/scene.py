@@ -1,4 +1,4 @@
-"""What every format is written from: the bodies of a bundle with closed convex pieces and a possible inertia."""
+"""Convert a bundle to bodies with closed convex parts and a physically valid inertia, the input of all exporters."""
 
 import re
 from dataclasses import dataclass
@@ -6,35 +6,41 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.core.types import ConvexPart
 from registry import SceneBundle
 from registry.errors import BundleError
 from registry.primitives import Primitive
 from registry.rigid_groups import moving_ids, welded_to
 from registry.simulation import cookable_points, specs_from_bundle, standing_primitive
 
-# The shares of the largest moment below which PhysX is not given the smaller ones (registry/simulation.py).
-_LEAST_MOMENT = 1e-3
+_LEAST_MOMENT = 1e-3  # lower bound of a principal moment over the largest one, as in registry/simulation.py
+
+
+@dataclass(frozen=True)
+class Hull:
+    """A closed convex mesh with faces oriented outward."""
+
+    vertices: np.ndarray  # float64 (v, 3) metres
+    faces: np.ndarray  # int32 (f, 3)
 
 
 @dataclass(frozen=True)
 class ExportBody:
-    """One object or base surface. Meshes, centre of mass and inertia are in object space (base: world space)."""
+    """One object or base surface; meshes, center of mass and inertia in object space (base: world space)."""
 
     id: int
     label: str
     name: str  # unique, letters, digits and underscores, starts with a letter
     base: bool
     moves: bool
-    weld: int | None  # id of the moving body that it is fixed to
+    weld: int | None  # id of the moving body that it is rigidly attached to
     relation: tuple[str, int] | None  # (relation, id of the parent) of the scene graph
     world_from_object: np.ndarray  # float64 (4, 4) rigid
     visual: Path  # textured .glb
-    parts: tuple[ConvexPart, ...]  # closed, faces outward
-    primitives: tuple[Primitive | None, ...]  # what each part is exactly, if it is a primitive that stands
+    parts: tuple[Hull, ...]
+    primitives: tuple[Primitive | None, ...]  # per part: the equivalent box or cylinder, or None
     mass_kg: float  # 0 for base surfaces
     center_of_mass: np.ndarray  # float64 (3,)
-    inertia: np.ndarray  # float64 (3, 3) about the centre of mass, object axes
+    inertia: np.ndarray  # float64 (3, 3) about the center of mass, object axes
     friction: float
     restitution: float
 
@@ -46,18 +52,18 @@ class ExportScene:
     id: str
     revision: str
     bodies: tuple[ExportBody, ...]
-    notes: tuple[str, ...]  # what could not be written exactly as the bundle has it
+    notes: tuple[str, ...]  # deviations from the bundle
 
     def body(self, key: int) -> ExportBody:
-        """Return the body with an id."""
+        """Look up a body by its id."""
         return next(body for body in self.bodies if body.id == key)
 
 
 def read_scene(bundle: SceneBundle) -> ExportScene:
-    """Read what the exporters need.
+    """Read the bodies of a bundle.
 
     Raises:
-        BundleError: a base surface has no collision slab, or a piece has no volume.
+        BundleError: a base surface has no collision slab, or a collision part has no volume.
     """
     scene = bundle.scene
     entries = {item["id"]: item for item in (*scene["base"], *scene["objects"])}
@@ -73,7 +79,7 @@ def read_scene(bundle: SceneBundle) -> ExportScene:
             wanted = spec.inertia if spec.inertia is not None else uniform_inertia(parts, spec.mass_kg)
             inertia, changed = possible_inertia(wanted)
             if changed:
-                notes.append(f"{name}: no real body has its inertia; the nearest possible one is written")
+                notes.append(f"{name}: its inertia is not physically valid; the nearest valid one is written")
         bodies.append(
             ExportBody(
                 id=spec.id,
@@ -98,33 +104,36 @@ def read_scene(bundle: SceneBundle) -> ExportScene:
 
 
 def safe_name(label: str, key: int) -> str:
-    """Return a name that XML, USD and Blender take, unique by the id: `coffee_cup_12`."""
+    """Return a name that is valid in XML, USD and Blender and unique by the id, such as `coffee_cup_12`."""
     words = re.sub(r"[^A-Za-z0-9]+", "_", label).strip("_")
     return f"{words if words[:1].isalpha() else f'thing_{words}'.rstrip('_')}_{key}"
 
 
-def closed_part(points: np.ndarray, name: str) -> ConvexPart:
-    """Return the hull of a convex piece's points (v, 3); a flat piece is as thick as in the physics of the bundle."""
+def closed_part(points: np.ndarray, name: str) -> Hull:
+    """Compute the convex hull of the points (v, 3) of a collision part, flat ones thickened as for PhysX.
+
+    Raises:
+        BundleError: the points are coplanar even then; `name` is the body's, for the message.
+    """
     from scipy.spatial import ConvexHull, QhullError
 
     points = cookable_points(points)
     try:
         hull = ConvexHull(points)
     except QhullError as error:
-        raise BundleError(
-            f"'{name}': a collision piece of extents {np.ptp(points, axis=0)} m is not solid"
-        ) from error
+        extents = np.ptp(points, axis=0)
+        raise BundleError(f"'{name}': a collision part of extents {extents} m has no volume") from error
     number = np.full(len(points), -1, np.int32)
     number[hull.vertices] = np.arange(len(hull.vertices))
     corner = points[hull.simplices]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     inward = np.einsum("fk,fk->f", normal, hull.equations[:, :3]) < 0
     faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
-    return ConvexPart(points[hull.vertices], number[faces])
+    return Hull(points[hull.vertices], number[faces])
 
 
-def uniform_inertia(parts: tuple[ConvexPart, ...], mass_kg: float) -> np.ndarray:
-    """Return the inertia (3, 3) about the common centre of pieces of one density, for bundles that have none."""
+def uniform_inertia(parts: tuple[Hull, ...], mass_kg: float) -> np.ndarray:
+    """Compute the inertia (3, 3), kg m2, of parts of uniform density about their common center of mass."""
     import trimesh
 
     solids = [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts]
@@ -138,9 +147,9 @@ def uniform_inertia(parts: tuple[ConvexPart, ...], mass_kg: float) -> np.ndarray
 
 
 def possible_inertia(inertia: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return an inertia that a real body can have, and whether it differs from the given one.
+    """Project an inertia (3, 3) to a physically valid one; also return whether it changed.
 
-    No principal moment may exceed the sum of the others; too small ones are raised, as thin rods have them.
+    Principal moments are raised to a lower bound and until they satisfy the triangle inequality.
     """
     symmetric = 0.5 * (inertia + inertia.T)
     moments, axes = np.linalg.eigh(symmetric)  # ascending

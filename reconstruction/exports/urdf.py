@@ -1,4 +1,4 @@
-"""URDF: one file a movable or fixed object, and `scene.urdf` with everything at its place."""
+"""Write a scene as URDF: `scene.urdf` with all bodies at their poses, and one file per object."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -15,7 +15,7 @@ WORLD_LINK = "world"
 
 
 def write_urdf(scene: ExportScene, folder: Path) -> list[str]:
-    """Write `scene.urdf` and one file an object beside `meshes/`; return their paths in the folder."""
+    """Write `scene.urdf` and one file per object, which refer to `meshes/`; return their relative paths."""
     robot = ET.Element("robot", name=scene.id)
     ET.SubElement(robot, "link", name=WORLD_LINK)
     for body in scene.bodies:
@@ -38,7 +38,7 @@ def _write(robot: ET.Element, folder: Path, name: str) -> str:
 
 
 def _joint(scene: ExportScene, body: ExportBody) -> ET.Element:
-    """Return the joint that puts a body at its place: floating where it moves on its own."""
+    """Return the joint that holds the pose of a body: floating if it moves on its own, else fixed."""
     floating = body.moves and body.weld is None
     parent = None if body.weld is None else scene.body(body.weld)
     world_from_parent = np.eye(4) if parent is None else parent.world_from_object
@@ -59,7 +59,7 @@ def _link(body: ExportBody) -> ET.Element:
         ET.SubElement(
             inertial, "inertia", {name: text_of([body.inertia[place]]) for name, place in names.items()}
         )
-    # Friction and restitution are no part of URDF; this is how PyBullet reads them.
+    # URDF has no friction and restitution; these are PyBullet's extension.
     contact = ET.SubElement(link, "contact")
     ET.SubElement(contact, "lateral_friction", value=text_of([body.friction]))
     ET.SubElement(contact, "restitution", value=text_of([body.restitution]))

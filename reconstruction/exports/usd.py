@@ -1,6 +1,6 @@
-"""USD with physics schemas: `scene.usd`, z up, metres, for Isaac Sim and whatever else reads UsdPhysics.
+"""Write a scene as USD with UsdPhysics schemas (`scene.usd`, z up, metres), for Isaac Sim and others.
 
-Needs usd-core to write (the extra `simrecon[exports]`).
+Needs usd-core (the extra `simrecon[exports]`).
 """
 
 from pathlib import Path
@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 
 from reconstruction.assets.gltf import read_glb, vertex_normals
-from reconstruction.core.types import ConvexPart, TexturedMesh
+from reconstruction.core.types import TexturedMesh
 from reconstruction.exports.meshes import texture_png, write_texture
-from reconstruction.exports.scene import ExportBody, ExportScene
+from reconstruction.exports.scene import ExportBody, ExportScene, Hull
 from registry.errors import EnvironmentMissing
 from registry.geometry import invert_rigid, quat_from_matrix
 from registry.primitives import Primitive
 
 _ROOT = "/World"
-_ROUGHNESS = 0.85
+_ROUGHNESS = 0.85  # of UsdPreviewSurface; nothing is measured
 
 
 def write_usd(scene: ExportScene, folder: Path) -> list[str]:
-    """Write `scene.usd` and the textures it refers to; return the files' paths in the folder.
+    """Write `scene.usd` and its textures; return their paths relative to the folder.
 
     Raises:
         EnvironmentMissing: usd-core is not installed.
@@ -50,32 +50,30 @@ def write_usd(scene: ExportScene, folder: Path) -> list[str]:
 
 
 def prim_path(body: ExportBody) -> str:
-    """Return where a body is in the stage."""
+    """Return the prim path of a body."""
     return f"{_ROOT}/{'Base' if body.base else 'Objects'}/{body.name}"
 
 
 def _pxr() -> Any:
-    """Import usd-core when it is first needed."""
+    """Import usd-core."""
     try:
         import pxr
         from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt  # noqa: F401
     except ImportError as error:
         raise EnvironmentMissing(
-            f"writing USD needs usd-core, which cannot be imported ({error}); "
+            f"USD export needs usd-core, which cannot be imported ({error}); "
             'run `pip install "simrecon[exports]"` (or `pip install usd-core`) and export again'
         ) from error
     return pxr
 
 
 def _add_body(pxr: Any, stage: Any, body: ExportBody, folder: Path) -> str:
-    """Add a body with its looks, pieces, mass and materials; return the path of its texture."""
+    """Add a body with visual mesh, colliders, mass and materials; return the path of its texture."""
     path = prim_path(body)
     xform = pxr.UsdGeom.Xform.Define(stage, path)
     prim = xform.GetPrim()
     pxr.Usd.ModelAPI(prim).SetKind(pxr.Kind.Tokens.component)
-    w, x, y, z = quat_from_matrix(body.world_from_object[:3, :3]).tolist()
-    xform.AddTranslateOp().Set(pxr.Gf.Vec3d(*body.world_from_object[:3, 3].tolist()))
-    xform.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(w, x, y, z))
+    _set_pose(pxr, xform, body.world_from_object)
     facts = {"id": body.id, "label": body.label}
     if not body.base:
         facts["mass_kg"] = float(body.mass_kg)
@@ -87,8 +85,8 @@ def _add_body(pxr: Any, stage: Any, body: ExportBody, folder: Path) -> str:
         _set_mass(pxr, prim, body)
     mesh = read_glb(body.visual)
     write_texture(mesh, folder / texture_png(body))
-    looks = _add_mesh(pxr, stage, f"{path}/visual", mesh.vertices, mesh.faces)
-    _dress(pxr, stage, looks, mesh, f"{path}/Looks/surface", texture_png(body))
+    visual = _add_mesh(pxr, stage, f"{path}/visual", mesh.vertices, mesh.faces)
+    _add_appearance(pxr, stage, visual, mesh, f"{path}/Looks/surface", texture_png(body))
     material = _physics_material(pxr, stage, f"{path}/Looks/contact", body)
     for number, part in enumerate(body.parts):
         place, primitive = f"{path}/collision_{number:03d}", body.primitives[number]
@@ -98,6 +96,12 @@ def _add_body(pxr: Any, stage: Any, body: ExportBody, folder: Path) -> str:
             piece = _add_primitive(pxr, stage, place, primitive)
         _make_collider(pxr, piece, material)
     return texture_png(body)
+
+
+def _set_pose(pxr: Any, xform: Any, pose: np.ndarray) -> None:
+    xform.AddTranslateOp().Set(pxr.Gf.Vec3d(*pose[:3, 3].tolist()))
+    quat = quat_from_matrix(pose[:3, :3]).tolist()
+    xform.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(*quat))
 
 
 def _set_mass(pxr: Any, prim: Any, body: ExportBody) -> None:
@@ -124,13 +128,15 @@ def _add_mesh(pxr: Any, stage: Any, path: str, vertices: np.ndarray, faces: np.n
     return mesh
 
 
-def _dress(pxr: Any, stage: Any, looks: Any, mesh: TexturedMesh, path: str, texture: str) -> None:
-    """Give a mesh normals, texture coordinates and a UsdPreviewSurface material with its texture."""
+def _add_appearance(pxr: Any, stage: Any, visual: Any, mesh: TexturedMesh, path: str, texture: str) -> None:
+    """Add normals, texture coordinates and a textured UsdPreviewSurface material to a mesh."""
     Sdf, UsdShade, tokens = pxr.Sdf, pxr.UsdShade, pxr.UsdGeom.Tokens
     normals = np.ascontiguousarray(vertex_normals(mesh.vertices, mesh.faces), np.float32)
-    looks.CreateNormalsAttr(pxr.Vt.Vec3fArray.FromNumpy(normals))
-    looks.SetNormalsInterpolation(tokens.vertex)
-    st = pxr.UsdGeom.PrimvarsAPI(looks).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, tokens.vertex)
+    visual.CreateNormalsAttr(pxr.Vt.Vec3fArray.FromNumpy(normals))
+    visual.SetNormalsInterpolation(tokens.vertex)
+    st = pxr.UsdGeom.PrimvarsAPI(visual).CreatePrimvar(
+        "st", Sdf.ValueTypeNames.TexCoord2fArray, tokens.vertex
+    )
     st.Set(pxr.Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uvs, np.float32)))
     pxr.UsdGeom.Scope.Define(stage, path.rsplit("/", 1)[0])
     material = UsdShade.Material.Define(stage, path)
@@ -154,7 +160,7 @@ def _dress(pxr: Any, stage: Any, looks: Any, mesh: TexturedMesh, path: str, text
     shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(_ROUGHNESS)
     shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    UsdShade.MaterialBindingAPI.Apply(looks.GetPrim()).Bind(material)
+    UsdShade.MaterialBindingAPI.Apply(visual.GetPrim()).Bind(material)
 
 
 def _physics_material(pxr: Any, stage: Any, path: str, body: ExportBody) -> Any:
@@ -166,7 +172,7 @@ def _physics_material(pxr: Any, stage: Any, path: str, body: ExportBody) -> Any:
     return material
 
 
-def _add_hull(pxr: Any, stage: Any, path: str, part: ConvexPart) -> Any:
+def _add_hull(pxr: Any, stage: Any, path: str, part: Hull) -> Any:
     piece = _add_mesh(pxr, stage, path, part.vertices, part.faces)
     shape = pxr.UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim())
     shape.CreateApproximationAttr(pxr.UsdPhysics.Tokens.convexHull)
@@ -174,8 +180,7 @@ def _add_hull(pxr: Any, stage: Any, path: str, part: ConvexPart) -> Any:
 
 
 def _add_primitive(pxr: Any, stage: Any, path: str, primitive: Primitive) -> Any:
-    """Add a box, as a cube that is stretched, or a cylinder along its z axis."""
-    pose = primitive.pose
+    """Add a box (a scaled cube) or a cylinder along z."""
     if primitive.shape == "box":
         piece = pxr.UsdGeom.Cube.Define(stage, path)
         piece.CreateSizeAttr(2.0)
@@ -188,16 +193,14 @@ def _add_primitive(pxr: Any, stage: Any, path: str, primitive: Primitive) -> Any
         piece.CreateAxisAttr(pxr.UsdGeom.Tokens.z)
         extent = np.array([radius, radius, half])
     piece.CreateExtentAttr(pxr.Vt.Vec3fArray.FromNumpy(np.array([-extent, extent], np.float32)))
-    w, x, y, z = quat_from_matrix(pose[:3, :3]).tolist()
-    piece.AddTranslateOp().Set(pxr.Gf.Vec3d(*pose[:3, 3].tolist()))
-    piece.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(w, x, y, z))
+    _set_pose(pxr, piece, primitive.pose)
     if primitive.shape == "box":
         piece.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*primitive.size))
     return piece
 
 
 def _make_collider(pxr: Any, piece: Any, material: Any) -> None:
-    """Make a piece a collider that is not drawn."""
+    """Make a prim a collider that is not rendered (purpose `guide`)."""
     piece.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
     prim = piece.GetPrim()
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
@@ -207,7 +210,7 @@ def _make_collider(pxr: Any, piece: Any, material: Any) -> None:
 
 
 def _weld(pxr: Any, stage: Any, child: ExportBody, parent: ExportBody) -> None:
-    """Fix a moving body to the moving one that it hangs on; the two do not collide with each other."""
+    """Add a fixed joint between two moving bodies, which then do not collide with each other."""
     joint = pxr.UsdPhysics.FixedJoint.Define(stage, f"{prim_path(child)}/weld")
     joint.CreateBody0Rel().SetTargets([prim_path(parent)])
     joint.CreateBody1Rel().SetTargets([prim_path(child)])

@@ -1,7 +1,6 @@
-"""Write a bundle in other formats into one folder, whole or not at all."""
+"""Export a bundle into a folder through a staging folder, so that a failed export changes nothing."""
 
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -25,20 +24,20 @@ _WITH_MESH_FILES = {"mjcf", "urdf"}
 
 @dataclass(frozen=True)
 class ExportResult:
-    """What was written."""
+    """The files that an export wrote."""
 
     folder: Path
-    main: dict[str, Path]  # {format: the file to open}
-    files: int  # of all formats in the folder
+    main: dict[str, Path]  # format -> the file to open
+    files: int  # count, over all formats in the folder
     bytes: int
-    notes: tuple[str, ...]  # what is not exactly as the bundle has it
+    notes: tuple[str, ...]  # deviations from the bundle
 
 
 def export_scene(bundle: SceneBundle, formats: Sequence[str], folder: Path) -> ExportResult:
-    """Write a scene in some of `FORMATS`. Formats that the folder has already of the same revision stay.
+    """Export a scene to some of `FORMATS`; other formats of the same revision in the folder are kept.
 
     Raises:
-        UsageError: the folder holds something that no export of this scene wrote.
+        UsageError: the folder holds files that no export of this scene wrote.
         EnvironmentMissing: a format needs a package that is not installed.
         BundleError: a mesh cannot be exported.
     """
@@ -52,7 +51,8 @@ def export_scene(bundle: SceneBundle, formats: Sequence[str], folder: Path) -> E
         if before.get("revision") == bundle.revision:
             written = {**before["formats"], **written}
         elif before:
-            _remove(folder, before)
+            for name in {name for files in before["formats"].values() for name in files}:
+                (folder / name).unlink(missing_ok=True)
         index = {"scene": scene.id, "revision": bundle.revision, "formats": written, "notes": scene.notes}
         (staging / INDEX).write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
         _move(staging, folder)
@@ -77,7 +77,7 @@ def _write(scene: ExportScene, formats: Sequence[str], staging: Path) -> dict[st
 
 
 def _present(folder: Path, scene_id: str) -> dict:
-    """Return the index of an earlier export of this scene in the folder, {} where it is empty or missing."""
+    """Return the index of an earlier export of this scene; {} if the folder is empty or missing."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return {}
     advice = "choose another --out or empty it yourself"
@@ -95,15 +95,9 @@ def _present(folder: Path, scene_id: str) -> dict:
     return index
 
 
-def _remove(folder: Path, index: dict) -> None:
-    """Remove the files of an older revision."""
-    for name in {name for files in index["formats"].values() for name in files}:
-        (folder / name).unlink(missing_ok=True)
-
-
 def _move(staging: Path, folder: Path) -> None:
-    """Move all files into the folder, the index last."""
+    """Move all files into the folder, the index last; existing files are replaced atomically."""
     names = sorted(str(p.relative_to(staging)) for p in staging.rglob("*") if p.is_file())
     for name in [*(n for n in names if n != INDEX), INDEX]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        os.replace(staging / name, folder / name)
+        (staging / name).replace(folder / name)

@@ -1,4 +1,4 @@
-"""Stage 1: a video, or a folder of images -> upright keyframes, and frames held out for evaluation."""
+"""Stage 1, keyframe selection: a video or image folder in, upright keyframes and held-out frames out."""
 
 from reconstruction.frames.config import FRAMES_PRESETS, HELD_OUT_EVERY, FramesConfig
 from reconstruction.frames.load import load_frames

@@ -7,30 +7,30 @@ HELD_OUT_EVERY = 10  # CONTRACT section 4: every tenth video frame is kept out o
 
 @dataclass(frozen=True)
 class FramesConfig:
-    """How frames are chosen."""
+    """How keyframes are selected."""
 
     max_side_px: int = 960
-    """Longer side of the images that all later stages see, in pixels; smaller inputs stay as they are."""
+    """Longer side of the images of all later stages, in pixels; smaller inputs are not enlarged."""
     min_keyframes: int = 64
-    """As many keyframes at least, where the video has that many different sharp frames."""
+    """Least number of keyframes, if the video has that many different sharp frames."""
     max_keyframes: int = 96
-    """As many keyframes at most."""
+    """Largest number of keyframes."""
     max_held_out: int = 40
-    """As many held-out frames at most, spread evenly."""
+    """Largest number of held-out frames, spread evenly."""
     step: float = 0.045
-    """Wanted displacement between keyframes, as a share of the longer image side."""
+    """Desired image displacement between keyframes, as a share of the longer image side."""
     blurred_below: float = 0.4
-    """A frame is blurred where its sharpness is below this share of that of its neighbours in time."""
+    """A frame is blurred if its sharpness is below this share of that of its neighbors in time."""
     widest_gap: float = 0.22
-    """Blurred frames are still taken where a wider gap than this share of the side would open."""
+    """A blurred frame is kept if the gap without it would exceed this share of the longer image side."""
     still_below: float = 0.012
-    """A video that moves less than this share of the longer side was filmed by a camera at rest."""
+    """A video with less total displacement than this share of the longer image side is refused as at rest."""
     min_usable_frames: int = 8
-    """Fewer different frames than this cannot become a scene."""
+    """Inputs with fewer different frames are refused."""
     hold_out_images_from: int = 60
-    """A folder with fewer images than this gives all of them to the reconstruction and holds none out."""
+    """Image folders with fewer images hold none out for evaluation."""
     max_analysis_fps: float = 30.0
-    """Videos with more frames per second are analysed at about this rate."""
+    """Videos with more frames per second are analyzed at about this rate."""
 
 
 FRAMES_PRESETS = {

@@ -1,11 +1,12 @@
-"""Turn files into upright RGB images: videos through PyAV as a stream, folders of photographs through Pillow.
+"""Decode upright RGB images: videos by PyAV, folders of photographs by Pillow.
 
-A video is never held in memory: `VideoReader.frames` yields decoded frames one by one, and a frame is
-scaled down while it is converted, so that a minute of 4K needs no more memory than its chosen small images.
+Videos are streamed: `VideoReader.frames` yields decoded frames one by one, and frames are scaled down in the color
+conversion, so that memory holds only the selected images at working resolution.
 """
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,22 +14,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from reconstruction.phone_exports.exports import natural
 from registry.errors import EnvironmentMissing, InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _FOCAL_35MM_KEYS = ("com.apple.quicktime.camera.focal_length.35mm_equivalent", "focal_length_35mm")
-_DIAGONAL_35MM = 43.2666
+_DIAGONAL_35MM = 43.2666  # of a 36 x 24 mm frame, mm
 _EXIF_IFD, _EXIF_FOCAL_35MM = 0x8769, 0xA405
 
 
 def working_size(width: int, height: int, max_side_px: int) -> tuple[int, int]:
-    """Return (width, height) with the longer side at most `max_side_px`; images are never enlarged."""
+    """Scale (width, height) so that the longer side is at most `max_side_px`; never enlarges."""
     scale = min(1.0, max_side_px / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def file_sha256(path: Path) -> str:
-    """Hash a file in pieces."""
+    """Return the SHA-256 of a file, in hexadecimal."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while chunk := stream.read(1 << 20):
@@ -38,17 +40,18 @@ def file_sha256(path: Path) -> str:
 
 @dataclass
 class VideoReader:
-    """One video file: what its headers say, and its frames in decoding order, as often as asked.
+    """A video file: its metadata, and its frames in the order of decoding, as often as asked.
 
-    The counters describe the latest complete run over `frames`.
+    `damaged_packets` counts over the latest run of `frames`. The size, `quarter_turns`, `interlaced` and
+    `high_dynamic_range` are known once the first frame is decoded.
     """
 
     path: Path
-    width: int = 0  # as shown: after pixel aspect ratio and rotation
+    width: int = 0  # after pixel aspect ratio and rotation
     height: int = 0
-    quarter_turns: int = 0  # counter-clockwise, that bring a decoded frame upright
+    quarter_turns: int = 0  # counter-clockwise, from decoded to upright
     focal_35mm: float = 0.0  # 35 mm equivalent, 0 where unknown
-    announced_frames: int = 0  # by the container; 0 where it does not say
+    announced_frames: int = 0  # by the container, 0 where unknown
     nominal_fps: float = 0.0
     damaged_packets: int = 0
     interlaced: bool = False
@@ -56,7 +59,7 @@ class VideoReader:
     _stored_size: tuple[int, int] = field(default=(0, 0), repr=False)
 
     def __post_init__(self) -> None:
-        """Read the headers; say clearly where this is no video."""
+        """Read the headers; raise `InputError` if this is not a video."""
         if self.path.stat().st_size == 0:
             raise InputError(f"frames: {self.path} is empty (0 bytes). Copy or record the video again.")
         with self._open() as container:
@@ -69,7 +72,7 @@ class VideoReader:
                     self.focal_35mm = float(value)
 
     def _open(self):
-        import av
+        import av.error
 
         try:
             # A crafted playlist must not make us read from the network.
@@ -90,21 +93,21 @@ class VideoReader:
 
         for stream in container.streams.video:
             cover = bool(stream.disposition & Disposition.attached_pic)
-            if not cover and container.format.name != "tty":  # ffmpeg "plays" text files as terminal art
-                # Slices and frames on all cores; frames still come out in order.
+            if not cover and container.format.name != "tty":  # ffmpeg decodes text files as terminal art
+                # Multi-threaded by slices and frames; the order of frames stays.
                 stream.thread_type = "AUTO"
                 return stream
         raise InputError(
-            f"frames: {self.path} has no video track. Give a video file or a folder of jpg or png images."
+            f"frames: {self.path} has no video track. Give a video, or a folder of jpg or png images."
         )
 
     def frames(self) -> Iterator[tuple[int, float, bool, object]]:
         """Yield (frame number from 0, seconds from the first frame, intact, av.VideoFrame).
 
-        Damaged packets are skipped and counted; what follows them is smeared, so it is not intact until the
-        next independently coded frame. The file's end, early or not, ends the iteration.
+        Damaged packets are skipped and counted. Frames after them are not intact up to the next intra-coded frame. The
+        end of the file, early or not, ends the iteration.
         """
-        import av
+        import av.error
 
         self.damaged_packets = 0
         with self._open() as container:
@@ -134,12 +137,13 @@ class VideoReader:
                     if time is None:
                         time = (first or 0.0) + number / (self.nominal_fps or 30.0)
                     first = time if first is None else first
-                    last = max(time - first, last + 1e-6)  # strictly increasing even where stamps are broken
+                    last = max(time - first, last + 1e-6)  # strictly increasing, even with broken time stamps
                     intact = (intact or frame.key_frame) and not frame.is_corrupt
                     yield number, last, intact, frame
                     number += 1
 
     def _learn_geometry(self, frame, stream) -> None:
+        """Set size, rotation and color properties from the first decoded frame."""
         turns = round((frame.rotation or 0) / 90) % 4
         aspect = stream.sample_aspect_ratio
         wide = frame.width * (float(aspect) if aspect and 0.1 < float(aspect) < 10 else 1.0)
@@ -150,17 +154,17 @@ class VideoReader:
         self.high_dynamic_range = int(frame.color_trc or 0) in (16, 18)  # PQ, HLG
 
     def to_rgb(self, frame, max_side_px: int) -> np.ndarray:
-        """Convert a decoded frame to an upright uint8 (h, w, 3), scaled down in the same step."""
+        """Convert a decoded frame to upright RGB uint8 (h, w, 3), scaled down to `max_side_px`."""
         return self._convert(frame, max_side_px, "rgb24")
 
     def to_gray(self, frame, max_side_px: int) -> np.ndarray:
-        """Convert a decoded frame to an upright uint8 (h, w)."""
+        """Convert a decoded frame to upright gray uint8 (h, w), scaled down to `max_side_px`."""
         return self._convert(frame, max_side_px, "gray")
 
     def _convert(self, frame, max_side_px: int, pixel_format: str) -> np.ndarray:
         width, height = working_size(*self._stored_size, max_side_px)
         if self.interlaced:
-            # One field only: two fields of a moving camera are two different pictures.
+            # One field only: the two fields of a moving camera show different instants.
             image = frame.reformat(format=pixel_format).to_ndarray()[::2]
             image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         else:
@@ -170,7 +174,7 @@ class VideoReader:
         return np.ascontiguousarray(np.rot90(image, self.quarter_turns))
 
     def focal_prior_px(self, max_side_px: int) -> float:
-        """Return the focal length in pixels of the working size, 0 where the file does not tell."""
+        """Return the focal length in pixels at working size, 0 where unknown."""
         width, height = working_size(self.width, self.height, max_side_px)
         return self.focal_35mm / _DIAGONAL_35MM * float(np.hypot(width, height))
 
@@ -179,16 +183,9 @@ def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error).split("\n")[0]
 
 
-def _natural_key(path: Path) -> list:
-    return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part)
-        for part in re.split(r"(\d+)", path.name.lower())
-    ]
-
-
 @dataclass
 class ImageFolder:
-    """A folder of photographs in natural name order (img2 before img10), all of one size once loaded."""
+    """A folder of photographs in natural name order (img2 before img10), resized to one size when loaded."""
 
     path: Path
     files: list[Path] = field(default_factory=list)
@@ -198,9 +195,10 @@ class ImageFolder:
     focal_35mm: float = 0.0
 
     def __post_init__(self) -> None:
-        """List the images and read their headers; keep those of the most common size and shape."""
+        """List the images and read their headers; keep those with the aspect ratio of the most common size."""
         found = [p for p in self.path.iterdir() if p.is_file() and not p.name.startswith(".")]
-        files = sorted((p for p in found if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key)
+        files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES]
+        files.sort(key=lambda p: natural(p.name))
         if not files:
             others = sorted({p.suffix.lower() or "(none)" for p in found})
             raise InputError(
@@ -219,33 +217,29 @@ class ImageFolder:
                 focals.append(header[2])
         if not sizes:
             raise InputError(
-                f"frames: none of the {len(files)} images in {self.path} can be read. Copy them again."
+                f"frames: none of {len(files)} images in {self.path} can be read. Copy them again."
             )
-        counts: dict[tuple[int, int], int] = {}
-        for size in sizes.values():
-            counts[size] = counts.get(size, 0) + 1
+        counts = Counter(sizes.values())
         self.width, self.height = max(counts, key=lambda size: (counts[size], size))
         self.focal_35mm = float(np.median(focals)) if focals else 0.0
         for path, size in sizes.items():
             if abs(size[0] / size[1] - self.width / self.height) < 0.01 * self.width / self.height:
                 self.files.append(path)
             else:
-                self.notes.append(
-                    f"{path.name} is {size[0]}x{size[1]}, most are {self.width}x{self.height}: "
-                    "left out (another shape)"
-                )
+                shapes = f"{size[0]}x{size[1]}, most are {self.width}x{self.height}"
+                self.notes.append(f"{path.name} is {shapes}: left out (another shape)")
         resized = sum(sizes[p] != (self.width, self.height) for p in self.files)
         if resized:
             self.notes.append(f"{resized} images of other sizes are resized to {self.width}x{self.height}")
 
     def load_rgb(self, number: int, max_side_px: int) -> np.ndarray | None:
-        """Load image `number` upright at working size; None (and a note) where its data is damaged."""
+        """Load image `number`, upright and at working size: uint8 (h, w, 3); None and a note if its data is damaged."""
         from PIL import Image, ImageOps
 
         size = working_size(self.width, self.height, max_side_px)
         try:
             with Image.open(self.files[number]) as image:
-                # JPEG can be decoded at a half or a quarter directly.
+                # JPEG can be decoded at reduced resolution.
                 image.draft("RGB", (2 * max(size), 2 * max(size)))
                 array = np.asarray(_to_rgb(ImageOps.exif_transpose(image)))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
@@ -255,23 +249,20 @@ class ImageFolder:
         return cv2.resize(array, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 
     def sha256(self) -> str:
-        """Hash names and contents of all images used."""
+        """Return the SHA-256 of the names and contents of all images used."""
         digest = hashlib.sha256()
         for path in self.files:
             digest.update(path.name.encode() + b"\0" + bytes.fromhex(file_sha256(path)))
         return digest.hexdigest()
 
     def focal_prior_px(self, max_side_px: int) -> float:
-        """Return the focal length in pixels of the working size, 0 where no image tells."""
-        return (
-            self.focal_35mm
-            / _DIAGONAL_35MM
-            * float(np.hypot(*working_size(self.width, self.height, max_side_px)))
-        )
+        """Return the focal length in pixels at working size, 0 where unknown."""
+        width, height = working_size(self.width, self.height, max_side_px)
+        return self.focal_35mm / _DIAGONAL_35MM * float(np.hypot(width, height))
 
 
 def _to_rgb(image):
-    """Convert any Pillow mode to 8-bit RGB; transparency is laid on white, 16-bit gray keeps its range."""
+    """Convert any Pillow mode to 8-bit RGB: transparency is composited over white, 16-bit gray is rescaled."""
     from PIL import Image
 
     if image.mode in ("I;16", "I;16B", "I"):
@@ -284,7 +275,7 @@ def _to_rgb(image):
 
 
 def _read_header(path: Path) -> tuple[int, int, float] | None:
-    """Return upright (width, height, 35 mm equivalent focal length or 0), None for what is no image."""
+    """Return upright width, height and 35 mm equivalent focal length (0: unknown); None if this is no image."""
     from PIL import Image
 
     try:
@@ -293,7 +284,7 @@ def _read_header(path: Path) -> tuple[int, int, float] | None:
             exif = image.getexif()
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None
-    if exif.get(0x0112, 1) in (5, 6, 7, 8):  # orientations that swap the sides
+    if exif.get(0x0112, 1) in (5, 6, 7, 8):  # orientations that swap width and height
         width, height = height, width
     focal = exif.get_ifd(_EXIF_IFD).get(_EXIF_FOCAL_35MM, 0) or 0
     return width, height, float(focal) if 0 < float(focal) < 1000 else 0.0

@@ -1,41 +1,39 @@
-"""Choose keyframes: measure sharpness, texture and motion of small gray frames, thin them along the motion.
+"""Select keyframes: measure sharpness, texture and motion of small gray frames, sample them evenly along the motion.
 
-Motion is measured against a reference frame that is replaced once the view has moved on, so that sensor
-noise of a camera that stands still does not add up to a path, and repeated frames do not advance it.
+Motion is the optical flow from a reference frame, which is replaced once the view has moved enough. Sensor noise of a
+camera at rest and repeated frames therefore do not accumulate.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
 
 ANALYSIS_SIDE_PX = 480  # sharpness is measured here
 _TRACK_SIDE_PX = 240  # texture and motion are measured here
-_MOVED_ON = 0.03  # displacement (share of the longer side) that replaces the reference
-_LOST_STEP = 0.08  # what a jump too large to track counts as
-_TEXTURED_EIGENVALUE = (
-    6e-5  # of the gradient matrix; sensor noise of a blank wall stays below after averaging
-)
+_MOVED_ON = 0.03  # displacement (share of the longer side) at which the reference is replaced
+_LOST_STEP = 0.08  # displacement assumed where tracking fails
+_TEXTURED_EIGENVALUE = 6e-5  # of the gradient matrix; smoothed noise of a blank wall is below
 
 
 @dataclass
 class FrameStats:
-    """What pass 1 knows of each analysed frame, in time order."""
+    """Measurements of each analyzed frame, in time order."""
 
     indices: list[int] = field(default_factory=list)
     times_s: list[float] = field(default_factory=list)
     sharpness: list[float] = field(default_factory=list)  # variance of the Laplacian
     brightness: list[float] = field(default_factory=list)  # mean gray
     texture: list[float] = field(default_factory=list)  # share of image blocks with a corner in them
-    position: list[float] = field(
-        default_factory=list
-    )  # path in shares of the longer image side, non-decreasing
+    # accumulated displacement in shares of the longer side, non-decreasing
+    position: list[float] = field(default_factory=list)
     similarity: list[float] = field(default_factory=list)  # share of points tracked from the reference
-    change: list[float] = field(default_factory=list)  # mean gray difference from the frame before
+    change: list[float] = field(default_factory=list)  # mean gray difference to the frame before
 
 
 class MotionMeter:
-    """Feed it gray frames in time order; it fills a `FrameStats`."""
+    """Measures gray frames, given in time order, into a `FrameStats`."""
 
     def __init__(self) -> None:
         """Start without a reference."""
@@ -47,7 +45,7 @@ class MotionMeter:
         self._before: np.ndarray | None = None
 
     def add(self, index: int, time_s: float, gray: np.ndarray) -> None:
-        """Measure one frame: uint8 (h, w), longer side about ANALYSIS_SIDE_PX."""
+        """Measure a gray frame uint8 (h, w), its longer side about `ANALYSIS_SIDE_PX`."""
         s = self.stats
         scale = _TRACK_SIDE_PX / max(gray.shape)
         size = (max(16, round(gray.shape[1] * scale)), max(16, round(gray.shape[0] * scale)))
@@ -64,12 +62,13 @@ class MotionMeter:
         self._before = small
 
     def _move(self, small: np.ndarray) -> tuple[float, float]:
+        """Return the accumulated displacement and the share of points tracked."""
         if self._reference is None:
             self._anchor(small, 0.0)
             return 0.0, 1.0
         shift, share = self._displacement(small)
         if share < 0.4:
-            # One blurred frame in between must not break the chain: wait before giving the reference up.
+            # A single blurred frame must not end the track: keep the reference for two more frames.
             self._lost_in_a_row += 1
             if self._lost_in_a_row < 3:
                 return self._at_reference, share
@@ -85,15 +84,16 @@ class MotionMeter:
         self._points = cv2.goodFeaturesToTrack(small, 160, 0.01, 6)
 
     def _displacement(self, small: np.ndarray) -> tuple[float, float]:
-        """Return (median displacement from the reference by the longer side, share of points tracked)."""
+        """Return the median displacement from the reference, as a share of the longer side, and the share tracked."""
+        assert self._reference is not None
         if self._points is None or len(self._points) < 8:
             self._points = cv2.goodFeaturesToTrack(self._reference, 160, 0.01, 6)
             if self._points is None or len(self._points) < 8:
                 self._anchor(small, self._at_reference)
                 return 0.0, 1.0
-        settings = {"winSize": (15, 15), "maxLevel": 3}
-        there, found, _ = cv2.calcOpticalFlowPyrLK(self._reference, small, self._points, None, **settings)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(small, self._reference, there, None, **settings)
+        settings: Any = {"winSize": (15, 15), "maxLevel": 3, "nextPts": None}
+        there, found, _ = cv2.calcOpticalFlowPyrLK(self._reference, small, self._points, **settings)
+        back, found_back, _ = cv2.calcOpticalFlowPyrLK(small, self._reference, there, **settings)
         closes = np.linalg.norm((back - self._points).reshape(-1, 2), axis=1) < 1.0
         good = (found.ravel() > 0) & (found_back.ravel() > 0) & closes
         if good.sum() < 6:
@@ -103,28 +103,28 @@ class MotionMeter:
 
 
 def _textured_share(small: np.ndarray) -> float:
-    """Share of 16x16 blocks that hold at least one corner which noise would not make."""
+    """Return the share of 16x16 blocks with at least one corner stronger than noise."""
     smooth = cv2.GaussianBlur(small, (0, 0), 1.0)
-    strength = cv2.cornerMinEigenVal(smooth, 5, 3)
+    strength = cv2.cornerMinEigenVal(smooth, 5, ksize=3)
     rows, columns = strength.shape[0] // 16 * 16, strength.shape[1] // 16 * 16
     blocks = strength[:rows, :columns].reshape(rows // 16, 16, columns // 16, 16).max(axis=(1, 3))
     return float((blocks > _TEXTURED_EIGENVALUE).mean())
 
 
 def repeats_of(stats: FrameStats, originals: np.ndarray, same_below: float = 0.25) -> np.ndarray:
-    """Return which frames (n,) bool are the same picture as one of `originals` (n,) bool."""
+    """Return which frames, bool (n,), repeat one of `originals`, bool (n,)."""
     run = np.cumsum(np.array(stats.change) >= same_below)
     return np.isin(run, run[originals]) & ~originals
 
 
 def relative_sharpness(stats: FrameStats, window_s: float = 0.75) -> np.ndarray:
-    """Return sharpness (n,) relative to the sharp frames (80th percentile) around each; about 1 is sharp."""
+    """Return sharpness (n,) relative to the 80th percentile of the neighbors in time; about 1 is sharp."""
     sharpness, times = np.array(stats.sharpness), np.array(stats.times_s)
     out = np.ones(len(sharpness))
     low = np.searchsorted(times, times - window_s)
     high = np.searchsorted(times, times + window_s, side="right")
     for i in range(len(sharpness)):
-        # At least five neighbours, also where frames are few or irregular.
+        # At least five neighbors, also where frames are sparse or irregular.
         a, b = min(low[i], max(i - 2, 0)), max(high[i], min(i + 3, len(sharpness)))
         out[i] = sharpness[i] / max(float(np.percentile(sharpness[a:b], 80)), 1e-9)
     return out
@@ -132,20 +132,20 @@ def relative_sharpness(stats: FrameStats, window_s: float = 0.75) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Spacing:
-    """How densely keyframes follow the motion."""
+    """Parameters of keyframe selection."""
 
-    step: float  # wanted displacement between keyframes, share of the longer side
+    step: float  # desired displacement between keyframes, share of the longer side
     fewest: int
     most: int
-    blurred_below: float  # relative sharpness under which a frame is avoided
-    widest_gap: float  # a blurred frame is kept where leaving it out would open a wider gap than this
+    blurred_below: float  # relative sharpness of a blurred frame
+    widest_gap: float  # largest gap that dropping a blurred frame may leave, share of the longer side
 
 
 def choose_keyframes(stats: FrameStats, usable: np.ndarray, spacing: Spacing) -> np.ndarray:
-    """Return rows of `stats`, ascending, chosen among those where `usable` (n,) bool holds.
+    """Select keyframes among the `usable` frames, bool (n,): rows of `stats`, ascending.
 
-    The path is cut into equal cells; each gives its sharpest frame. Frames that repeat a chosen one have
-    its place on the path and are never chosen beside it.
+    The accumulated displacement is divided into equal cells; the sharpest frame of each is selected. Frames that repeat
+    a selected one have the same position and are not selected too.
     """
     rows = np.flatnonzero(usable)
     position = np.array(stats.position)[rows]
@@ -160,7 +160,7 @@ def choose_keyframes(stats: FrameStats, usable: np.ndarray, spacing: Spacing) ->
     target = min(wanted, distinct)
     cells = wanted
     chosen = _sharpest_per_cell(position, quality, cells)
-    # Motion is uneven: fast parts leave cells empty, so finer cells may be needed to reach the count.
+    # Fast motion leaves cells empty, so finer cells may be needed to reach the count.
     while len(chosen) < target and cells < 40 * wanted:
         cells = int(cells * 1.15) + 1
         finer = _sharpest_per_cell(position, quality, cells)
@@ -174,12 +174,12 @@ def _sharpest_per_cell(position: np.ndarray, quality: np.ndarray, cells: int) ->
     start, length = position[0], position[-1] - position[0]
     coordinate = (position - start) / length * cells
     cell = np.minimum(coordinate.astype(int), cells - 1)
-    # Of equally sharp frames the one nearest to the middle of its cell keeps the spacing even.
+    # Of equally sharp frames, prefer the one nearest to the middle of the cell.
     score = np.minimum(quality, 1.3) - 0.25 * np.abs(coordinate - cell - 0.5)
     order = np.lexsort((-score, cell))
     first = np.concatenate([[True], np.diff(cell[order]) > 0])
     chosen = np.sort(order[first])
-    # Two chosen frames on either side of a cell's border may still be the same picture.
+    # Frames on both sides of a cell border may repeat each other: keep the sharper one.
     keep = [chosen[0]]
     for row in chosen[1:]:
         if position[row] - position[keep[-1]] > 1e-3:

@@ -1,11 +1,12 @@
-"""Stage 1: a video or a folder of images -> upright keyframes and held-out frames for evaluation.
+"""Stage 1: select upright keyframes and held-out frames from a video or a folder of images.
 
-Two passes over a video: the first measures every frame at low resolution (sharpness, motion, blankness),
-the second decodes the chosen ones at working resolution. What cannot become a scene is refused here with
-one clear sentence: no video, blank, still, too short. Lack of parallax shows only once poses are estimated.
+Videos are decoded twice: pass 1 measures sharpness, texture and motion at low resolution, pass 2 decodes the selected
+frames at working resolution. Inputs that cannot be reconstructed are refused: no video, blank, at rest, too short. Lack
+of parallax is detected by the poses stage.
 """
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,16 +34,16 @@ def load_frames(video: Path, config: FramesConfig, *, progress: Progress = NO_PR
     """Choose and load keyframes from a video file or a folder of jpg and png images.
 
     Args:
-        video: File that ffmpeg decodes, folder of images in name order, or an export of Record3D or Polycam.
-        config: See `FramesConfig`.
-        progress: Receives the steps and every decision worth telling.
+        video: a file that ffmpeg decodes, a folder of images in name order, or an export of Record3D or Polycam.
+        config: settings.
+        progress: receives steps and notes.
 
     Returns:
         Keyframes and held-out frames, upright, at working resolution, in time order.
 
     Raises:
-        UsageError: There is no such file or folder.
-        InputError: It cannot be decoded, or shows nothing to reconstruct (blank, still, too short).
+        UsageError: there is no such file or folder.
+        InputError: it cannot be decoded or reconstructed (blank, at rest, too short).
     """
     video = Path(video)
     if not video.exists():
@@ -69,17 +70,14 @@ def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSe
     except InputError as error:
         if not damage:
             raise
-        raise InputError(
-            f"{error} But the file is damaged or cut off: {damage}; copy it again first."
-        ) from error
+        raise InputError(f"{error} But the file is damaged or cut off: {damage}; copy it again.") from error
     keep = [stats.indices[row] for row in chosen]
-    held = [i for i in range(0, len(times), HELD_OUT_EVERY) if i not in smeared]
-    held = _spread(np.array(held, int), config.max_held_out)
+    candidates = [i for i in range(0, len(times), HELD_OUT_EVERY) if i not in smeared]
+    held = _spread(np.array(candidates, int), config.max_held_out)
     images = _decode_chosen(reader, {*keep, *held}, config, progress)
     missing = [i for i in keep if i not in images]
     if missing:
         raise InputError(f"frames: {path} changed while it was read: frame {missing[0]} is gone. Run again.")
-    shape = images[keep[0]].shape
     span = times[-1] - times[0]
     fps = (len(times) - 1) / span if span > 0 else reader.nominal_fps
     source = VideoSource(
@@ -92,35 +90,26 @@ def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSe
         duration_s=float(span + 1 / fps) if fps > 0 else 0.0,
     )
     progress.note(f"{len(keep)} keyframes of {len(times)} frames, {len(held)} held out for evaluation")
-    return FrameSet(
-        source=source,
-        images=np.stack([images[i] for i in keep]),
-        indices=np.array(keep, np.int32),
-        times_s=np.array([times[i] for i in keep]),
-        sharpness=np.array([stats.sharpness[row] for row in chosen], np.float32),
-        held_out_images=np.stack([images[i] for i in held]) if held else np.zeros((0, *shape), np.uint8),
-        held_out_indices=np.array(held, np.int32),
-        held_out_times_s=np.array([times[i] for i in held], np.float64),
-        focal_prior_px=reader.focal_prior_px(config.max_side_px),
-        ordered=True,
-    )
+    sharpness = [stats.sharpness[row] for row in chosen]
+    focal_px = reader.focal_prior_px(config.max_side_px)
+    return _frame_set(source, images, keep, held, times, sharpness, focal_px, ordered=True)
 
 
 def _measure_video(
     reader: VideoReader, config: FramesConfig, progress: Progress
 ) -> tuple[FrameStats, list[float], set[int]]:
-    """Pass 1: return statistics of analysed frames, times of all frames, numbers of smeared ones."""
+    """Pass 1: measure frames; return their measurements, the times of all frames, the numbers of smeared ones."""
     progress.start(reader.announced_frames, "measuring frames")
     meter, times, smeared = MotionMeter(), [], set()
     stride = max(1, round(reader.nominal_fps / config.max_analysis_fps))
-    # A variable-rate file may announce a wrong rate: the stride only ever skips frames closer than this.
+    # The announced rate of a variable-rate file may be wrong: only frames closer in time than this are skipped.
     spacing_s = 0.6 * stride / max(reader.nominal_fps, 1e-6) if stride > 1 else 0.0
     last = -np.inf
     for number, time_s, intact, frame in reader.frames():
         times.append(time_s)
         if not intact:
             smeared.add(number)
-        held_out = number % HELD_OUT_EVERY == 0  # measured too: it keeps the chain of motion whole
+        held_out = number % HELD_OUT_EVERY == 0  # measured too, for continuous motion
         if held_out or stride == 1 or time_s - last >= spacing_s:
             meter.add(number, time_s, reader.to_gray(frame, ANALYSIS_SIDE_PX))
             last = time_s
@@ -131,13 +120,13 @@ def _measure_video(
 def _without_smeared(
     stats: FrameStats, usable: np.ndarray, smeared: set[int], config: FramesConfig, progress: Progress
 ) -> tuple[np.ndarray, set[int]]:
-    """Take frames smeared by damaged data from the usable ones, unless hardly any would be left."""
+    """Exclude frames smeared by damaged data from the usable ones, unless too few would be left."""
     if not smeared:
         return usable, smeared
     intact = usable & ~np.isin(stats.indices, list(smeared))
     if intact.sum() < max(config.min_keyframes // 2, 0.3 * usable.sum()):
         progress.note(
-            f"{len(smeared)} frames after damaged data may be smeared; used all the same: others are too few"
+            f"{len(smeared)} frames after damaged data may be smeared; still used: others are too few"
         )
         return usable, set()
     progress.note(f"{len(smeared)} frames after damaged data are smeared: not used")
@@ -147,14 +136,12 @@ def _without_smeared(
 def _without_held_out(
     stats: FrameStats, usable: np.ndarray, config: FramesConfig, progress: Progress
 ) -> np.ndarray:
-    """Take held-out frames, and repeats of them in a video with duplicates, from the usable (n,) bool."""
+    """Exclude held-out frames and their repeats from the usable ones, bool (n,)."""
     held_out = np.array(stats.indices) % HELD_OUT_EVERY == 0
     repeats = repeats_of(stats, held_out) & usable
     without = usable & ~held_out & ~repeats
     if repeats.any() and len(choose_keyframes(stats, without, _spacing(config))) < config.min_keyframes // 2:
-        progress.note(
-            f"{int(repeats.sum())} frames repeat held-out ones and are used all the same: others are too few"
-        )
+        progress.note(f"{int(repeats.sum())} frames repeat held-out ones; still used: others are too few")
         return usable & ~held_out
     return without
 
@@ -162,7 +149,7 @@ def _without_held_out(
 def _decode_chosen(
     reader: VideoReader, wanted: set[int], config: FramesConfig, progress: Progress
 ) -> dict[int, np.ndarray]:
-    """Pass 2: return upright RGB images by frame number."""
+    """Pass 2: decode the wanted frames; upright RGB images by frame number."""
     progress.start(len(wanted), "decoding keyframes")
     images: dict[int, np.ndarray] = {}
     last = max(wanted)
@@ -176,7 +163,7 @@ def _decode_chosen(
 
 
 def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> str:
-    """Tell what the decoder had to work around, and return what is damaged; refuse files with nothing in them."""
+    """Note properties of the file, and return a description of its damage or ""; raise `InputError` without frames."""
     if decoded == 0:
         raise InputError(
             f"frames: no frame of {reader.path} can be decoded. It was cut off or damaged, or its codec "
@@ -193,7 +180,7 @@ def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> str
         progress.note("high dynamic range video: read without tone mapping, colors will look flat")
     if reader.quarter_turns:
         progress.note(
-            f"rotated by {360 - 90 * reader.quarter_turns} degrees clockwise, as the file's metadata says"
+            f"rotated by {360 - 90 * reader.quarter_turns} degrees clockwise, by the file's metadata"
         )
     return damage
 
@@ -209,10 +196,8 @@ def _from_folder(path: Path, config: FramesConfig, progress: Progress) -> FrameS
     for number in range(len(folder.files)):
         image = folder.load_rgb(number, config.max_side_px)
         if image is not None:
-            gray = cv2.resize(
-                cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), gray_size, interpolation=cv2.INTER_AREA
-            )
-            meter.add(number, float(number), gray)
+            gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+            meter.add(number, float(number), cv2.resize(gray, gray_size, interpolation=cv2.INTER_AREA))
         progress.advance()
     stats = meter.stats
     for note in folder.notes[:10]:
@@ -221,49 +206,35 @@ def _from_folder(path: Path, config: FramesConfig, progress: Progress) -> FrameS
         progress.note(f"and {len(folder.notes) - 10} more images left out")
     ordered = _looks_ordered(stats)
     usable = _usable_frames(stats, len(stats.indices), config, str(path), progress, moving=ordered)
-    holds_out = len(stats.indices) >= config.hold_out_images_from
-    held_rows = np.array([r for r, i in enumerate(stats.indices) if i % HELD_OUT_EVERY == 0], int)
-    if holds_out:
-        usable[held_rows] = False
-        held = _spread(np.array(stats.indices)[held_rows], config.max_held_out)
+    held: list[int] = []
+    if len(stats.indices) >= config.hold_out_images_from:
+        held_out = np.array(stats.indices) % HELD_OUT_EVERY == 0
+        usable[held_out] = False
+        held = _spread(np.array(stats.indices)[held_out], config.max_held_out)
     else:
-        held = []
         progress.note(f"only {len(stats.indices)} images: none is held out, all are used")
     rows = np.flatnonzero(usable)
-    if len(rows) > config.max_keyframes:  # few photographs are all kept: somebody chose each of them
-        rows = (
-            choose_keyframes(stats, usable, _spacing(config))
-            if ordered
-            else np.array(_spread(rows, config.max_keyframes))
-        )
+    if len(rows) > config.max_keyframes and ordered:
+        rows = choose_keyframes(stats, usable, _spacing(config))
+    elif len(rows) > config.max_keyframes:
+        rows = np.array(_spread(rows, config.max_keyframes))
     _require_enough(len(rows), config, str(path))
     keep = [stats.indices[r] for r in rows]
-    images = {i: folder.load_rgb(i, config.max_side_px) for i in (*keep, *held)}
-    width, height = working_size(folder.width, folder.height, config.max_side_px)
+    loaded = ((i, folder.load_rgb(i, config.max_side_px)) for i in (*keep, *held))
+    images = {i: image for i, image in loaded if image is not None}
     count = len(folder.files)
     source = VideoSource(str(path), folder.sha256(), folder.width, folder.height, 1.0, count, float(count))
     progress.note(
         f"{len(keep)} of {count} images chosen, {len(held)} held out for evaluation; "
         + ("neighbors in name order look alike" if ordered else "in no particular order")
     )
-    return FrameSet(
-        source=source,
-        images=np.stack([images[i] for i in keep]),
-        indices=np.array(keep, np.int32),
-        times_s=np.array(keep, np.float64),
-        sharpness=np.array([stats.sharpness[r] for r in rows], np.float32),
-        held_out_images=np.stack([images[i] for i in held])
-        if held
-        else np.zeros((0, height, width, 3), np.uint8),
-        held_out_indices=np.array(held, np.int32),
-        held_out_times_s=np.array(held, np.float64),
-        focal_prior_px=folder.focal_prior_px(config.max_side_px),
-        ordered=ordered,
-    )
+    sharpness = [stats.sharpness[r] for r in rows]
+    focal_px = folder.focal_prior_px(config.max_side_px)
+    return _frame_set(source, images, keep, held, range(count), sharpness, focal_px, ordered=ordered)
 
 
 def _from_export(export: Export, config: FramesConfig, progress: Progress) -> FrameSet:
-    """Read the images of a phone app's export, turned upright as its poses say; its poses are for stage 2."""
+    """Load the images of a phone app's export, turned upright according to its poses."""
     turns = polycam_turns(export) if export.kind == "polycam" else 0
     app = {"polycam": "Polycam", "record3d": "Record3D"}[export.kind]
     progress.note(f"an export of {app}: its {len(export.images)} images are the input, its poses are used")
@@ -274,17 +245,14 @@ def _from_export(export: Export, config: FramesConfig, progress: Progress) -> Fr
     source = replace(frames.source, file=str(export.path))
     if turns % 2:
         source = replace(source, width=source.height, height=source.width)
-
-    def upright(images: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.rot90(images, turns, axes=(1, 2)))
-
-    return replace(
-        frames, source=source, images=upright(frames.images), held_out_images=upright(frames.held_out_images)
+    images, held_out = (
+        np.ascontiguousarray(np.rot90(x, turns, axes=(1, 2))) for x in (frames.images, frames.held_out_images)
     )
+    return replace(frames, source=source, images=images, held_out_images=held_out)
 
 
 def _looks_ordered(stats: FrameStats) -> bool:
-    """Neighbours in name order mostly see the same things."""
+    """Tell whether most neighbors in name order overlap."""
     similarity = np.array(stats.similarity[1:])
     return bool(len(similarity) > 0 and np.mean(similarity > 0.4) > 0.7)
 
@@ -293,13 +261,39 @@ def _looks_ordered(stats: FrameStats) -> bool:
 
 
 def _spacing(config: FramesConfig) -> Spacing:
-    return Spacing(
-        config.step, config.min_keyframes, config.max_keyframes, config.blurred_below, config.widest_gap
+    c = config
+    return Spacing(c.step, c.min_keyframes, c.max_keyframes, c.blurred_below, c.widest_gap)
+
+
+def _frame_set(
+    source: VideoSource,
+    images: dict[int, np.ndarray],
+    keep: list[int],
+    held: list[int],
+    times: Sequence[float],
+    sharpness: list[float],
+    focal_px: float,
+    *,
+    ordered: bool,
+) -> FrameSet:
+    """Collect the artifact; `images` and `times` are by frame number, `sharpness` is of the keyframes."""
+    nothing = np.zeros((0, *images[keep[0]].shape), np.uint8)
+    return FrameSet(
+        source=source,
+        images=np.stack([images[i] for i in keep]),
+        indices=np.array(keep, np.int32),
+        times_s=np.array([times[i] for i in keep], np.float64),
+        sharpness=np.array(sharpness, np.float32),
+        held_out_images=np.stack([images[i] for i in held]) if held else nothing,
+        held_out_indices=np.array(held, np.int32),
+        held_out_times_s=np.array([times[i] for i in held], np.float64),
+        focal_prior_px=focal_px,
+        ordered=ordered,
     )
 
 
 def _spread(numbers: np.ndarray, most: int) -> list[int]:
-    """Return at most `most` of the numbers, spread evenly."""
+    """Return at most `most` of the numbers (n,), spread evenly."""
     if len(numbers) <= most:
         return [int(i) for i in numbers]
     return [int(i) for i in numbers[np.linspace(0, len(numbers) - 1, most).round().astype(int)]]
@@ -314,7 +308,7 @@ def _usable_frames(
     *,
     moving: bool = True,
 ) -> np.ndarray:
-    """Return which analysed frames show something (n,) bool; refuse what shows nothing or never moves."""
+    """Return which analyzed frames have texture, bool (n,); raise `InputError` for too few, blank or static inputs."""
     if decoded == 1:
         raise InputError(
             f"frames: {name} is a single image. Give a video of 5 to 60 s, or at least 20 images."

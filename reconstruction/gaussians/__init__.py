@@ -1,6 +1,6 @@
-"""Stage 5: posed frames and depth maps -> 2D Gaussians (Huang et al. 2024), fitted on the CPU or with gsplat.
+"""Stage 5: fit 2D Gaussians (Huang et al. 2024) to posed frames and depth maps, on the CPU or with gsplat.
 
-`import reconstruction.gaussians` is light; what needs a compiler is imported when it is first used.
+Importing this package does not import Numba; modules with kernels are imported at first use.
 """
 
 from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig

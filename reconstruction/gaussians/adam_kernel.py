@@ -1,4 +1,4 @@
-"""The compiled step of Adam."""
+"""Compiled Adam step (Kingma and Ba 2015)."""
 
 import math
 
@@ -9,7 +9,7 @@ import numba
 def adam_rows(
     start, stop, parameters, gradients, first, second, visits, rows, rates, beta1, beta2, epsilon
 ):  # pragma: no cover - compiled
-    """One Adam step of the given rows; bias correction by each row's own number of visits."""
+    """Take one Adam step on rows[start:stop]; bias correction uses each row's number of visits."""
     for k in range(start, stop):
         i = rows[k]
         visits[i] += 1

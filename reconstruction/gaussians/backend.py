@@ -1,4 +1,4 @@
-"""Protocol of differentiable rasterizers: Gaussians and a camera in, a rendered view or a loss with derivatives out."""
+"""Interface of differentiable rasterizers of Gaussians."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,22 +13,22 @@ from reconstruction.gaussians.rendering import Render
 
 @dataclass(frozen=True)
 class StepResult:
-    """Loss of one frame and its derivatives by everything that is optimized; valid until the next step."""
+    """Loss of one frame and its gradients; arrays are valid until the next step."""
 
-    terms: dict[str, float]  # unweighted
+    terms: dict[str, float]  # unweighted terms by name
     total: float
-    parameters: np.ndarray  # (n, 13)
-    pose: np.ndarray  # (6,) of world_from_camera exp(xi): translation, rotation in camera axes
-    gain: np.ndarray  # (3,)
-    bias: np.ndarray  # (3,)
+    parameters: np.ndarray  # (n, 13) gradient
+    pose: np.ndarray  # (6,) gradient by xi of world_from_camera exp(xi): translation, rotation in camera axes
+    gain: np.ndarray  # (3,) gradient by the exposure gain
+    bias: np.ndarray  # (3,) gradient by the exposure bias
     rows: np.ndarray  # int (k,) Gaussians in view
-    depths: np.ndarray  # (k,) their depths
+    depths: np.ndarray  # (k,) z-depth of their centers
     contribution: np.ndarray  # (n,) sum over pixels of alpha T
-    error: np.ndarray  # (n,) the same, weighted with the pixels' color error
+    error: np.ndarray  # (n,) sum over pixels of alpha T times color error
 
 
 class Backend(Protocol):
-    """Renders packed Gaussians (n, 13), and differentiates the training loss."""
+    """Renders packed Gaussians (n, 13) and differentiates the training loss."""
 
     name: str
 
@@ -41,6 +41,7 @@ class Backend(Protocol):
         pixel_weights: np.ndarray | None = None,
     ) -> Render:
         """Render a view, see `render_gaussians`."""
+        ...
 
     def step(
         self,
@@ -52,4 +53,5 @@ class Backend(Protocol):
         weights: LossWeights,
         settings: RasterSettings,
     ) -> StepResult:
-        """Evaluate the loss of one frame (see `losses`) and its derivatives."""
+        """Evaluate the loss of one frame (see `losses`) and its gradients."""
+        ...

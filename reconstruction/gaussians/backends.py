@@ -1,18 +1,19 @@
-"""The rasterizers by name: `cpu` (Numba, built in) and `gsplat` (CUDA)."""
+"""Load rasterizers by name: `cpu` (Numba, built in), `gsplat` (CUDA), or a plugin."""
 
 import numpy as np
 
+from reconstruction.core.plugins import load_plugin
 from reconstruction.core.types import Camera
 from reconstruction.gaussians.backend import Backend, StepResult
+from reconstruction.gaussians.config import GaussiansConfig
 from reconstruction.gaussians.losses import FrameTarget, LossWeights, image_loss
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize, rasterize_backward
 from reconstruction.gaussians.rendering import Render
 from reconstruction.gaussians.scratch import Scratch
-from registry.errors import UsageError
 
 
 class CpuBackend:
-    """The Numba tile rasterizer."""
+    """The tile rasterizer in Numba."""
 
     name = "cpu"
 
@@ -66,4 +67,4 @@ def load_backend(name: str) -> Backend:
         from reconstruction.gaussians.gsplat_backend import GsplatBackend
 
         return GsplatBackend()
-    raise UsageError(f"gaussians: no backend {name!r}; there are cpu and gsplat")
+    return load_plugin("gaussians.backend", name, GaussiansConfig)()

@@ -1,4 +1,4 @@
-"""Compiled kernels that blend the splats of a tile front to back, and the derivatives of that."""
+"""Compiled kernels that alpha-blend the splats of a tile front to back, and their backward pass."""
 
 import numba
 import numpy as np
@@ -38,20 +38,17 @@ _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
 _FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
-# exp(-rho / 2) = exp(x)^64 with x = -rho / 128, by its Taylor polynomial.
+# exp(-rho / 2) = exp(x)^64 with x = -rho / 128, by the Taylor polynomial of exp(x).
 _FALLOFF_STEP = np.float32(-1.0 / 128.0)
 _E2, _E3, _E4, _E5 = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120)
-# Where the screen-space filter shapes a splat, its depth still follows its plane, within this factor: with the depth
-# of the center, slanted surfaces of splats smaller than a pixel would come out too near.
+# Where the screen-space filter determines a splat, its depth follows its plane within these factors of the center's:
+# constant depth would bias slanted surfaces of splats smaller than a pixel towards the camera.
 _FLAT_LOW, _FLAT_HIGH = np.float32(0.9), np.float32(1.1)
 
 
 @numba.njit(cache=True, inline="always", fastmath=_FAST)
 def _falloff(rho):  # pragma: no cover - compiled
-    """Return exp(-rho / 2) as exp(-rho / 128)^64: plain arithmetic, which compilers turn into vector code.
-
-    Right to 1e-5 of its value for rho < 100, and never negative.
-    """
+    """Return exp(-rho / 2) by arithmetic that is vectorized; relative error 1e-5 for rho < 100, never negative."""
     x = rho * _FALLOFF_STEP
     e = _ONE + x * (_ONE + x * (_E2 + x * (_E3 + x * (_E4 + x * _E5))))
     e = max(e, x - x)
@@ -65,54 +62,26 @@ def _falloff(rho):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def blend(
-    start,
-    stop,
-    splats,
-    boxes,
-    tile_start,
-    entries,
-    tile_order,
-    tiles_x,
-    scalars,
-    weights,
-    features,
-    contributions,
-):  # pragma: no cover - compiled
-    """Blend the splats of every tile front to back.
+    start, stop, splats, boxes, tile_start, entries, tile_order, tiles_x, scalars, weights, features, contributions
+):  # fmt: skip  # pragma: no cover - compiled
+    """Blend the splats of the tiles tile_order[start:stop].
 
-    The innermost loops always run over the 16 pixels of a tile's row, without branches, on arrays with one plane a
-    quantity, so that they compile to vector instructions; pixels that a splat does not touch get alpha 0.
-
-    Args:
-        splats: (k, 17) near to far; boxes (k, 4) alike.
-        tile_start: Of `bin_to_tiles`; entries alike.
-        tile_order: (t,) order of the tiles over the threads.
-        tiles_x: Tiles in a row.
-        scalars: (3,) largest alpha, transmittance at which a pixel is finished, reference depth.
-        weights: (h, w) of the pixels in `contributions`; (0, 0) to leave those out.
-        features: (h, w, 13) filled.
-        contributions: (e,) filled: sum over the tile's pixels of weight alpha T of every entry.
+    Splats (k, 17) and boxes (k, 4) are near to far; tile_start and entries are of `bin_to_tiles`. scalars (3,) are the
+    largest alpha, the transmittance at which a pixel is finished, and the reference depth. weights (h, w) are those of
+    the pixels in `contributions`, or (0, 0) to omit these. Fills features (h, w, 13) and contributions (e,), the sum
+    over the tile's pixels of weight alpha T of each entry.
     """
     for k in range(start, stop):
         _blend_tile(
-            tile_order[k],
-            splats,
-            boxes,
-            tile_start,
-            entries,
-            tiles_x,
-            scalars,
-            weights,
-            features,
-            contributions,
-        )
+            tile_order[k], splats, boxes, tile_start, entries, tiles_x, scalars, weights, features, contributions
+        )  # fmt: skip
 
 
 @numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy", forceinline=True)
 def _blend_tile(
     tile, splats, boxes, tile_start, entries, tiles_x, scalars, weights, features, contributions
 ):  # pragma: no cover - compiled
-    """Do one tile of `blend`."""
+    """Blend one tile; the inner loop runs over a row of 16 pixels without branches, so that it is vectorized."""
     height, width = features.shape[0], features.shape[1]
     alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
     zero = alpha_max - alpha_max
@@ -190,70 +159,37 @@ def _blend_tile(
 
 @numba.njit(cache=True, nogil=True)
 def blend_backward(
-    start,
-    stop,
-    splats,
-    boxes,
-    tile_start,
-    entries,
-    tile_order,
-    tiles_x,
-    scalars,
-    features,
-    image_gradients,
-    error,
+    start, stop, splats, boxes, tile_start, entries, tile_order, tiles_x, scalars, features, image_gradients, error,
     entry_gradients,
-):  # pragma: no cover - compiled
-    """Differentiate `blend`: front to back again, with what lies behind as total minus prefix.
+):  # fmt: skip  # pragma: no cover - compiled
+    """Differentiate `blend` front to back; sums over the splats behind are total minus prefix.
 
     With q_i the derivative of the loss by the weight w_i = alpha_i T_i, dL/dalpha_i = T_i q_i - sum_{j>i} w_j q_j /
-    (1 - alpha_i), and sum_j w_j q_j is known from the rendered image alone.
+    (1 - alpha_i), and sum_j w_j q_j follows from the rendered image alone.
 
-    Args:
-        splats: As for `blend`, up to scalars.
-        features: (h, w, 13) of `blend`.
-        image_gradients: (h, w, 9).
-        error: (h, w) weight of the pixels in the last column of the result (for densification).
-        entry_gradients: (e, 18) filled.
-    """  # fmt: skip
+    Takes the arguments and features of `blend`, image_gradients (h, w, 9), and error (h, w), the weight of the pixels
+    in the last column of the result (for densification). Fills entry_gradients (e, 18).
+    """
     for k in range(start, stop):
         _blend_tile_backward(
-            tile_order[k],
-            splats,
-            boxes,
-            tile_start,
-            entries,
-            tiles_x,
-            scalars,
-            features,
-            image_gradients,
-            error,
+            tile_order[k], splats, boxes, tile_start, entries, tiles_x, scalars, features, image_gradients, error,
             entry_gradients,
-        )
+        )  # fmt: skip
 
 
 @numba.njit(cache=True, fastmath=_FAST, boundscheck=False, error_model="numpy", forceinline=True)
 def _blend_tile_backward(
-    tile,
-    splats,
-    boxes,
-    tile_start,
-    entries,
-    tiles_x,
-    scalars,
-    features,
-    image_gradients,
-    error,
-    entry_gradients,
-):  # pragma: no cover - compiled
-    """Do one tile of `blend_backward`."""
+    tile, splats, boxes, tile_start, entries, tiles_x, scalars, features, image_gradients, error, entry_gradients
+):  # fmt: skip  # pragma: no cover - compiled
+    """Differentiate one tile. One function despite its length: it recomputes the forward values that it needs."""
     height, width = features.shape[0], features.shape[1]
     alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
     zero = alpha_max - alpha_max
     tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
     light = np.ones((TILE, TILE), features.dtype)
-    # Planes: gradients 0..8, error 9, what lies behind 10, opacity 11, moments 12 and 13, first inverse depth 14.
+    # Planes: gradients 0..8, error 9, sum over splats not passed yet 10, opacity 11, moments 12 and 13, first inverse
+    # depth 14.
     given = np.zeros((15, TILE, TILE), features.dtype)
     lanes = np.empty((N_SPLAT_GRADIENTS, TILE), features.dtype)
     xs, ys = np.empty(TILE, features.dtype), np.empty(TILE, features.dtype)

@@ -6,28 +6,28 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class GaussiansConfig:
-    """How depth maps and images become 2D Gaussians."""
+    """Settings of fitting 2D Gaussians and of the depth maps rendered from them."""
 
-    backend: Literal["cpu", "gsplat"] = "cpu"
+    backend: Literal["cpu", "gsplat"] | str = "cpu"
     """Rasterizer: `cpu` is built in; `gsplat` needs CUDA and the extra `simrecon[gpu]`."""
 
     iterations: int = 450
-    """Gradient steps in all, one frame each."""
+    """Number of gradient steps, one frame each."""
 
     side_px: int = 480
-    """Longer side of the images in the last part of the training."""
+    """Longer side of the images in the second part of the training."""
 
     coarse_side_px: int = 320
-    """Longer side of the images before that."""
+    """Longer side of the images in the first part of the training."""
 
     coarse_share: float = 0.6
     """Share of the iterations at the coarse size."""
 
     max_gaussians: int = 60_000
-    """Budget: densification stops here."""
+    """Largest number of Gaussians."""
 
     seed_share: float = 0.75
-    """Share of the budget that seeds from the depth maps may take; densification takes the rest."""
+    """Share of `max_gaussians` for seeds from depth maps; densification adds the rest."""
 
     initial_opacity: float = 0.7
     """Opacity of a seed."""
@@ -39,10 +39,10 @@ class GaussiansConfig:
     """Weight of the relative difference to the depth maps."""
 
     completed_depth_weight: float = 0.2
-    """Factor on it for completed pixels (confidence 1) beside measured ones."""
+    """Depth weight of completed pixels (confidence 1) relative to measured ones."""
 
     depth_scale: float = 0.02
-    """Relative depth error beyond which a pixel's pull fades, so that wrong depths do not win over images."""
+    """Scale of the robust depth loss: relative error at which its gradient has halved."""
 
     normal_weight: float = 0.03
     """Weight of 1 - cosine between the splats' normals and the normal of the rendered depth."""
@@ -51,16 +51,16 @@ class GaussiansConfig:
     """Weight of the depth distortion (spread along the ray, in relative inverse depth)."""
 
     opacity_weight: float = 0.05
-    """Weight of light that passes where there is a surface (known depth)."""
+    """Weight of the transmittance at pixels with known depth."""
 
     optimize_exposure: bool = True
     """Fit a gain and a bias per color channel to every frame."""
 
     optimize_poses: bool = False
-    """Refine the cameras, too; kept-out frames then no longer share exactly the same space."""
+    """Optimize the camera poses, too. Held-out cameras are not refined with them."""
 
     mean_rate: float = 1.2e-3
-    """Adam step of the means, relative to the scene's median depth; all rates fall to `final_rate` of themselves."""
+    """Adam step of the means, relative to the scene's median depth. All rates decay to `final_rate` of themselves."""
 
     quaternion_rate: float = 2.4e-2
     """Adam step of the quaternions."""
@@ -81,7 +81,7 @@ class GaussiansConfig:
     """Adam step of the cameras: radians, and relative to the median depth."""
 
     final_rate: float = 0.05
-    """Share of every rate that is left at the end (exponential decay)."""
+    """Final value of every rate relative to its first (exponential decay)."""
 
     densify_every: int = 60
     """Iterations between two rounds of densification and pruning."""
@@ -90,31 +90,31 @@ class GaussiansConfig:
     """Share of the iterations after which no Gaussian is added or removed."""
 
     densify_growth: float = 0.1
-    """At most this share of the Gaussians is split in one round."""
+    """Largest share of the Gaussians that is split in one round."""
 
     prune_opacity: float = 0.05
-    """Gaussians less opaque than this are removed."""
+    """Gaussians with less opacity are removed."""
 
     refine_depth: bool = True
-    """Hand the depth of the Gaussians on to the later stages instead of the measured one."""
+    """Pass the depth rendered from the Gaussians to later stages instead of the measured depth."""
 
     clear_depth: float = 0.01
-    """Relative difference of expected and median depth up to which a pixel shows one surface."""
+    """Largest relative difference of expected and median depth at pixels that show a single surface."""
 
     confirmed_depth: float = 0.02
-    """Where it shows several: relative difference to one of the two up to which the measured depth is kept."""
+    """Largest relative difference of the measured depth to expected or median depth at which it is kept."""
 
     sigma_cutoff: float = 2.6
     """Standard deviations at which a splat ends."""
 
     transmittance_stop: float = 1e-3
-    """Share of light at which a pixel is finished."""
+    """Transmittance below which a pixel is finished."""
 
     seed: int = 0
-    """Of the order of frames and of splits."""
+    """Random seed of the order of frames."""
 
     def __post_init__(self) -> None:
-        """Reject values that cannot work."""
+        """Reject invalid values."""
         positive = ("iterations", "side_px", "coarse_side_px", "max_gaussians", "densify_every")
         for name in positive:
             if getattr(self, name) < 1:

@@ -1,11 +1,11 @@
-"""Depth maps as the fitted Gaussians show them: every frame corrected by what all frames agree on."""
+"""Refine depth maps by the depth rendered from the fitted Gaussians, which fuse all frames."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from reconstruction.core.progress import Progress
-from reconstruction.core.types import DepthMaps, PosedFrames
+from reconstruction.core.types import Camera, DepthMaps, PosedFrames
 from reconstruction.depth import DepthConfig
 from reconstruction.depth.views import plan_views
 from reconstruction.gaussians.backend import Backend
@@ -16,12 +16,11 @@ from reconstruction.gaussians.rendering import Render
 from registry.geometry import invert_rigid
 
 _SOLID = 0.5  # opacity from which a pixel shows a surface
-_SAME, _BEYOND = (
-    0.015,
-    1.025,
-)  # relative depth up to which, ratio from which another view sees the same, looks through
-_OWN_WITNESSES, _FAR_OFF = 2, 0.1
-_BADLY_EXPLAINED = 0.05  # share of a frame's known pixels
+_SAME = 0.015  # largest relative depth difference at which another view agrees
+_BEYOND = 1.025  # smallest depth ratio at which another view sees through a point
+_OWN_WITNESSES = 2  # agreeing neighbors that keep a measured depth without the Gaussians' support
+_FAR_OFF = 0.1  # smallest relative difference of expected and measured depth for that
+_BADLY_EXPLAINED = 0.05  # share of a frame's known pixels that may be dropped before neighbors may keep them
 
 
 def rendered_depth_maps(
@@ -33,25 +32,28 @@ def rendered_depth_maps(
     backend: Backend,
     progress: Progress,
 ) -> DepthMaps:
-    """Return the depth maps with the depth of the Gaussians where it is unambiguous and others bear it out.
+    """Return depth maps with the expected depth of the Gaussians where it is unambiguous and confirmed.
 
-    A pixel takes the expected depth where expected and median depth agree, that is where one surface stops the light,
-    and its own depth is about the same. Where its own depth is another, the depth maps of neighboring frames vote: it
-    takes the expected depth if more of them measured that, keeps its own if Gaussians stand alone far off from a
-    surface that others measured (floaters of a weak capture), and becomes unknown otherwise. At outlines, where the
-    expected depth lies between two surfaces, it keeps its own depth if either of the two confirms it. A frame in which
-    much would become unknown is one that the Gaussians explain badly: there, what two neighbors measured stays. Pixels
-    that were unknown stay so: what Gaussians show there was never measured in this view. Confidence is that of the
-    input.
+    A pixel is clear if expected and median depth agree, that is, if it shows one surface.
+
+    - Clear, and the measured depth is close to the expected: the expected depth.
+    - Not clear (occlusion boundary): the measured depth if expected or median depth confirms it.
+    - Otherwise the depth maps of neighboring frames vote. The expected depth wins if more of them support it. The
+      measured depth wins if two support it, none supports the expected, and that is far off (a floater). Otherwise the
+      pixel becomes unknown.
+    - If too many pixels of a frame would become unknown, the Gaussians explain it badly: measured depth that two
+      neighbors support is kept.
+
+    Unknown pixels stay unknown. Confidence is that of the input.
 
     Args:
         gaussians: of `fit_gaussians` on these depth maps; their cameras are used.
-        posed: the frames, for which frames are neighbors.
+        posed: the frames, which determine the neighbors.
         depth: one map per keyframe, in the units of the cameras.
         config: `clear_depth` and `confirmed_depth` are the relative differences that count as agreement.
         settings: of the rasterizer.
-        backend: that renders.
-        progress: told of every frame.
+        backend: renders the Gaussians.
+        progress: receives steps and a summary.
     """
     parameters, poses = gaussians.packed(), gaussians.world_from_camera
     neighbors = plan_views(posed, DepthConfig()).neighbors
@@ -67,7 +69,7 @@ def rendered_depth_maps(
         if asked.any():
             relative = invert_rigid(poses[np.maximum(neighbors[row], 0)]) @ pose
             support = [
-                _witnesses(row, candidate, asked, measured, neighbors[row], relative, depth)
+                _witnesses(row, candidate, asked, measured, neighbors[row], relative, depth.camera)
                 for candidate in (own, np.asarray(render.depth, np.float32))
             ]
             decided = _vote(own, render.depth, clear, *support)
@@ -90,7 +92,7 @@ def rendered_depth_maps(
 def _choose(
     own: np.ndarray, render: Render, config: GaussiansConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the depth (h, w) that needs no vote, 0 = none; the pixels that need one; those that show one surface."""
+    """Return depth (h, w) decided without a vote, 0 = none; the masks of pixels that need one, and of clear ones."""
     expected, median, solid = render.depth, render.median_depth, render.opacity > _SOLID
     clear = solid & (np.abs(expected - median) < config.clear_depth * expected)
     near = np.abs(expected - own) < config.confirmed_depth * own
@@ -100,22 +102,16 @@ def _choose(
 
 
 def _witnesses(
-    row: int,
-    candidate: np.ndarray,
-    asked: np.ndarray,
-    measured: np.ndarray,
-    neighbors: np.ndarray,
-    relative: np.ndarray,
-    depth: DepthMaps,
-) -> np.ndarray:
-    """Count the neighboring depth maps (h, w) that agree with a candidate depth (h, w) where asked."""
+    row: int, candidate: np.ndarray, asked: np.ndarray, measured: np.ndarray, neighbors: np.ndarray,
+    relative: np.ndarray, camera: Camera,
+) -> np.ndarray:  # fmt: skip
+    """Count per pixel (h, w) the neighboring depth maps that agree with a candidate depth (h, w), where `asked`."""
     from reconstruction.depth.consistency import count_witnesses
 
-    camera = depth.camera
-    k = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    k = camera.intrinsics
     agree, through = np.zeros(candidate.shape, np.uint8), np.zeros(candidate.shape, np.uint8)
     before = measured[row].copy()
-    measured[row] = candidate  # the kernel reads the view's own depth from the stack
+    measured[row] = candidate  # the kernel reads the depth to test from the stack
     count_witnesses(row, neighbors, measured, asked, relative, k, _BEYOND, _SAME, agree, through)
     measured[row] = before
     return agree.astype(np.int32)
@@ -124,9 +120,8 @@ def _witnesses(
 def _vote(
     own: np.ndarray, expected: np.ndarray, clear: np.ndarray, for_own: np.ndarray, for_expected: np.ndarray
 ) -> np.ndarray:
-    """Return what the neighbors decide (h, w), 0 where they do not."""
+    """Return the depth (h, w) that the neighbors' support decides for, 0 = undecided."""
     far_off = np.abs(expected - own) > _FAR_OFF * own
     alone = (for_expected == 0) & (for_own >= _OWN_WITNESSES) & far_off
-    return np.where(clear & (for_expected > for_own), expected, np.where(clear & alone, own, 0)).astype(
-        np.float32
-    )
+    decided = np.where(clear & (for_expected > for_own), expected, np.where(clear & alone, own, 0))
+    return decided.astype(np.float32)

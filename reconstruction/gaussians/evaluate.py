@@ -1,4 +1,4 @@
-"""How well Gaussians explain frames that they were not fitted to."""
+"""Evaluate Gaussians on held-out frames: PSNR, SSIM, depth error, coverage."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,15 @@ from reconstruction.gaussians.views import render_gaussians
 
 @dataclass(frozen=True)
 class GaussiansEvaluation:
-    """Figures per kept-out frame; a gain and a bias per color channel, and nothing else, are fitted to each."""
+    """Metrics per held-out frame, after fitting a gain and a bias per color channel."""
 
     indices: np.ndarray  # int32 (m,) video frame numbers
     psnr_db: np.ndarray  # float64 (m,)
     ssim: np.ndarray  # float64 (m,)
-    depth_error: np.ndarray  # float64 (m,) median relative error of the expected depth, NaN without truth
-    coverage: np.ndarray  # float64 (m,) share of pixels with opacity above one half
+    depth_error: (
+        np.ndarray
+    )  # float64 (m,) median relative error of the expected depth, NaN without ground truth
+    coverage: np.ndarray  # float64 (m,) share of pixels with opacity above 0.5
 
     @property
     def mean_psnr_db(self) -> float:
@@ -39,7 +41,7 @@ class GaussiansEvaluation:
 
 
 def fit_exposure(rendered: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gain (3,) and bias (3,) that take a rendered image (h, w, 3) closest to a photograph."""
+    """Fit gain (3,) and bias (3,) from a rendered image (h, w, 3) to a photograph by least squares."""
     gain, bias = np.ones(3), np.zeros(3)
     for c in range(3):
         a, b = rendered[..., c].ravel().astype(np.float64), image[..., c].ravel().astype(np.float64)
@@ -50,7 +52,7 @@ def fit_exposure(rendered: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, n
 
 
 def psnr_db(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio of images in [0, 1], in dB (100 for equal ones)."""
+    """Return the peak signal-to-noise ratio of images in [0, 1], in dB, at most 100."""
     return float(-10 * np.log10(max(float(np.mean((a.astype(np.float64) - b) ** 2)), 1e-10)))
 
 
@@ -63,15 +65,15 @@ def evaluate_gaussians(
     settings: RasterSettings | None = None,
     backend: str = "cpu",
 ) -> GaussiansEvaluation:
-    """Render the kept-out frames and compare, over all pixels.
+    """Render the held-out frames and compare them with the images over all pixels.
 
     Args:
-        gaussians: In the space of `posed`.
-        posed: Its kept-out frames are used.
-        depth_truth: (m, h, w) true z-depth of the kept-out frames, 0 unknown, at any resolution.
-        side_px: Longer side to compare at; 0: the frames' own (working) resolution.
-        settings: Of the rasterizer.
-        backend: "cpu" or "gsplat".
+        gaussians: in the space of `posed`.
+        posed: its held-out frames are used.
+        depth_truth: (m, h, w) true z-depth of the held-out frames, 0 unknown, at any resolution.
+        side_px: longer side to compare at; 0: that of the frames.
+        settings: of the rasterizer.
+        backend: as `GaussiansConfig.backend`.
     """
     full = posed.camera
     scale = min(1.0, side_px / max(full.width, full.height)) if side_px else 1.0
@@ -89,9 +91,8 @@ def evaluate_gaussians(
         out["psnr_db"][row], out["ssim"][row] = psnr_db(color, image), ssim(color, image)
         out["coverage"][row] = float((render.opacity > 0.5).mean())
         if depth_truth is not None:
-            truth = cv2.resize(
-                np.asarray(depth_truth[row], np.float32), size, interpolation=cv2.INTER_NEAREST
-            )
+            exact = np.asarray(depth_truth[row], np.float32)
+            truth = cv2.resize(exact, size, interpolation=cv2.INTER_NEAREST)
             both = (truth > 0) & (render.opacity > 0.5)
             if both.any():
                 out["depth_error"][row] = np.median(np.abs(render.depth[both] / truth[both] - 1))

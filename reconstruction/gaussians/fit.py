@@ -1,7 +1,7 @@
-"""Posed frames and depth maps -> Gaussians: the training loop.
+"""Fit Gaussians to posed frames and depth maps: the training loop.
 
-One frame a step, in a seeded random order; small images first. Everything that counts in meters is relative to the
-scene's median depth, so that the result does not depend on the scale of the input.
+One frame per step, in a seeded random order; small images first. All lengths are relative to the scene's median depth,
+so that the result does not depend on the scale of the input.
 """
 
 import math
@@ -23,33 +23,39 @@ from reconstruction.gaussians.rasterizer import RasterSettings
 from reconstruction.gaussians.seeding import seed_from_depth
 from registry.errors import InputError
 
-_REPORT_EVERY = 10
-_EXPOSURE_SIDE = 96  # pixels: enough to compare mean colors
-_EXPOSURE_PULL = 1e-3  # towards gain 1 and bias 0, which colors and exposures leave open together
+_REPORT_EVERY = 10  # iterations
+_EXPOSURE_SIDE = 96  # longer side in pixels of the images whose mean colors give the first gains
+_EXPOSURE_PULL = (
+    1e-3  # weight of the pull to gain 1 and bias 0, since colors and exposures share a free factor
+)
 
 
 @dataclass
 class _Cameras:
-    """What is optimized per frame."""
+    """Variables per frame, and their optimizers."""
 
-    gain: np.ndarray  # (k, 3)
-    bias: np.ndarray  # (k, 3)
-    poses: np.ndarray  # (k, 4, 4)
+    gain: np.ndarray  # float64 (k, 3)
+    bias: np.ndarray  # float64 (k, 3)
+    poses: np.ndarray  # float64 (k, 4, 4) world_from_camera
     adam_exposure: Adam
     adam_pose: Adam
 
 
 def median_depth_of(depth: DepthMaps) -> float:
-    """Return the median known depth, the unit of everything that should not depend on scale."""
+    """Return the median known depth of about 16 frames, the unit of length of the fit.
+
+    Raises:
+        InputError: no pixel is known.
+    """
     stride = max(1, len(depth.depth) // 16)
     known = np.asarray(depth.depth[::stride])[np.asarray(depth.confidence[::stride]) > 0]
     if len(known) == 0:
-        raise InputError("gaussians: no depth map has a known pixel; nothing to fit to")
+        raise InputError("gaussians: no depth map has a known pixel, so there is nothing to fit to")
     return float(np.median(known))
 
 
 def settings_of(config: GaussiansConfig, median_depth: float) -> RasterSettings:
-    """Return the rasterizer's settings for a scene of a certain size."""
+    """Return the rasterizer's settings for a scene with a certain median depth."""
     return RasterSettings(
         sigma_cutoff=config.sigma_cutoff,
         transmittance_stop=config.transmittance_stop,
@@ -59,15 +65,16 @@ def settings_of(config: GaussiansConfig, median_depth: float) -> RasterSettings:
 
 
 def make_target(posed: PosedFrames, depth: DepthMaps, row: int, side: int, completed: float) -> FrameTarget:
-    """Return frame `row` with its longer side at most `side` pixels, and its depth at the same pixels."""
+    """Return image and depth of frame `row`, resized to at most `side` pixels; `completed` weighs completed depth."""
     full = posed.camera
     scale = min(1.0, side / max(full.width, full.height))
     width, height = round(full.width * scale), round(full.height * scale)
     image = cv2.resize(np.asarray(posed.images[row]), (width, height), interpolation=cv2.INTER_AREA)
-    # Depth is never mixed across edges: the nearest pixel stands for the new one.
-    nearest = {"dsize": (width, height), "interpolation": cv2.INTER_NEAREST}
-    z = cv2.resize(np.asarray(depth.depth[row]), **nearest)
-    confidence = cv2.resize(np.asarray(depth.confidence[row]), **nearest)
+    # Nearest neighbor: depth must not be mixed across occlusion boundaries.
+    z, confidence = (
+        cv2.resize(np.asarray(maps[row]), (width, height), interpolation=cv2.INTER_NEAREST)
+        for maps in (depth.depth, depth.confidence)
+    )
     weight = np.choose(np.minimum(confidence, 2), [0.0, completed, 1.0]).astype(np.float32) * (z > 0)
     return FrameTarget(full.resized(width, height), image.astype(np.float32) / 255, z, weight)
 
@@ -78,24 +85,23 @@ def fit_gaussians(
     """Fit 2D Gaussians to frames and depth maps.
 
     Args:
-        posed: Keyframes with cameras, in any space; kept-out frames are not looked at.
-        depth: One depth map per keyframe, in the same units.
-        config: Settings; the result is the same for the same settings and seed.
-        progress: Told of steps and of what was decided.
+        posed: keyframes with cameras, in any space; held-out frames are not used.
+        depth: one depth map per keyframe, in the same units.
+        config: settings; the result is deterministic.
+        progress: receives steps and a summary.
 
     Returns:
         The Gaussians with the exposures (and cameras) of the keyframes.
 
     Raises:
         InputError: there is no usable depth.
-        EnvironmentMissing: the backend's needs are not met.
+        EnvironmentMissing: the backend's requirements are not met.
     """
     backend = load_backend(config.backend)
     unit = median_depth_of(depth)
     settings = settings_of(config, unit)
-    seeds = seed_from_depth(
-        posed, depth, int(config.seed_share * config.max_gaussians), config.initial_opacity
-    )
+    budget = int(config.seed_share * config.max_gaussians)
+    seeds = seed_from_depth(posed, depth, budget, config.initial_opacity)
     state = SplatState.start(seeds)
     frames = len(posed.images)
     cameras = _Cameras(
@@ -133,7 +139,7 @@ def fit_gaussians(
         if done % _REPORT_EVERY == 0:
             progress.advance(_REPORT_EVERY)
     progress.note(
-        f"{len(state)} Gaussians: {len(seeds)} seeded from depth, {added} added where the error asked for them"
+        f"gaussians: {len(state)} Gaussians: {len(seeds)} seeded from depth, {added} added by hole filling and splits"
     )
     return from_packed(
         state.parameters, cameras.gain.astype(np.float32), cameras.bias.astype(np.float32), cameras.poses
@@ -143,7 +149,7 @@ def fit_gaussians(
 def _first_gains(
     backend: Backend, state: SplatState, posed: PosedFrames, depth: DepthMaps, settings: RasterSettings
 ) -> np.ndarray:
-    """Return gains (k, 3): each frame's mean color over that of the seeds, which average all frames; mean gain 1."""
+    """Return gains (k, 3): each frame's mean color relative to that of the rendered seeds; geometric mean 1."""
     gains = np.ones((len(posed.images), 3))
     for row, pose in enumerate(posed.world_from_camera):
         target = make_target(posed, depth, row, _EXPOSURE_SIDE, 1.0)
@@ -156,15 +162,10 @@ def _first_gains(
 
 
 def _fill(
-    backend: Backend,
-    state: SplatState,
-    cameras: _Cameras,
-    posed: PosedFrames,
-    depth: DepthMaps,
-    config: GaussiansConfig,
-    settings: RasterSettings,
-) -> int:
-    """Add Gaussians where frames show something and no depth map did. Returns how many."""
+    backend: Backend, state: SplatState, cameras: _Cameras, posed: PosedFrames, depth: DepthMaps,
+    config: GaussiansConfig, settings: RasterSettings,
+) -> int:  # fmt: skip
+    """Add Gaussians in holes of the rendered seeds, where no depth map has depth; return their number."""
     before = len(state)
     for row in range(0, len(posed.images), max(1, len(posed.images) // 24)):
         room = int(0.95 * config.max_gaussians) - len(state)
@@ -178,17 +179,10 @@ def _fill(
 
 
 def _take_step(
-    backend: Backend,
-    state: SplatState,
-    cameras: _Cameras,
-    row: int,
-    target: FrameTarget,
-    config: GaussiansConfig,
-    settings: RasterSettings,
-    unit: float,
-    share_done: float,
-) -> None:
-    """One frame: loss, derivatives, and a step of everything that it depends on."""
+    backend: Backend, state: SplatState, cameras: _Cameras, row: int, target: FrameTarget, config: GaussiansConfig,
+    settings: RasterSettings, unit: float, share_done: float,
+) -> None:  # fmt: skip
+    """Evaluate the loss of frame `row` and step Gaussians, exposure and pose."""
     gain, bias, pose = cameras.gain[row], cameras.bias[row], cameras.poses[row]
     result = backend.step(state.parameters, pose, target, gain, bias, weights_of(config), settings)
     rates = rates_of(config, unit, share_done)
@@ -210,7 +204,7 @@ def _take_step(
 
 
 def exponential(xi: np.ndarray) -> np.ndarray:
-    """Return the rigid transform (4, 4) of a tangent vector (6,): translation, then rotation."""
+    """Return the exponential map (4, 4) of a twist (6,): translation, then rotation."""
     w = np.asarray(xi[3:], np.float64)
     angle = float(np.linalg.norm(w))
     k = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])

@@ -1,7 +1,7 @@
-"""gsplat's `rasterization_2dgs` on CUDA behind the same interface, with the same losses through torch.
+"""CUDA backend: gsplat's `rasterization_2dgs`, with the training loss in torch.
 
-Two things differ from the CPU rasterizer by gsplat's design: a splat has one depth, that of its center, in the
-blended depth, and the distortion is its L1 form. Cut-offs are gsplat's own; of the settings, `near` applies.
+Differences to the CPU rasterizer, by gsplat's design: blended depth uses the depth of each splat's center, the
+distortion is its L1 form, and cut-offs are gsplat's own; of the settings, only `near` applies.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from reconstruction.gaussians.rendering import Render
 from registry.errors import EnvironmentMissing
 from registry.geometry import invert_rigid
 
-_THICKNESS = 1e-3  # gsplat takes three scales and ignores the third
+_THICKNESS = 1e-3  # third scale; gsplat ignores it
 
 
 class GsplatBackend:
@@ -27,17 +27,19 @@ class GsplatBackend:
         try:
             import torch
         except ImportError as error:
-            raise EnvironmentMissing("gaussians: the gsplat backend needs torch with CUDA") from error
+            raise EnvironmentMissing(
+                "gaussians: the gsplat backend needs torch with CUDA; install it, or use --set gaussians.backend=cpu"
+            ) from error
         try:
-            import gsplat
+            import gsplat  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise EnvironmentMissing(
-                "gaussians: gsplat is not installed; `pip install 'simrecon[gpu]'` beside a CUDA build of torch, "
-                "or use --set gaussians.backend=cpu"
+                "gaussians: gsplat is not installed; run `pip install 'simrecon[gpu]'` with a CUDA build of torch, or "
+                "use --set gaussians.backend=cpu"
             ) from error
         if not torch.cuda.is_available():
             raise EnvironmentMissing(
-                "gaussians: gsplat needs a CUDA device and torch sees none; use --set gaussians.backend=cpu"
+                "gaussians: gsplat needs a CUDA device, but torch finds none; use --set gaussians.backend=cpu"
             )
         self._torch, self._rasterization = torch, gsplat.rasterization_2dgs
         self._device = torch.device("cuda")
@@ -47,7 +49,7 @@ class GsplatBackend:
         return tensor.clone().requires_grad_(True) if grad else tensor
 
     def _draw(self, leaves: dict, camera: Camera, world_from_camera: np.ndarray, settings: RasterSettings):
-        """Render; leaves hold parameters (n, 13), color shares (n, 3) and the camera tangent xi (6,)."""
+        """Render; leaves are parameters (n, 13), color shares (n, 3) and the pose twist xi (6,)."""
         from reconstruction.gaussians.torch_losses import TorchImage
 
         torch = self._torch
@@ -55,24 +57,20 @@ class GsplatBackend:
         rgb = (0.5 + SH_C0 * p[:, 10:13]).clamp(min=0) + leaves["shares"]
         scales = torch.cat([p[:, 7:9].exp(), torch.full_like(p[:, :1], _THICKNESS)], dim=1)
         zero = torch.zeros((), device=self._device)
-        twist = torch.stack(
-            [
-                torch.stack([zero, -xi[5], xi[4], xi[0]]),
-                torch.stack([xi[5], zero, -xi[3], xi[1]]),
-                torch.stack([-xi[4], xi[3], zero, xi[2]]),
-                torch.stack([zero, zero, zero, zero]),
-            ]
-        )
-        # camera_from_world of world_from_camera exp(xi), to first order, which is what its derivative at 0 needs.
-        camera_from_world = (torch.eye(4, device=self._device) - twist) @ self._tensor(
-            invert_rigid(world_from_camera)
-        )
+        rows = (
+            (zero, -xi[5], xi[4], xi[0]), (xi[5], zero, -xi[3], xi[1]), (-xi[4], xi[3], zero, xi[2]),
+            (zero, zero, zero, zero),
+        )  # fmt: skip
+        twist = torch.stack([torch.stack(row) for row in rows])
+        # Inverse of world_from_camera exp(xi) to first order, which suffices for the derivative at 0.
+        fixed = self._tensor(invert_rigid(world_from_camera))
+        camera_from_world = (torch.eye(4, device=self._device) - twist) @ fixed
         color, alpha, normal, _, distortion, median, meta = self._rasterization(
             p[:, :3], p[:, 3:7], scales, torch.sigmoid(p[:, 9]), rgb, camera_from_world[None],
             self._tensor(camera.matrix)[None], camera.width, camera.height, near_plane=settings.near,
             render_mode="RGB+ED", distloss=True,
         )  # fmt: skip
-        # gsplat hands normals out in world space; where a normal is meant, it points at the camera.
+        # gsplat returns normals in world space, towards the camera.
         normal = normal[0] @ camera_from_world[:3, :3].T
         image = TorchImage(
             color[0, ..., :3], color[0, ..., 3], normal, alpha[0, ..., 0], distortion[0, ..., 0]
@@ -111,7 +109,7 @@ class GsplatBackend:
         )  # fmt: skip
 
     def _shares(self, color, leaves: dict, weights, keep: bool) -> np.ndarray:
-        """Sum alpha T of every Gaussian over weighted pixels: the derivative of the color by a color share."""
+        """Return the weighted sum over pixels of alpha T of each Gaussian (n,): the derivative by its color share."""
         (by_share,) = self._torch.autograd.grad(
             (color[..., 0] * weights).sum(), leaves["shares"], retain_graph=keep
         )

@@ -1,4 +1,4 @@
-"""Gaussians where frames show something and no depth map did: depth is drawn in from around the hole."""
+"""Seed Gaussians in holes without measured depth, at depth interpolated from around the hole."""
 
 import cv2
 import numpy as np
@@ -6,14 +6,14 @@ import numpy as np
 from reconstruction.gaussians.losses import FrameTarget
 from reconstruction.gaussians.model import N_PARAMETERS
 from reconstruction.gaussians.rendering import Render
-from reconstruction.gaussians.seeding import disks, rays_of
+from reconstruction.gaussians.seeding import disks
 
 _STRIDE = 4  # pixels between two Gaussians
-_OPACITY = 0.5
+_OPACITY = 0.5  # of a new Gaussian
 
 
 def interpolate_inverse_depth(inverse: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Fill the unknown pixels of an inverse depth map (h, w) smoothly: pull averages up a pyramid, push them down."""
+    """Fill the unknown pixels of an inverse depth map (h, w) by pull-push over an image pyramid."""
     height, width = inverse.shape
     if height <= 2 or width <= 2 or known.all():
         mean = inverse[known].mean() if known.any() else 0.0
@@ -27,7 +27,7 @@ def interpolate_inverse_depth(inverse: np.ndarray, known: np.ndarray) -> np.ndar
 
 
 def fill_holes(render: Render, target: FrameTarget, world_from_camera: np.ndarray) -> np.ndarray:
-    """Return packed Gaussians (n, 13) for the pixels that the render leaves dark; they face the camera."""
+    """Return packed Gaussians (n, 13) for pixels of low opacity in a render; they face the camera."""
     solid = render.opacity > 0.7
     hole = cv2.erode((render.opacity < 0.4).astype(np.uint8), np.ones((3, 3), np.uint8))
     grid = np.zeros(hole.shape, bool)
@@ -37,7 +37,7 @@ def fill_holes(render: Render, target: FrameTarget, world_from_camera: np.ndarra
         return np.zeros((0, N_PARAMETERS), np.float32)
     inverse = np.where(solid, 1 / np.maximum(render.depth, 1e-9), 0)
     z = 1 / np.maximum(interpolate_inverse_depth(inverse, solid)[y, x], 1e-9)
-    rays = rays_of(target.camera, np.float64)[y, x]
+    rays = target.camera.pixel_rays()[y, x]
     rotation = world_from_camera[:3, :3]
     points = (z[:, None] * rays) @ rotation.T + world_from_camera[:3, 3]
     normals = -(rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ rotation.T

@@ -1,19 +1,18 @@
-"""Compiled kernels of the 2D Gaussian rasterizer: project, bin, reduce, and their derivatives.
+"""Compiled kernels of the 2D Gaussian rasterizer: projection, tile binning, reduction, and their backward passes.
 
 A splat (Huang et al., "2D Gaussian Splatting", 2024) is a disk with center p, unit tangents t_u, t_v and standard
-deviations s_u, s_v. In camera space the 3x3 matrix H = [s_u t_u, s_v t_v, p] takes splat coordinates (u, v, 1) to
-points, so the ray d of a pixel meets the splat where (u, v, 1) is proportional to H^-1 d. H^-1 p = (0, 0, 1), hence
-with (dx, dy) the pixel's offset from the projected center
+deviations s_u, s_v. In camera space the 3x3 matrix H = [s_u t_u, s_v t_v, p] maps splat coordinates (u, v, 1) to
+points. The ray d of a pixel meets the splat where (u, v, 1) is proportional to H^-1 d. As H^-1 p = (0, 0, 1), with
+(dx, dy) the pixel's offset from the projected center
 
     W = 1 + wx dx + wy dy,   u = (ax dx + ay dy) / W,   v = (bx dx + by dy) / W,   z = zc / W,
 
-exact, with six coefficients a splat. `G` below is H^-1.
+exactly, with six coefficients per splat. `G` below is H^-1. Blending is in `blend_kernels`.
 
-Blending is in `blend_kernels`.
-Kernels with `start, stop` do their share of the rows and release the interpreter lock (see `threads.run_over`).
-Nothing races: a tile is one unit of work; what belongs to a splat is written once per (splat, tile) entry and then
-summed per splat in the order of its entries. Results do not depend on the number of threads.
-All kernels are generic in the floating-point type of their arrays: float32 in use, float64 to check derivatives.
+Kernels with `start, stop` process these rows and release the interpreter lock (see `threads.run_over`). There are no
+races: a tile is one unit of work; values of a splat are written once per (splat, tile) entry and then summed in the
+order of its entries. Results do not depend on the number of threads. All kernels are generic in the floating-point
+type: float32 in use, float64 to check derivatives.
 """
 
 import math
@@ -29,21 +28,19 @@ N_PROJECTED = 17
 # and second moments of the relative inverse depth, inverse depth of the first splat, and the median depth.
 N_FEATURES = 13
 F_DEPTH, F_NORMAL, F_ALPHA, F_DISTORTION, F_MOMENT1, F_MOMENT2, F_FIRST, F_MEDIAN = 3, 4, 7, 8, 9, 10, 11, 12
-# Columns of the derivative of a loss with respect to the rendered image.
-N_IMAGE_GRADIENTS = 9  # color, depth, normal, opacity, distortion
-# Columns of the per-splat derivatives: those of XC..OPACITY, color, normal; then alpha T summed plain and by error.
+# Columns of the per-splat gradients: by XC..OPACITY, color, normal; then sums of alpha T and of alpha T error.
 N_SPLAT_GRADIENTS = 18
 S_COLOR, S_NORMAL, S_CONTRIBUTION, S_ERROR = 10, 13, 16, 17
 # Columns of the parameters: mean, quaternion, log scales, opacity logit, color (SH degree 0).
 N_PARAMETERS = 13
 P_QUATERNION, P_SCALE, P_OPACITY, P_COLOR = 3, 7, 9, 10
 SH_C0 = 0.28209479177387814
-_MIN_COSINE = 0.01  # a splat seen more edge-on than this has no usable intersection
+_MIN_COSINE = 0.01  # between normal and ray; splats seen more edge-on are culled
 
 
 @numba.njit(cache=True, inline="always")
 def _rotation(quaternion):  # pragma: no cover - compiled
-    """Return the nine entries of the rotation matrix of a wxyz quaternion of any length, row by row."""
+    """Return the nine entries, row by row, of the rotation matrix of a wxyz quaternion of any length."""
     w, x, y, z = float(quaternion[0]), float(quaternion[1]), float(quaternion[2]), float(quaternion[3])
     s = 1.0 / math.sqrt(max(w * w + x * x + y * y + z * z, 1e-30))
     w, x, y, z = w * s, x * s, y * s, z * s
@@ -58,7 +55,7 @@ def _rotation(quaternion):  # pragma: no cover - compiled
 def _splat_in_camera(parameters, rotation, translation, h):  # pragma: no cover - compiled
     """Fill h (3, 4): columns s_u t_u, s_v t_v, center and normal (towards the camera), in camera space.
 
-    Returns +1, or -1 where the normal had to be turned.
+    Returns -1 if the normal was flipped, else +1.
     """
     r = _rotation(parameters[P_QUATERNION:P_SCALE])
     su, sv = math.exp(parameters[P_SCALE]), math.exp(parameters[P_SCALE + 1])
@@ -95,9 +92,9 @@ def _invert3(h, g):  # pragma: no cover - compiled
 
 @numba.njit(cache=True)
 def _pixel_box(h, intrinsics, reach2, width, height, box):  # pragma: no cover - compiled
-    """Fill box with the pixels x0, y0, x1, y1 (end exclusive) that the splat may touch. True if there are any.
+    """Fill box with the pixel bounds x0, y0, x1, y1 (end exclusive) of the splat; return whether it has pixels.
 
-    The exact bounds of the projected ellipse u^2 + v^2 = reach2 (Sigg et al. 2006; 2DGS eq. 8), joined with those of
+    The exact bounds of the projected ellipse u^2 + v^2 = reach2 (Sigg et al. 2006; 2DGS eq. 8), united with those of
     the screen-space filter.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -109,10 +106,10 @@ def _pixel_box(h, intrinsics, reach2, width, height, box):  # pragma: no cover -
         size = width if axis == 0 else height
         offset = f * h[axis, 2] / zc
         center = offset + (cx if axis == 0 else cy)
-        if s >= 0.0:  # the ellipse reaches behind the camera: it may be anywhere
+        if s >= 0.0:  # the ellipse reaches behind the camera: no bounds
             low, high = 0.0, float(size)
         else:
-            # Rows of H as seen from the projected center, so that nothing large cancels.
+            # Rows of H relative to the projected center, to avoid cancellation.
             tu, tv = f * h[axis, 0] - offset * h[2, 0], f * h[axis, 1] - offset * h[2, 1]
             k = reach2 / s
             middle = k * (tu * h[2, 0] + tv * h[2, 1])
@@ -129,22 +126,11 @@ def _pixel_box(h, intrinsics, reach2, width, height, box):  # pragma: no cover -
 
 @numba.njit(cache=True, nogil=True)
 def project(
-    start,
-    stop,
-    parameters,
-    rotation,
-    translation,
-    intrinsics,
-    size,
-    near,
-    sigma_cutoff,
-    alpha_min,
-    splats,
-    boxes,
-):  # pragma: no cover - compiled
-    """Project the Gaussians start..stop; boxes (n, 4) pixel bounds, x1 = 0 where one is not seen.
+    start, stop, parameters, rotation, translation, intrinsics, size, near, sigma_cutoff, alpha_min, splats, boxes
+):  # fmt: skip  # pragma: no cover - compiled
+    """Project the Gaussians start..stop to an image of `size` (width, height).
 
-    size is (width, height); splats (n, 17) filled where seen.
+    Fills boxes (n, 4), pixel bounds with x1 = 0 if not visible, and splats (n, 17) of the visible ones.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     h, g = np.empty((3, 4)), np.empty((3, 3))
@@ -177,7 +163,7 @@ def project(
 
 @numba.njit(cache=True)
 def sort_by_depth(splats, boxes):  # pragma: no cover - compiled
-    """Return the rows (k,) of the visible splats from near to far: a stable radix sort on the bits of the depth."""
+    """Return the rows, int32 (k,), of the visible splats from near to far, by a stable radix sort of float32 depth."""
     n = 0
     for i in range(len(boxes)):
         n += boxes[i, 2] > 0
@@ -208,10 +194,10 @@ def sort_by_depth(splats, boxes):  # pragma: no cover - compiled
 
 @numba.njit(cache=True)
 def bin_to_tiles(rows, boxes, tiles_x, tiles_y):  # pragma: no cover - compiled
-    """Counting sort of (splat, tile) entries by tile, near to far within each.
+    """Sort (splat, tile) entries by tile, near to far within each, by counting sort.
 
     Returns:
-        tile_start (t + 1,), entries (e,) rank of the splat in `rows`, first (k + 1,) and positions (e,): the entries
+        tile_start (t + 1,), entries (e,): rank in `rows` of the splat, first (k + 1,) and positions (e,): the entries
         of rank r are positions[first[r]:first[r + 1]].
     """
     tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
@@ -243,7 +229,7 @@ def bin_to_tiles(rows, boxes, tiles_x, tiles_y):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def gather(start, stop, splats, boxes, rows, near_splats, near_boxes):  # pragma: no cover - compiled
-    """Copy the visible splats and their boxes in depth order, so that tiles read them nearly in sequence."""
+    """Copy the visible splats and boxes in depth order, for sequential memory access in the tiles."""
     for r in range(start, stop):
         for c in range(splats.shape[1]):
             near_splats[r, c] = splats[rows[r], c]
@@ -253,7 +239,7 @@ def gather(start, stop, splats, boxes, rows, near_splats, near_boxes):  # pragma
 
 @numba.njit(cache=True, nogil=True)
 def reduce_entries(start, stop, entry_values, first, positions, rows, out):  # pragma: no cover - compiled
-    """Sum the values (e, k) of the entries of splats start..stop, in order, into out (n, k) at the Gaussians' rows."""
+    """Sum the entry values (e, k) of each splat start..stop, in order, into out (n, k) at the Gaussians' rows."""
     columns = entry_values.shape[1]
     for r in range(start, stop):
         for c in range(columns):
@@ -265,22 +251,12 @@ def reduce_entries(start, stop, entry_values, first, positions, rows, out):  # p
 
 @numba.njit(cache=True, nogil=True)
 def project_backward(
-    start,
-    stop,
-    parameters,
-    rows,
-    rotation,
-    translation,
-    intrinsics,
-    splats,
-    splat_gradients,
-    gradients,
-    pose_gradients,
-):  # pragma: no cover - compiled
-    """Carry the derivatives of projected splats (n, 18) to parameters (n, 13) and camera pose (k, 6).
+    start, stop, parameters, rows, rotation, translation, intrinsics, splats, splat_gradients, gradients, pose_gradients
+):  # fmt: skip  # pragma: no cover - compiled
+    """Backpropagate splat gradients (n, 18) of the visible splats start..stop to parameters (n, 13) and pose (k, 6).
 
-    Of the visible splats start..stop. The pose moves as world_from_camera exp(xi), xi = (translation, rotation) in
-    camera axes, so that a camera-space point x moves by -rho - phi x x.
+    The pose gradient is by xi = (rho, phi) of world_from_camera exp(xi), translation and rotation in camera axes: a
+    camera-space point x moves by -rho - phi x x. One kernel despite its length: all parts share the same locals.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     h, g, dg = np.empty((3, 4)), np.empty((3, 3)), np.zeros((3, 3))
@@ -295,7 +271,7 @@ def project_backward(
         dg[1, 0], dg[1, 1] = d[BX] * z / fx, d[BY] * z / fy
         dg[2, 0], dg[2, 1] = d[WX] * z / fx, d[WY] * z / fy
         dz = d[ZC]
-        for c in range(6):  # the coefficients carry a factor z
+        for c in range(6):  # the coefficients have a factor z
             dz += d[AX + c] * s[AX + c] / z
         # d(H^-1) = -H^-1 dH H^-1, hence dL/dH = -G^T (dL/dG) G^T; the third column of dL/dG is zero.
         for a in range(3):
@@ -308,7 +284,7 @@ def project_backward(
         dh[2, 2] += dz - (d[XC] * (s[XC] - cx) + d[YC] * (s[YC] - cy)) / z
         for c in range(3):
             dn[c] = d[S_NORMAL + c]
-        # Derivative by the pose: minus the sum of x cross dL/dx over everything that turns with the camera.
+        # Derivative by the pose: minus the sum of x cross dL/dx over all camera-space vectors x.
         for c in range(3):
             a, b = (c + 1) % 3, (c + 2) % 3
             pose_gradients[k, c] = -dh[c, 2]
@@ -316,7 +292,7 @@ def project_backward(
             for j in range(3):
                 turn += h[a, j] * dh[b, j] - h[b, j] * dh[a, j]
             pose_gradients[k, 3 + c] = -turn
-        # Columns back to world axes; then scales and the rotation matrix.
+        # Rotate the columns to world axes; then scales and rotation matrix.
         su, sv = math.exp(p[P_SCALE]), math.exp(p[P_SCALE + 1])
         d_su, d_sv = 0.0, 0.0
         for c in range(3):
@@ -336,7 +312,7 @@ def project_backward(
 
 @numba.njit(cache=True)
 def _quaternion_gradient(quaternion, dr, out):  # pragma: no cover - compiled
-    """Carry the derivative by the rotation matrix to the quaternion (not normalized), into out[3:7]."""
+    """Backpropagate the gradient by the rotation matrix to the quaternion (not normalized), into out[3:7]."""
     w, x, y, z = float(quaternion[0]), float(quaternion[1]), float(quaternion[2]), float(quaternion[3])
     s = 1.0 / math.sqrt(max(w * w + x * x + y * y + z * z, 1e-30))
     w, x, y, z = w * s, x * s, y * s, z * s

@@ -1,7 +1,7 @@
-"""Compiled kernels of the losses: values and derivatives by the rendered image.
+"""Compiled kernels of the losses: values and gradients by the rendered image.
 
-All loop over the image rows start..stop. Sums are kept per row and added by the caller, so that they do not
-depend on the number of threads.
+All loop over the image rows start..stop. Sums are kept per row and added by the caller, so that they do not depend on
+the number of threads.
 """
 
 import math
@@ -11,15 +11,15 @@ import numpy as np
 
 from reconstruction.gaussians.kernels import F_ALPHA, F_DEPTH, F_DISTORTION, F_NORMAL
 
-MIN_ALPHA = 0.2  # depth and normals are only compared where at least this much light is stopped
-EDGE = 0.05  # relative depth difference of neighbors across which no normal is taken
+MIN_ALPHA = 0.2  # smallest opacity of pixels with depth and normal losses
+EDGE = 0.05  # largest relative depth difference of the neighbors that span a normal
 
 
 @numba.njit(cache=True, nogil=True)
 def color_products(
     start, stop, features, gain, bias, target, color, squares, products
 ):  # pragma: no cover - compiled
-    """Fill color = gain * rendered + bias, its square, and its product with the target, all (h, w, 3)."""
+    """Fill color = gain * rendered + bias, its square and its product with the target, all (h, w, 3)."""
     for y in range(start, stop):
         for x in range(color.shape[1]):
             for c in range(3):
@@ -33,9 +33,9 @@ def color_products(
 def ssim_partials(
     start, stop, mean, mean_target, square, square_target, product, row_sum, d_mean, d_square, d_product
 ):  # pragma: no cover - compiled
-    """SSIM of every pixel from windowed moments; derivatives of its sum by mean, square and product.
+    """Compute SSIM (Wang et al. 2004; K1 = 0.01, K2 = 0.03, range 1) from windowed moments (h, w, 3).
 
-    All (h, w, 3); row_sum (h,) gets the sum of SSIM. Wang et al. 2004 with K1 = 0.01, K2 = 0.03, range 1.
+    Fills row_sum (h,) with the sum of SSIM, and its derivatives by mean, square and product (h, w, 3).
     """
     c1, c2 = 0.0001, 0.0009
     for y in range(start, stop):
@@ -63,34 +63,16 @@ def ssim_partials(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def color_gradients(
-    start,
-    stop,
-    features,
-    color,
-    target,
-    gain,
-    d_mean,
-    d_square,
-    d_product,
-    l1_factor,
-    ssim_factor,
-    image_gradients,
-    error,
-    sums,
-):  # pragma: no cover - compiled
-    """L1 and SSIM derivatives by the rendered color into image_gradients[..., :3].
+    start, stop, features, color, target, gain, d_mean, d_square, d_product, l1_factor, ssim_factor, image_gradients,
+    error, sums,
+):  # fmt: skip  # pragma: no cover - compiled
+    """Compute gradients of the L1 and SSIM losses by the rendered color.
 
-    Args:
-        features: (h, w, 13); color (h, w, 3) = gain * rendered + bias.
-        target: (h, w, 3).
-        gain: (3,).
-        d_mean: (h, w, 3) windowed derivatives of SSIM; d_square and d_product alike.
-        l1_factor: Weight of the summed |color - target|.
-        ssim_factor: Weight of the summed SSIM (negative: it is to grow).
-        image_gradients: (h, w, 9), columns 0..2 filled.
-        error: (h, w) filled with the mean absolute difference.
-        sums: (h, 7) filled: sum of |difference|, derivative by gain (3) and bias (3).
-    """  # fmt: skip
+    Takes features (h, w, 13), color = gain * rendered + bias and target (h, w, 3), gain (3,), the windowed derivatives
+    of SSIM (h, w, 3), and the weights of the summed |color - target| and of the summed SSIM (negative: it is
+    maximized). Fills image_gradients (h, w, 9), columns 0..2, error (h, w), the mean absolute difference, and
+    sums (h, 7): |difference|, gradient by gain (3) and by bias (3).
+    """
     for y in range(start, stop):
         for c in range(7):
             sums[y, c] = 0
@@ -118,10 +100,10 @@ def color_gradients(
 def normal_partials(
     start, stop, features, rays, factor, d_axes, image_gradients, row_sum
 ):  # pragma: no cover - compiled
-    """Normal consistency (2DGS eq. 14): alpha minus the rendered normals along the normal of the rendered depth.
+    """Compute normal consistency (2DGS eq. 14): alpha minus rendered normal dot normal of the rendered depth.
 
-    Fills image_gradients[..., 4:7] and d_axes (h, w, 6), the derivatives by the two differences of neighboring
-    points that span the pixel's surface; alpha counts as constant in it. row_sum (h,) gets the loss.
+    Fills image_gradients[..., 4:7], row_sum (h,) with the loss, and d_axes (h, w, 6), the gradients by the two
+    differences of neighboring points that span the surface at a pixel. alpha is treated as constant.
     """
     height, width = features.shape[0], features.shape[1]
     for y in range(start, stop):
@@ -150,7 +132,7 @@ def normal_partials(
                 continue
             ax, ay, az = p[0, 0] - p[1, 0], p[0, 1] - p[1, 1], p[0, 2] - p[1, 2]
             bx, by, bz = p[2, 0] - p[3, 0], p[2, 1] - p[3, 1], p[2, 2] - p[3, 2]
-            # Down cross right points at the camera.
+            # Down cross right points towards the camera.
             mx, my, mz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
             length = math.sqrt(mx * mx + my * my + mz * mz)
             if length < 1e-20:
@@ -173,32 +155,15 @@ def normal_partials(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def depth_gradients(
-    start,
-    stop,
-    features,
-    rays,
-    target,
-    weight,
-    d_axes,
-    scale,
-    depth_factor,
-    opacity_factor,
-    distortion_factor,
-    image_gradients,
-    sums,
-):  # pragma: no cover - compiled
-    """Depth, opacity and distortion losses, and what the normal loss says of depth, by the rendered image.
+    start, stop, features, rays, target, weight, d_axes, scale, depth_factor, opacity_factor, distortion_factor,
+    image_gradients, sums,
+):  # fmt: skip  # pragma: no cover - compiled
+    """Compute depth, opacity and distortion losses, and all gradients by depth, opacity and distortion.
 
-    Args:
-        features: (h, w, 13).
-        rays: (h, w, 3).
-        target: (h, w) depth; weight (h, w), 0 where it is not known.
-        d_axes: (h, w, 6) of `normal_partials`.
-        scale: Relative error at which the pull of a pixel has halved: scale log(1 + |e| / scale).
-        depth_factor: Weight of the summed depth loss; opacity_factor and distortion_factor alike.
-        image_gradients: (h, w, 9), columns 3, 7 and 8 filled.
-        sums: (h, 3) filled: depth, opacity and distortion loss.
-    """  # fmt: skip
+    Takes features (h, w, 13), rays (h, w, 3), target depth and weight (h, w; 0 = unknown), d_axes (h, w, 6) of
+    `normal_partials`, the scale s of the robust loss s log(1 + |e| / s), and the weights of the summed losses. Fills
+    image_gradients (h, w, 9), columns 3, 7 and 8, and sums (h, 3): depth, opacity and distortion loss.
+    """
     height, width = features.shape[0], features.shape[1]
     for y in range(start, stop):
         for c in range(3):

@@ -1,9 +1,10 @@
-"""The Gaussians as an artifact, and the packed form that kernels work on."""
+"""Gaussians as an artifact, and their packed form (n, 13) for kernels."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from reconstruction.core.types import check_arrays
 from registry.geometry import matrix_from_quat, quat_from_matrix, split_similarity
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 * coefficient
@@ -14,19 +15,26 @@ N_PARAMETERS = 13  # mean 3, quaternion 4, log scales 2, opacity logit 1, color 
 class Gaussians:
     """2D Gaussians (oriented disks) in the space of the posed frames that they were fitted to.
 
-    Colors are view-independent (spherical harmonics of degree 0), in the frames' sRGB values, not linear light: a
-    room's matte surfaces are what the later stages use. A disk's third axis is its normal. Frame k was seen as
-    `exposure_gain[k] * rendered + exposure_bias[k]`, by `world_from_camera[k]`.
+    Colors are view-independent (spherical harmonics of degree 0), in sRGB values, not linear light. Keyframe k is
+    modeled as `exposure_gain[k] * rendered + exposure_bias[k]`, seen by `world_from_camera[k]`.
     """
 
     means: np.ndarray  # float32 (n, 3)
-    quaternions: np.ndarray  # float32 (n, 4) wxyz, unit; columns of its matrix: t_u, t_v, normal
-    log_scales: np.ndarray  # float32 (n, 2) natural logarithm of the standard deviations along t_u and t_v
+    quaternions: np.ndarray  # float32 (n, 4) wxyz, unit; the columns of its matrix are t_u, t_v, normal
+    log_scales: np.ndarray  # float32 (n, 2) natural logarithms of the standard deviations along t_u and t_v
     opacity_logits: np.ndarray  # float32 (n,)
-    colors: np.ndarray  # float32 (n, 3) SH coefficients of degree 0: rgb = 0.5 + 0.2821 c
-    exposure_gain: np.ndarray  # float32 (k, 3) of the keyframes they were fitted to
+    colors: np.ndarray  # float32 (n, 3) SH coefficients c of degree 0: rgb = 0.5 + 0.2821 c
+    exposure_gain: np.ndarray  # float32 (k, 3) per keyframe and color channel
     exposure_bias: np.ndarray  # float32 (k, 3)
-    world_from_camera: np.ndarray  # float64 (k, 4, 4) those frames' cameras, refined where that was asked for
+    world_from_camera: np.ndarray  # float64 (k, 4, 4) rigid; as optimized, if `optimize_poses`
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(
+            self, means="float32 n 3", quaternions="float32 n 4", log_scales="float32 n 2", opacity_logits="float32 n",
+            colors="float32 n 3", exposure_gain="float32 k 3", exposure_bias="float32 k 3",
+            world_from_camera="float64 k 4 4",
+        )  # fmt: skip
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -34,7 +42,7 @@ class Gaussians:
 
     @property
     def rgb(self) -> np.ndarray:
-        """Return colors (n, 3) in [0, 1] (not above, where the fit went there)."""
+        """Return RGB colors (n, 3), at least 0; the fit may exceed 1."""
         return np.maximum(0.5 + SH_C0 * self.colors, 0.0)
 
     @property
@@ -44,13 +52,8 @@ class Gaussians:
 
     def packed(self) -> np.ndarray:
         """Return the parameters as one float32 array (n, 13)."""
-        return np.ascontiguousarray(
-            np.concatenate(
-                [self.means, self.quaternions, self.log_scales, self.opacity_logits[:, None], self.colors],
-                axis=1,
-            ),
-            np.float32,
-        )
+        columns = [self.means, self.quaternions, self.log_scales, self.opacity_logits[:, None], self.colors]
+        return np.ascontiguousarray(np.concatenate(columns, axis=1), np.float32)
 
 
 def from_packed(
@@ -59,7 +62,7 @@ def from_packed(
     exposure_bias: np.ndarray | None = None,
     world_from_camera: np.ndarray | None = None,
 ) -> Gaussians:
-    """Unpack parameters (n, 13); quaternions are normalized, with w >= 0."""
+    """Unpack parameters (n, 13); quaternions are normalized to w >= 0. Without cameras k is 0."""
     p = np.asarray(parameters, np.float32)
     quaternions = p[:, 3:7] / np.maximum(np.linalg.norm(p[:, 3:7], axis=1, keepdims=True), 1e-12)
     quaternions = np.where(quaternions[:, :1] < 0, -quaternions, quaternions)
@@ -77,10 +80,7 @@ def from_packed(
 
 
 def moved(gaussians: Gaussians, b_from_a: np.ndarray) -> Gaussians:
-    """Return the Gaussians, with their cameras, in space b; b_from_a (4, 4) is a similarity.
-
-    Colors of degree 0 do not depend on the direction, so a rotation leaves them.
-    """
+    """Return the Gaussians and their cameras in space b; b_from_a (4, 4) is a similarity."""
     scale, rotation, translation = split_similarity(b_from_a)
     axes = rotation @ matrix_from_quat(gaussians.quaternions)
     poses = np.array(gaussians.world_from_camera, np.float64)

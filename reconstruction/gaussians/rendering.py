@@ -1,4 +1,4 @@
-"""What a view of the Gaussians looks like, whichever rasterizer drew it."""
+"""The rendered view of Gaussians, common to all rasterizers."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,16 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Render:
-    """One rendered view; all arrays float32, normals in camera space, depth in the units of the scene."""
+    """One rendered view; all arrays are float32, depth is in the units of the scene."""
 
-    color: np.ndarray  # (h, w, 3) over black, without exposure, not clipped
+    color: np.ndarray  # (h, w, 3) RGB over black, without exposure, not clipped
     depth: np.ndarray  # (h, w) expected z-depth sum(w z) / sum(w), 0 where nothing is drawn
-    median_depth: np.ndarray  # (h, w) z-depth at which half of the light is stopped, 0 where less is
-    normal: np.ndarray  # (h, w, 3) sum of w n, towards the camera, length at most the opacity
-    opacity: np.ndarray  # (h, w) accumulated, in [0, 1]
+    median_depth: np.ndarray  # (h, w) z-depth at which transmittance falls to 0.5, 0 if it does not
+    normal: np.ndarray  # (h, w, 3) sum of w n, camera frame, towards the camera; length <= opacity
+    opacity: np.ndarray  # (h, w) in [0, 1]
     distortion: np.ndarray  # (h, w) spread of the splats along the ray
-    contribution: (
-        np.ndarray | None
-    )  # (n,) sum over pixels of weight alpha T of every Gaussian, where asked for
+    contribution: np.ndarray | None  # (n,) sum over pixels of weight alpha T; None without pixel weights
 
     def uint8(self) -> np.ndarray:
-        """Return the color as an image."""
+        """Return the color, uint8 (h, w, 3)."""
         return np.round(np.clip(self.color, 0, 1) * 255).astype(np.uint8)

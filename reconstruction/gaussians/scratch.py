@@ -1,18 +1,16 @@
-"""Memory that is used again every step: fresh pages cost as much time as the rendering itself."""
+"""Reusable buffers: allocating fresh pages in every step would take as long as rendering."""
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 
 class Scratch:
-    """Hands out arrays by name; one with the same name overwrites the one before.
-
-    A result that lives in scratch memory is valid until the next call with the same scratch.
-    """
+    """Provides arrays by name; an array overwrites the former one of the same name."""
 
     def __init__(self) -> None:
         self._buffers: dict[str, np.ndarray] = {}
 
-    def empty(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+    def empty(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
         """Return an array with arbitrary content."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         buffer = self._buffers.get(name)
@@ -20,7 +18,7 @@ class Scratch:
             buffer = self._buffers[name] = np.empty(size + size // 4 + 64, np.uint8)
         return buffer[:size].view(dtype).reshape(shape)
 
-    def zeros(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+    def zeros(self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
         """Return an array of zeros."""
         array = self.empty(name, shape, dtype)
         array[...] = 0

@@ -1,4 +1,4 @@
-"""Stage 5: posed frames and depth maps -> 2D Gaussians, and the depth that they show."""
+"""Stage 5: fit 2D Gaussians to posed frames and depth maps, and refine the depth maps with them."""
 
 from dataclasses import dataclass, replace
 
@@ -15,44 +15,39 @@ from reconstruction.gaussians.model import Gaussians, moved
 
 @dataclass(frozen=True)
 class GaussianScene:
-    """What the stage makes, in `sfm` space, so that another scale or floor does not ask for another fit."""
+    """Gaussians and refined depth in `sfm` space, so that a change of scale or floor needs no new fit."""
 
     gaussians: Gaussians
-    depth: DepthMaps  # of the keyframes, corrected by the Gaussians; later stages use it
+    depth: DepthMaps  # of the keyframes, for later stages
 
     def in_world(self, world: WorldFrame) -> Gaussians:
         """Return the Gaussians in world space, in metres."""
         return moved(self.gaussians, world.world_from_sfm)
 
     def posed(self, posed: PosedFrames) -> PosedFrames:
-        """Return the keyframes with the cameras that the Gaussians were fitted with (refined where asked for)."""
+        """Return the keyframes with the Gaussians' cameras (optimized, if `optimize_poses`)."""
         return replace(posed, world_from_camera=np.asarray(self.gaussians.world_from_camera, np.float64))
 
 
 def make_gaussians(
-    posed: PosedFrames,
-    depth: DepthMaps,
-    config: GaussiansConfig,
-    *,
-    progress: Progress = NO_PROGRESS,
+    posed: PosedFrames, depth: DepthMaps, config: GaussiansConfig, *, progress: Progress = NO_PROGRESS
 ) -> GaussianScene:
-    """Fit Gaussians and render the depth maps anew from them.
+    """Fit Gaussians and refine the depth maps by rendering them.
 
     Args:
-        posed: keyframes with cameras, in any space; kept-out frames are not looked at.
+        posed: keyframes with cameras, in any space; held-out frames are not used.
         depth: one depth map per keyframe, in the same units.
-        config: settings; `refine_depth=False` hands the depth maps on as they are.
-        progress: told of steps and decisions.
+        config: settings; with `refine_depth=False` depth maps stay unchanged.
+        progress: receives steps and notes.
 
     Raises:
         InputError: there is no usable depth.
-        EnvironmentMissing: the backend's needs are not met.
+        EnvironmentMissing: the backend's requirements are not met.
     """
     gaussians = fit_gaussians(posed, depth, config, progress=progress)
     if not config.refine_depth:
         return GaussianScene(gaussians, depth)
     settings = settings_of(config, median_depth_of(depth))
     backend = load_backend(config.backend)
-    return GaussianScene(
-        gaussians, rendered_depth_maps(gaussians, posed, depth, config, settings, backend, progress)
-    )
+    refined = rendered_depth_maps(gaussians, posed, depth, config, settings, backend, progress)
+    return GaussianScene(gaussians, refined)

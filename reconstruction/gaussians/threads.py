@@ -1,7 +1,7 @@
-"""Compiled loops over several threads.
+"""Run compiled kernels on several threads.
 
-Plain threads around kernels that release the interpreter lock, instead of Numba's parallel loops: those take five
-times as long to compile, and their threads spin while they wait, which slows everything else on a busy machine.
+Kernels release the interpreter lock and run on plain threads. Numba's parallel loops would take five times as long to
+compile, and their threads spin while waiting, which slows down a busy machine.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from functools import cache
 from itertools import pairwise
 from typing import Any
 
-_PIECES = 2  # pieces a thread, so that an uneven share of the work does not hold up the rest
+_PIECES = 2  # pieces of work per thread, to balance uneven pieces
 
 
 @cache
@@ -19,14 +19,14 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def thread_count() -> int:
-    """Return the number of threads: the usable cores, or NUMBA_NUM_THREADS."""
-    import numba
+    """Return the number of threads: NUMBA_NUM_THREADS, which is the number of usable cores unless it is set."""
+    from numba.core import config
 
-    return int(numba.config.NUMBA_NUM_THREADS)
+    return int(config.NUMBA_NUM_THREADS)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def run_over(count: int, kernel: Callable[..., None], *arguments: Any) -> None:
-    """Call kernel(start, stop, *arguments) for pieces of range(count); each piece writes only what is its own."""
+    """Call kernel(start, stop, *arguments) for pieces of range(count) in parallel; pieces must not share outputs."""
     threads = thread_count()
     pieces = 1 if threads == 1 else min(threads * _PIECES, max(count, 1))
     bounds = [i * count // pieces for i in range(pieces + 1)]

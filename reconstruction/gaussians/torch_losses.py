@@ -1,4 +1,4 @@
-"""The training loss of `losses` written for torch, for rasterizers that differentiate through torch."""
+"""The training loss of `losses` in torch, for rasterizers that use its automatic differentiation."""
 
 from dataclasses import dataclass
 
@@ -7,23 +7,23 @@ import torch.nn.functional as F
 
 from reconstruction.gaussians.losses import LossWeights
 
-MIN_ALPHA, EDGE = 0.2, 0.05  # as in loss_kernels, which needs Numba to import
+MIN_ALPHA, EDGE = 0.2, 0.05  # as in loss_kernels, whose import needs Numba
 
 
 @dataclass(frozen=True)
 class TorchImage:
-    """What a rasterizer rendered, before exposure; expected depth, normals in camera space."""
+    """A rendered image before exposure."""
 
     color: torch.Tensor  # (h, w, 3)
-    depth: torch.Tensor  # (h, w) sum(w z) / sum(w)
-    normal: torch.Tensor  # (h, w, 3) sum of w n
+    depth: torch.Tensor  # (h, w) expected z-depth sum(w z) / sum(w)
+    normal: torch.Tensor  # (h, w, 3) sum of w n in the camera frame
     alpha: torch.Tensor  # (h, w)
     distortion: torch.Tensor  # (h, w)
 
 
 @dataclass(frozen=True)
 class TorchTarget:
-    """What a frame should look like."""
+    """Image and depth of one frame, see `FrameTarget`."""
 
     image: torch.Tensor  # (h, w, 3)
     depth: torch.Tensor  # (h, w)
@@ -32,7 +32,7 @@ class TorchTarget:
 
 
 def _window(image: torch.Tensor) -> torch.Tensor:
-    """Blur (h, w, 3) with the 11x11 Gaussian window, zero outside."""
+    """Filter an image (h, w, 3) with SSIM's 11x11 Gaussian window and zero padding."""
     x = torch.arange(11, dtype=image.dtype, device=image.device) - 5
     kernel = torch.exp(-0.5 * (x / 1.5) ** 2)
     kernel = kernel / kernel.sum()
@@ -42,7 +42,7 @@ def _window(image: torch.Tensor) -> torch.Tensor:
 
 
 def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the structural similarity (h, w, 3) of images in [0, 1]."""
+    """Return the structural similarity (h, w, 3) of images (h, w, 3) in [0, 1]."""
     mean_a, mean_b = _window(a), _window(b)
     variance_a, variance_b = _window(a * a) - mean_a**2, _window(b * b) - mean_b**2
     covariance = _window(a * b) - mean_a * mean_b
@@ -53,7 +53,7 @@ def ssim_map(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def _normal_term(image: TorchImage, rays: torch.Tensor) -> torch.Tensor:
-    """Sum over pixels of alpha minus the rendered normal along the normal of the rendered depth."""
+    """Return the sum over pixels of alpha minus rendered normal dot normal of the rendered depth."""
     points = image.depth[..., None] * rays
     dx, dy = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     cross = torch.linalg.cross(dy, dx)
@@ -72,7 +72,7 @@ def _normal_term(image: TorchImage, rays: torch.Tensor) -> torch.Tensor:
 def torch_loss(
     image: TorchImage, target: TorchTarget, gain: torch.Tensor, bias: torch.Tensor, weights: LossWeights
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Return the loss of one frame, and its terms unweighted; see `losses` for the formulas."""
+    """Return the loss of one frame and its unweighted terms; see `losses` for the formulas."""
     color = gain * image.color + bias
     pixels = image.alpha.numel()
     seen = (image.alpha >= MIN_ALPHA) & (target.depth_weight > 0)

@@ -1,4 +1,4 @@
-"""Gaussians, a camera and its pose in, a rendered view out, by the rasterizer that is asked for."""
+"""Render a view of Gaussians with a rasterizer chosen by name."""
 
 import numpy as np
 
@@ -21,13 +21,13 @@ def render_gaussians(
     """Render a view.
 
     Args:
-        gaussians: Of `fit_gaussians`, or read from a .ply.
-        camera: Pinhole camera.
+        gaussians: of `fit_gaussians`, or read from a .ply.
+        camera: pinhole camera.
         world_from_camera: (4, 4) rigid, in the space of the Gaussians.
-        settings: Cut-offs; `near` counts in the units of the scene.
-        pixel_weights: (h, w) to also sum alpha T of every Gaussian over the pixels with these weights: ones for its
-            contribution to the view, a mask of one object's pixels for its share in that object.
-        backend: "cpu" or "gsplat".
+        settings: cut-offs.
+        pixel_weights: (h, w) weights of the pixels in `Render.contribution`: ones for contributions to the view, a mask
+            for contributions to an object.
+        backend: as `GaussiansConfig.backend`.
     """
     return load_backend(backend).render(
         gaussians.packed(), camera, world_from_camera, settings or RasterSettings(), pixel_weights

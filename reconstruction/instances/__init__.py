@@ -1,4 +1,4 @@
-"""Stage 6: cut the fused surface into floor, walls and separate things, by learned affinities or by masks."""
+"""Stage 6: segment the fused surface into floor, walls, ceiling and objects, by a learned partition or by 2D masks."""
 
 from reconstruction.instances.config import INSTANCES_PRESETS, InstancesConfig
 from reconstruction.instances.external import backends, outside_inputs

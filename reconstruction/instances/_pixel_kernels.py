@@ -1,4 +1,4 @@
-"""Compiled per-pixel refinement of id maps."""
+"""Compiled refinement of id maps."""
 
 import numpy as np
 from numba import njit, prange
@@ -6,15 +6,17 @@ from numba import njit, prange
 
 @njit(cache=True, parallel=True)
 def snap_borders(ids, band, lab, depth, radius, reach):  # pragma: no cover - compiled
-    """Give each pixel of `band` the id whose sure pixels around look and lie most like it.
+    """Reassign pixels near id borders to the nearby id with the most similar color and depth; return uint16 (h, w).
+
+    One loop over pixels and one over their neighbors, so that no array per id is needed.
 
     Args:
-        ids: uint16 (h, w) ids.
-        band: bool (h, w) pixels that are unsure.
+        ids: uint16 (h, w).
+        band: bool (h, w) pixels to reassign.
         lab: float32 (h, w, 3) CIELAB.
         depth: float32 (h, w) measured depth, 0 = unknown.
-        radius: only ids within this many pixels of the pixel may claim it.
-        reach: sure pixels within this many pixels describe an id.
+        radius: a pixel may take ids that occur within this distance, in pixels.
+        reach: color and depth of an id are means over its pixels outside of `band` within this distance, in pixels.
     """
     height, width = ids.shape
     out = ids.copy()

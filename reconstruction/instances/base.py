@@ -1,4 +1,4 @@
-"""Floor, walls and ceiling as the surface stage found them, as entities; a floor is assumed where none was seen."""
+"""Base entities: floor, walls and ceiling from the planes that the surface stage fitted."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ BASE_LABELS = ("floor", "wall", "ceiling")
 
 
 def base_planes(surface: Surface) -> list[FittedPlane]:
-    """Return the surface's floor (first, if seen), walls and ceiling with masks of the vertices on them."""
+    """Return floor (first, if it was seen), walls and ceiling of a surface, with masks of the vertices on them."""
     out = []
     for plane in surface.planes:
         if plane.label in BASE_LABELS:
@@ -21,11 +21,11 @@ def base_planes(surface: Surface) -> list[FittedPlane]:
 
 
 def base_entities(surface: Surface, progress: Progress) -> tuple[BaseEntity, ...]:
-    """Return the entities of floor, walls and ceiling, numbered from 1, the floor first."""
+    """Return floor, walls and ceiling, numbered from 1, the floor first; a floor is assumed where none was seen."""
     planes = [plane for plane in surface.planes if plane.label in BASE_LABELS]
     base: list[BaseEntity] = []
     if not planes or planes[0].label != "floor":
-        progress.note("No floor was seen near z = 0: one is assumed under everything.")
+        progress.note("No floor was seen near z = 0: one is assumed under the whole scene.")
         base.append(assumed_floor(1, np.asarray(surface.vertices, np.float64)))
     for plane in planes:
         base.append(BaseEntity(len(base) + 1, plane.label, plane.surface, True))
@@ -33,13 +33,11 @@ def base_entities(surface: Surface, progress: Progress) -> tuple[BaseEntity, ...
 
 
 def assumed_floor(number: int, points: np.ndarray) -> BaseEntity:
-    """Return a floor at z = 0 under everything, marked as not observed."""
+    """Return a floor at z = 0 that extends 0.25 m beyond points (n, 3), marked as not observed."""
     if len(points):
         low, high = np.percentile(points[:, :2], [0.5, 99.5], axis=0)
     else:
         low, high = np.full(2, -1.0), np.full(2, 1.0)
-    low, high = low - 0.25, high + 0.25
-    corners = np.array(
-        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
-    )
+    (x0, y0), (x1, y1) = low - 0.25, high + 0.25
+    corners = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
     return BaseEntity(number, "floor", Plane(np.array([0, 0, 1.0, 0]), corners), False)

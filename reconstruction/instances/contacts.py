@@ -1,29 +1,29 @@
-"""What a thing stands on, from the surface around its foot."""
+"""Support relations between objects, from the surface around the foot of each."""
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph
 
-_REACH_M, _FAR_REACH_M = 0.05, 0.3  # around the foot, in plan
-_RISE_M, _DROP_M = 0.03, 0.06  # the carrier's surface may lie this far above and below the foot
-_UP = 0.5  # z of the normal of what carries
-_ON_FLOOR_M = 0.05
-# A thing that hides the whole top of what carries it: that ends at the foot, and lies below it in plan.
-_TOP_BELOW_M, _TOP_ABOVE_M = 0.03, 0.02
-_COMMON_PLAN, _PLAN_STEPS = 0.5, 24  # of the smaller outline
+_REACH_M, _FAR_REACH_M = 0.05, 0.3  # around the foot, in plan; the second where the first finds no support
+_RISE_M, _DROP_M = 0.03, 0.06  # the support's surface may lie this far above and below the foot
+_UP = 0.5  # least z of the normals of a support surface
+_ON_FLOOR_M = 0.05  # a foot below this height stands on the floor
+# An object that hides the whole top of its support: the support ends near the foot, and their footprints overlap.
+_TOP_BELOW_M, _TOP_ABOVE_M = 0.03, 0.02  # the support's top may lie this far below and above the foot
+_COMMON_PLAN, _PLAN_STEPS = 0.5, 24  # overlap over the smaller footprint; grid points a side that measure it
 
 
 def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
-    """Return for each thing the row of the thing that it stands on, -1 for none (it stands on floor or hangs).
+    """Return the row of the object that supports each object, -1 for none (it stands on the floor, or hangs).
 
-    A thing is carried by what has most up-facing surface around and below its foot, if that begins lower than the
-    thing itself does; or by what ends right below it, where that surface is lower (a plate hides the top of the box
-    that it is on, and the table around both shows). Nothing carries itself, not even by way of others.
+    The support is the object with the most up-facing area around and below the foot, whose own foot is lower. An object
+    that ends right below the foot replaces it if it is in between: a plate hides the top of the box under it, while
+    the table around both is visible. Support has no cycles.
 
     Args:
         graph: the surface.
-        things: int (n,) vertices of each.
+        things: int (n,) vertices of each object.
     """
     bottoms = [float(np.percentile(graph.points[v, 2], 2)) for v in things]
     owner = np.full(len(graph.points), -1, np.int64)
@@ -39,7 +39,7 @@ def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
             other == row or bottoms[other] > bottoms[row] - 0.002 or _stands_on(out, other, row)
             for other in range(len(things))
         ]
-        for reach in (_REACH_M, _FAR_REACH_M):  # what it stands on may have a hole around it
+        for reach in (_REACH_M, _FAR_REACH_M):  # the support's surface may have a hole around the foot
             area = _area_below(graph, things[row], bottoms[row], tree, up, owner, len(things), reach)
             area[barred] = 0.0
             if area.max(initial=0.0) > 0:
@@ -56,7 +56,7 @@ def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
 def _hidden_carrier(
     graph: MeshGraph, things: list[np.ndarray], row: int, bottoms: list[float], barred: list[bool]
 ) -> int:
-    """Return the thing that ends right below a foot and has most of its outline in common with it, or -1."""
+    """Return the object that ends right below the foot of `row` and whose footprint overlaps most, or -1."""
     best, most = -1, _COMMON_PLAN
     for other, vertices in enumerate(things):
         if barred[other] or len(vertices) < 3:
@@ -70,7 +70,7 @@ def _hidden_carrier(
 
 
 def _common_plan(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the area that the convex outlines of points (n, 2) and (m, 2) have in common, of the smaller one."""
+    """Return the overlap of the convex hulls of points (n, 2) and (m, 2), as a share of the smaller hull's area."""
     low, high = np.maximum(first.min(0), second.min(0)), np.minimum(first.max(0), second.max(0))
     if (low >= high).any():
         return 0.0
@@ -98,7 +98,7 @@ def _area_below(
     graph: MeshGraph, vertices: np.ndarray, bottom: float, tree: cKDTree, up: np.ndarray, owner: np.ndarray, count: int,
     reach: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return the up-facing area (count,) of each thing around and just below the foot."""
+    """Return the up-facing area (count,) of each object around and just below the foot, less with distance in plan."""
     points = graph.points[vertices]
     foot = points[points[:, 2] < bottom + max(0.02, 0.15 * np.ptp(points[:, 2]))].copy()
     foot[:, 2] = bottom

@@ -1,30 +1,37 @@
-"""Containment: whether one thing lies in the hollow of another."""
+"""Containment: test whether one object lies in the hollow of another."""
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph
 
-_ENCLOSED = 0.9  # share of a piece that is within an outline
-_SLACK_M = 0.005
-_RIM_M, _AROUND_M = 0.15, 0.3  # a container's rim above the end of what is in it, and around that
-_DEEPER_M, _MIN_LOWER_M2 = 0.01, 2e-4
-_LEVEL, _LOWER_RATIO = 0.8, 2.0
-_SECTORS, _MIN_SECTORS = 8, 7  # directions around a thing, and how many of them meet the rim
+_ENCLOSED, _SLACK_M = 0.9, 0.005  # share of the vertices inside a footprint, up to this far outside of it
+_RIM_M, _AROUND_M = 0.15, 0.3  # largest height of the rim over the inner object's bottom, and its distance
+_DEEPER_M = 0.01  # inside the rim, and below the inner object's bottom
+_MIN_LOWER_M2, _LOWER_RATIO = 2e-4, 2.0  # least area below that bottom, and over the area level with it
+_LEVEL = 0.8  # least z of the normals of level surface
+_SECTORS, _MIN_SECTORS = 8, 7  # directions around the inner object, and how many of them must meet the rim
 
 
 def is_within(graph: MeshGraph, vertices: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether a piece lies within the convex outline of another one in plan."""
+    """Return whether the vertices lie within the convex footprint of the vertices `other`."""
     hull = cv2.convexHull(graph.points[other, :2].astype(np.float32))
     flat = graph.points[vertices[:: max(1, len(vertices) // 400)], :2]
     return float(np.mean(inset(hull, flat) > -_SLACK_M)) > _ENCLOSED
 
 
 def is_inside(graph: MeshGraph, container: np.ndarray, inner: np.ndarray, bottom: float) -> bool:
-    """Return whether a piece is in a hollow that goes on below what is seen of the piece, which ends at z = `bottom`.
+    """Return whether an object is in a hollow of a container that continues below the object's visible bottom.
 
-    A rim stands around it, nearly all around in plan, and within the rim more is seen lower than level with its end.
+    The container has a rim around the object in nearly all directions in plan, and inside the rim more up-facing area
+    below the height `bottom` than at it.
+
+    Args:
+        graph: the surface.
+        container: int (n,) vertices.
+        inner: int (m,) vertices of the object.
+        bottom: height at which the visible surface of the object ends, metres.
     """
     if not is_within(graph, inner, container):
         return False
@@ -49,14 +56,11 @@ def is_inside(graph: MeshGraph, container: np.ndarray, inner: np.ndarray, bottom
 
 
 def inset(outline: np.ndarray, points_xy: np.ndarray) -> np.ndarray:
-    """Return how far points are within an outline in plan, in meters; negative outside of it.
+    """Return the signed distances float64 (n,) of points (n, 2) to a polygon, positive inside.
 
     Args:
-        outline: float32 (k, 1, 2) or (k, 2) corners of a polygon in order, such as `cv2.convexHull` returns.
+        outline: float32 (k, 1, 2) or (k, 2) corners in order, such as `cv2.convexHull` returns.
         points_xy: (n, 2), rounded to float32 as the corners are.
-
-    Returns:
-        float64 (n,) distance to the nearest side.
     """
     points = np.asarray(points_xy, np.float64).tolist()
     return np.array([cv2.pointPolygonTest(outline, (x, y), True) for x, y in points], np.float64)

@@ -1,4 +1,4 @@
-"""What every way to cut a room into things starts from, and what it ends with."""
+"""Input and output that the two segmentation methods share: the surface graph with its base, and the objects."""
 
 from dataclasses import dataclass
 
@@ -18,13 +18,13 @@ class Shell:
 
     graph: MeshGraph
     planes: list[FittedPlane]  # the floor first, if it was seen
-    base: tuple[BaseEntity, ...]  # of each plane, and a floor that had to be assumed
+    base: tuple[BaseEntity, ...]  # one per plane, after an assumed floor if none was seen
     owner: np.ndarray  # int32 (v,) id of the base entity that a vertex lies on, 0 = none
     behind: np.ndarray  # bool (v,) below the floor or behind a wall
 
     @classmethod
     def of(cls, surface: Surface, progress: Progress) -> "Shell":
-        """Read the base off the surface's planes."""
+        """Build the graph and the base of a surface."""
         graph = MeshGraph.from_surface(surface)
         planes = base_planes(surface)
         base = base_entities(surface, progress)
@@ -37,17 +37,17 @@ class Shell:
 
 @dataclass
 class Thing:
-    """Surface of one thing; `rests_on` is the thing that carries it, None where the base does or it hangs."""
+    """The surface of one object, and what supports it."""
 
     vertices: np.ndarray  # int (n,) sorted
-    rests_on: "Thing | None" = None
-    attached: bool = False  # it hangs on a wall
+    rests_on: "Thing | None" = None  # the supporting object; None: on the floor, or attached
+    attached: bool = False  # to a wall
 
 
 @dataclass(frozen=True)
 class Cut:
-    """The separate things, and what is base; vertices of things are in `owner` too where they lie on a plane."""
+    """A segmentation: the objects, and the base entity of each vertex."""
 
     things: list[Thing]
-    owner: np.ndarray  # int32 (v,)
-    told: FrameMasks | None = None  # masks it was made by, with ids of the base, then of things
+    owner: np.ndarray  # int32 (v,) base entity, 0 = none; vertices of things may have one, too
+    labeled: FrameMasks | None = None  # its 2D masks, with ids of the base, then of `things` in their order

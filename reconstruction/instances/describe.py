@@ -1,4 +1,4 @@
-"""Things become objects: numbered by size, with boxes that reach what carries them, hints and coarse labels."""
+"""Object attributes: ids by size, boxes extended to the support, support hints and coarse labels."""
 
 import numpy as np
 
@@ -9,18 +9,19 @@ from reconstruction.instances.containment import is_inside
 from reconstruction.instances.cut import Thing
 from reconstruction.instances.labels import coarse_label, shape_facts
 
-_FLAT_SPREAD_M, _FLAT_REACH_M = 0.015, 0.03  # of a flat thing's surface: its noise, and the far end of that
-_LEAST_FRONT_M = 0.02
-_HIDDEN_M = 0.05  # of a thing may be hidden by what stands before its foot
+# Of flat wall-mounted objects: largest distance of the 20 and 80 % quantiles, and of the 98 % quantile, to the median.
+_FLAT_SPREAD_M, _FLAT_REACH_M = 0.015, 0.03
+_LEAST_FRONT_M = 0.02  # least depth of the box of a wall-mounted object
+_HIDDEN_M = 0.05  # a box is extended downwards by at most this much: an occluder may hide the object's foot
 _CONTAINER_FLOOR_M = 0.008  # thickness of the bottom of a bowl or a basket
-_FLAT = 0.5  # height over width of what is flat
-_COVERED, _RIM_M = 0.7, 0.02  # share of what carries a thing, and how far that may reach beyond the outline
+_FLAT = 0.5  # flat objects have less height than this times their width
+_COVERED, _RIM_M = 0.7, 0.02  # share of the support's area under a box, and the margin of that box
 
 
 def describe(
     graph: MeshGraph, things: list[Thing], base: tuple[BaseEntity, ...], vertex_instance: np.ndarray
 ) -> tuple[Instance, ...]:
-    """Number things by size, write their ids into `vertex_instance` and describe them."""
+    """Return the objects as instances, numbered by box volume; their ids are written into `vertex_instance` (v,)."""
     boxes = {id(t): upright_box(graph.points[t.vertices], graph.areas[t.vertices]) for t in things}
     order = sorted(things, key=lambda t: (-float(np.prod(boxes[id(t)].extents_m)), int(t.vertices[0])))
     number = {id(t): len(base) + 1 + i for i, t in enumerate(order)}
@@ -30,31 +31,23 @@ def describe(
         box = _box_on_support(graph, thing, boxes[id(thing)], base)
         carries = sum(1 for t in things if t.rests_on is thing)
         on_floor = not thing.attached and thing.rests_on is None and _stands_on_floor(graph, box)
-        label, confidence = coarse_label(
-            shape_facts(graph, thing.vertices, box, on_floor, thing.attached, carries)
-        )
+        facts = shape_facts(graph, thing.vertices, box, on_floor, thing.attached, carries)
+        label, confidence = coarse_label(facts)
         hint = number[id(thing.rests_on)] if thing.rests_on is not None else 1 if on_floor else 0
         if thing.attached:
             hint = _nearest_wall(graph, thing, base)
         out.append(
             Instance(
-                number[id(thing)],
-                label,
-                confidence,
-                box.center,
-                box.yaw_rad,
-                box.extents_m,
-                hint,
-                thing.attached,
+                number[id(thing)], label, confidence, box.center, box.yaw_rad, box.extents_m, hint, thing.attached,
             )
-        )
+        )  # fmt: skip
     return tuple(out)
 
 
 def _stands_on_floor(graph: MeshGraph, box: UprightBox) -> bool:
-    """Tell whether a thing that nothing carries stands on the floor, whose contact is hidden or was not measured.
+    """Return whether an object without support stands on the floor, with its contact occluded or not measured.
 
-    Something has to hold it: the floor, unless it is nearer to the highest point of the room, where it may hang.
+    It does unless its top is nearer to the highest point of the room than its bottom is to the floor: then it may hang.
     """
     bottom, top = box.center[2] + 0.5 * box.extents_m[2] * np.array([-1.0, 1.0])
     return bool(bottom <= graph.points[:, 2].max() - top)
@@ -72,7 +65,7 @@ def _nearest_wall(graph: MeshGraph, thing: Thing, base: tuple[BaseEntity, ...]) 
 def _box_on_support(
     graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[BaseEntity, ...]
 ) -> UprightBox:
-    """Let the box reach the surface that the thing rests on, whose contact no camera sees."""
+    """Extend the box to the support surface, since no camera sees the contact."""
     if thing.attached:
         return _box_to_wall(graph, thing, box, base)
     bottom = box.center[2] - 0.5 * box.extents_m[2]
@@ -83,14 +76,11 @@ def _box_on_support(
         return with_bottom(box, float(np.clip(floor, bottom - box.extents_m[2], bottom)))
     under = thing.rests_on.vertices
     flat = box.extents_m[2] < _FLAT * box.extents_m[:2].min()
-    if flat and _covers(
-        box, graph.points[under], graph.areas[under]
-    ):  # then it lies on the top, which it hides
+    if flat and _covers(box, graph.points[under], graph.areas[under]):  # it hides the top that it lies on
         top = quantiles(graph.points[under, 2], graph.areas[under], (0.95,))[0]
         return with_bottom(box, float(np.clip(top, bottom - _HIDDEN_M, bottom)))
-    near = (
-        np.abs(graph.points[under, :2] - box.center[:2]) < 0.5 * np.linalg.norm(box.extents_m[:2]) + 0.03
-    ).all(1)
+    radius = 0.5 * np.linalg.norm(box.extents_m[:2]) + 0.03
+    near = (np.abs(graph.points[under, :2] - box.center[:2]) < radius).all(1)
     carrying = under[near & (graph.normals[under, 2] > 0.7) & (graph.points[under, 2] < bottom + 0.02)]
     heights = graph.points[carrying, 2]
     heights = heights[heights > bottom - _HIDDEN_M]
@@ -100,10 +90,9 @@ def _box_on_support(
 
 
 def _covers(box: UprightBox, points: np.ndarray, areas: np.ndarray) -> bool:
-    """Tell whether most of the surface at points (n, 3) is below a box, within its outline."""
-    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
-    turned = np.abs((points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]]))
-    inside = (turned < 0.5 * box.extents_m[:2] + _RIM_M).all(axis=1) & (points[:, 2] < box.center[2])
+    """Return whether most of the surface at points (n, 3) is below a box and inside its footprint."""
+    offset = np.abs(box.plan_offsets(points))
+    inside = (offset < 0.5 * box.extents_m[:2] + _RIM_M).all(axis=1) & (points[:, 2] < box.center[2])
     return float(np.average(inside, weights=np.maximum(areas, 1e-12))) > _COVERED
 
 
@@ -114,7 +103,7 @@ def _bottom_of(graph: MeshGraph, thing: Thing, base: tuple[BaseEntity, ...]) -> 
 
 
 def _box_to_wall(graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[BaseEntity, ...]) -> UprightBox:
-    """Return a box parallel to the wall, from the wall to the front of the thing."""
+    """Return a box parallel to the nearest wall, from the wall to the front of the object."""
     wall = next((b for b in base if b.id == _nearest_wall(graph, thing, base)), None)
     if wall is None:
         return box
@@ -130,10 +119,9 @@ def _box_to_wall(graph: MeshGraph, thing: Thing, box: UprightBox, base: tuple[Ba
 
 
 def _front(distance: np.ndarray, areas: np.ndarray) -> float:
-    """Return how far a thing stands out from its wall, from its vertices' distances (n,) to it.
+    """Return how far an object stands out from its wall, from the distances (n,) of its vertices to the wall.
 
-    The surface of what is flat is as thick as its noise, of which the far end says nothing; what is not flat ends at
-    its far end.
+    This is the 98 % quantile; for flat objects, whose spread of distances is noise, the 80 % quantile.
     """
     low, middle, high, end = quantiles(distance, areas, (0.2, 0.5, 0.8, 0.98))
     flat = max(high - middle, middle - low) < _FLAT_SPREAD_M and end - middle < _FLAT_REACH_M

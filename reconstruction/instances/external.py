@@ -1,4 +1,4 @@
-"""What the stage reads besides its config and the stages before it: folders, and the endpoint's model."""
+"""Inputs of the stage besides its config and the earlier stages: folders of masks and weights, the endpoint's model."""
 
 import os
 from pathlib import Path
@@ -8,9 +8,9 @@ from reconstruction.instances.config import InstancesConfig
 
 
 def outside_inputs(config: InstancesConfig) -> tuple[str, ...]:
-    """Return what is behind the names in the config: other masks or weights in a folder must not reuse a result.
+    """Return digests of the folders that the config names, and the endpoint's model, for the cache key of the stage.
 
-    A model that is named as on the hub stands for itself.
+    Models on the hub are identified by their names in the config.
     """
     named = {
         "masks": config.masks_path if config.masks == "folder" else config.masks_model,
@@ -26,7 +26,7 @@ def outside_inputs(config: InstancesConfig) -> tuple[str, ...]:
 
 
 def backends(config: InstancesConfig) -> dict[str, str]:
-    """Say what made the masks and the labels, for the bundle."""
+    """Return the backends of masks and labels, with their models, for the bundle's report."""
     from reconstruction.instances.masks import DEFAULT_MODELS
     from reconstruction.instances.naming import DEFAULT_CLIP_MODEL
 

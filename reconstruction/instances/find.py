@@ -1,4 +1,4 @@
-"""The instances stage: base planes, the cut, boxes and labels, id maps, names."""
+"""The instances stage: base planes, segmentation, boxes and labels, id maps, names."""
 
 from dataclasses import replace
 
@@ -22,7 +22,10 @@ from reconstruction.instances.sightings import sightings
 def make_instances(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, config: InstancesConfig, *, progress: Progress
 ) -> InstanceSet:
-    """Find things and name them; see `find_instances` and `load_namer`, whose errors come before any work."""
+    """Segment the surface and name the objects; see `find_instances` and `load_namer`.
+
+    The namer is loaded first, so that its errors come before any work.
+    """
     namer = load_namer(config)
     found = find_instances(posed, depth, surface, config, progress=progress)
     return found if namer is None else name_instances(namer, found, posed, progress=progress)
@@ -31,22 +34,22 @@ def make_instances(
 def find_instances(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, config: InstancesConfig, *, progress: Progress
 ) -> InstanceSet:
-    """Cut the surface into base entities and separate things.
+    """Segment the surface into base entities and objects.
 
     Args:
         posed: keyframes with cameras in world space.
         depth: their depth in metres.
         surface: the fused surface in world space, floor at z = 0, walls roughly along the axes.
-        config: whose masks, and the least size of things.
-        progress: told of decisions: a floor that had to be assumed, an empty room.
-
-    Raises:
-        UsageError: a folder of masks does not fit the capture.
-        EnvironmentMissing: the learned masks asked for need something that is not here, or the weights of the
-            partition cannot be read.
+        config: the segmentation method, and the least size of objects.
+        progress: receives notes of decisions: an assumed floor, an empty room.
 
     Returns:
         The instances; ids count from 1, base entities first (floor, walls, ceiling), then objects by size.
+
+    Raises:
+        UsageError: a folder of masks does not fit the capture.
+        EnvironmentMissing: a package or weights of the mask model are missing, or the weights of the partition cannot
+            be read.
     """
     backend = load_mask_backend(config)
     masks = None if backend is None else backend.frame_masks(posed, depth, progress=progress)
@@ -62,17 +65,19 @@ def find_instances(
     objects = describe(shell.graph, cut.things, shell.base, vertex_instance)
     progress.advance()
     if not objects:
-        progress.note("No separate things were found: the scene is an empty room.")
-    told = None if cut.told is None else _with_numbers(cut.told, cut, len(shell.base), vertex_instance)
-    id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, told, progress=progress)
+        progress.note("No separate objects were found: the scene is an empty room.")
+    labeled = _with_instance_ids(cut, len(shell.base), vertex_instance)
+    id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, labeled, progress=progress)
     found = InstanceSet(vertex_instance, shell.base, objects, id_maps)
-    if told is not None:
-        asked = masks.resized(told.camera.width, told.camera.height)
-        found = add_outlined(found, asked, told, posed, depth, surface, config, progress)
+    if masks is not None and labeled is not None:
+        masks = masks.resized(labeled.camera.width, labeled.camera.height)
+        found = add_outlined(found, masks, labeled, posed, depth, surface, config, progress)
     return without_unseen(found, config, progress)
 
 
-def _with_numbers(told: FrameMasks, cut: Cut, base: int, vertex_instance: np.ndarray) -> FrameMasks:
-    """Return the masks with the numbers of things that `describe` gave, for ids in the order of the cut."""
+def _with_instance_ids(cut: Cut, base: int, vertex_instance: np.ndarray) -> FrameMasks | None:
+    """Return the labeled masks with the final ids of objects, which `describe` assigned by size."""
+    if cut.labeled is None:
+        return None
     numbers = [vertex_instance[thing.vertices[0]] for thing in cut.things]
-    return replace(told, ids=np.r_[np.arange(base + 1), numbers].astype(np.uint16)[told.ids])
+    return replace(cut.labeled, ids=np.r_[np.arange(base + 1), numbers].astype(np.uint16)[cut.labeled.ids])

@@ -1,23 +1,23 @@
-"""Which thing each Gaussian belongs to: that of the labeled surface nearest to it."""
+"""Instance ids of Gaussians, from the nearest labeled surface vertex."""
 
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from registry.errors import BundleError
 
 PROPERTY = "instance_id"
-_REACH_M = 0.05  # the surface is sampled up to this sparsely; farther away, a Gaussian belongs to nothing
+_REACH_M = 0.05  # largest distance to a vertex: the surface is sampled up to this sparsely
 
 
 def gaussian_instances(means: np.ndarray, vertices: np.ndarray, vertex_instance: np.ndarray) -> np.ndarray:
-    """Return the instance id int32 (g,) of each Gaussian, 0 where no labeled surface is near.
+    """Return the instance id int32 (g,) of each Gaussian, 0 where no labeled vertex is within 5 cm.
 
     Args:
         means: float (g, 3) centers in world space, metres.
-        vertices: float (v, 3) the fused surface in world space.
-        vertex_instance: int (v,) its ids, 0 = none.
+        vertices: float (v, 3) of the fused surface in world space.
+        vertex_instance: int (v,) ids of the vertices, 0 = none.
     """
     labeled = np.flatnonzero(np.asarray(vertex_instance) > 0)
     if len(labeled) == 0 or len(means) == 0:
@@ -31,10 +31,10 @@ def gaussian_instances(means: np.ndarray, vertices: np.ndarray, vertex_instance:
 
 
 def add_instances_to_ply(path: Path, instances: np.ndarray) -> None:
-    """Give each vertex of a binary little-endian 3DGS file of floats the integer property `instance_id`, the last one.
+    """Append the integer property `instance_id` to each Gaussian of a binary little-endian PLY of floats, in place.
 
     Raises:
-        BundleError: the file holds another number of Gaussians, or other properties than floats.
+        BundleError: the file holds another number of Gaussians, or properties that are not floats.
     """
     header, _, data = path.read_bytes().partition(b"end_header\n")
     floats = header.count(b"property float ")

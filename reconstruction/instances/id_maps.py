@@ -1,4 +1,4 @@
-"""Which instance each pixel of each keyframe shows: the labeled surface drawn, its borders moved to image edges."""
+"""Id maps of keyframes: render the labeled surface, then move the borders to image edges."""
 
 from dataclasses import replace
 from functools import partial
@@ -8,7 +8,9 @@ import numpy as np
 
 from reconstruction.core.mesh_graph import lab_from_rgb
 from reconstruction.core.progress import Progress
+from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera, DepthMaps, InstanceSet, PosedFrames, Surface
+from reconstruction.instances._pixel_kernels import snap_borders
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.mask_propagation import MaskPropagation
 from reconstruction.instances.masks.base import FrameMasks
@@ -16,25 +18,22 @@ from reconstruction.poses.parallel import ordered_map
 
 
 def render_id_maps(
-    posed: PosedFrames,
-    depth: DepthMaps,
-    surface: Surface,
-    vertex_instance: np.ndarray,
-    config: InstancesConfig,
-    told: FrameMasks | None = None,
-    *,
-    progress: Progress,
-) -> np.ndarray:
-    """Return uint16 (n, h, w) ids per keyframe at depth resolution, as masks with ids `told` them, if there are any."""
+    posed: PosedFrames, depth: DepthMaps, surface: Surface, vertex_instance: np.ndarray, config: InstancesConfig,
+    labeled: FrameMasks | None = None, *, progress: Progress,
+) -> np.ndarray:  # fmt: skip
+    """Return the instance id of each pixel of each keyframe, uint16 (n, h, w) at depth resolution.
+
+    Where masks with instance ids (`labeled`) are given, they take precedence over the rendered surface.
+    """
     camera = depth.camera
-    asked = None if told is None else MaskPropagation(told, surface)
+    propagation = None if labeled is None else MaskPropagation(labeled, surface)
     maps = np.zeros((len(posed.images), camera.height, camera.width), np.uint16)
     progress.start(len(maps), "instance maps")
-    # Frames are drawn ahead on all cores; the kernels after that use all of them by themselves.
-    drawn = ordered_map(partial(draw_ids, surface, vertex_instance, posed, depth), range(len(maps)))
-    for row, ids in enumerate(drawn):
+    # Frames are rendered ahead, one per core; the kernels after that are parallel themselves.
+    rendered = ordered_map(partial(draw_ids, surface, vertex_instance, posed, depth), range(len(maps)))
+    for row, ids in enumerate(rendered):
         ids = snapped_ids(ids, posed, depth, row, config)
-        maps[row] = ids if asked is None else cv2.medianBlur(asked.ids(ids, posed, depth, row), 3)
+        maps[row] = ids if propagation is None else cv2.medianBlur(propagation.ids(ids, posed, depth, row), 3)
         progress.advance()
     return maps
 
@@ -42,9 +41,7 @@ def render_id_maps(
 def seen_vertices(
     surface: Surface, camera: Camera, world_from_camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the surface vertex that each pixel shows, int32 (h, w), -1 = none, and its z-depth, float32 (h, w)."""
-    from reconstruction.core.rasterize import rasterize_mesh
-
+    """Render a surface; return the vertex at each pixel, int32 (h, w), -1 = none, and z-depth, float32 (h, w)."""
     raster = rasterize_mesh(surface.vertices, surface.faces, camera, world_from_camera)
     out = np.full(raster.face.shape, -1, np.int32)
     hit = raster.face >= 0
@@ -56,10 +53,10 @@ def seen_vertices(
 def draw_ids(
     surface: Surface, vertex_instance: np.ndarray, posed: PosedFrames, depth: DepthMaps, row: int
 ) -> np.ndarray:
-    """Return uint16 (h, w): the id of the surface that each pixel of a keyframe shows, borders as drawn."""
+    """Return the ids uint16 (h, w) of the surface rendered into a keyframe."""
     seen, drawn = seen_vertices(surface, depth.camera, np.asarray(posed.world_from_camera[row]))
     measured = _measured(depth, row)
-    # Where the measured depth is far in front of the drawn surface, something unmodelled is seen: no id.
+    # Measured depth far in front of the rendered surface: an occluder that is not modeled, which has no id.
     contradicted = (measured > 0) & (measured < 0.9 * drawn)
     shown = (seen >= 0) & ~contradicted
     ids = np.zeros(seen.shape, np.uint16)
@@ -70,11 +67,9 @@ def draw_ids(
 def snapped_ids(
     ids: np.ndarray, posed: PosedFrames, depth: DepthMaps, row: int, config: InstancesConfig
 ) -> np.ndarray:
-    """Return the drawn ids (h, w) of a keyframe, their borders moved to edges of its image and its depth."""
+    """Return the rendered ids (h, w) of a keyframe with their borders moved to edges of its image and depth map."""
     if config.snap_radius_px <= 0:
         return ids
-    from reconstruction.instances._pixel_kernels import snap_borders
-
     radius = config.snap_radius_px
     kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
     signed = ids.astype(np.float32)
@@ -89,7 +84,10 @@ def _measured(depth: DepthMaps, row: int) -> np.ndarray:
 
 
 def without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progress) -> InstanceSet:
-    """Return the instances without objects that cover less of every id map than the config asks for."""
+    """Return the instances without objects that cover less than `min_object_image_share` of every id map.
+
+    Objects on top of a removed one rest on what supported that.
+    """
     count = max((o.id for o in found.objects), default=0) + 1
     best = np.zeros(count, np.int64)
     for id_map in found.id_maps:
@@ -99,9 +97,9 @@ def without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progre
     gone = {o.id: o.support_hint for o in found.objects if best[o.id] < fewest}
     if not gone:
         return found
-    progress.note(f"{len(gone)} scraps that show in no keyframe are not kept as things")
+    progress.note(f"{len(gone)} objects are dropped: they cover too few pixels of every keyframe")
 
-    def carrier(hint: int) -> int:
+    def support(hint: int) -> int:
         while hint in gone:
             hint = gone[hint]
         return hint
@@ -110,6 +108,6 @@ def without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progre
     return InstanceSet(
         np.where(np.isin(found.vertex_instance, erased), 0, found.vertex_instance).astype(np.int32),
         found.base,
-        tuple(replace(o, support_hint=carrier(o.support_hint)) for o in found.objects if o.id not in gone),
+        tuple(replace(o, support_hint=support(o.support_hint)) for o in found.objects if o.id not in gone),
         np.where(np.isin(found.id_maps, erased), 0, found.id_maps).astype(np.uint16),
     )

@@ -1,6 +1,6 @@
-"""Coarse labels from size, shape, place and support; honest about how little that says.
+"""Coarse labels by rules on size, shape, place and support.
 
-Confidences are what the rules were right in, in generated rooms (docs/instances.md, `python -m benchmarks.labels`).
+Confidences stay below the accuracy of the rules in generated rooms (docs/instances.md, `python -m benchmarks.labels`).
 """
 
 from dataclasses import dataclass
@@ -12,67 +12,54 @@ from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.instances.boxes import UprightBox
 
 UNKNOWN = ("unknown", 0.0)
+_LEVEL_M = 0.04  # height of the bins in which horizontal surfaces are counted
 
 
 @dataclass(frozen=True)
 class ShapeFacts:
-    """What a label is guessed from."""
+    """Measurements of an object that the label rules read."""
 
     extents_m: np.ndarray  # float64 (3,) of the upright box
     on_floor: bool
-    attached: bool
-    carries: int  # how many things rest on it
-    flat_top_share: float  # up-facing area near its top, over its ground plan
-    levels: int  # number of large horizontal regions at different heights
-    hollow: bool  # seen from above its middle is lower than its rim
-    squareness: float  # 1: its sides face two directions at right angles; 0: they face all around
-    outward: float  # 1: its sides face away from its middle; 0: they also face inwards, as in a shelf
-    side_share: float  # area of upright surface over all area
-    fill: float  # outline from above (of what hangs: from the front) over its bounding rectangle
+    attached: bool  # to a wall
+    carries: int  # number of objects that rest on it
+    flat_top_share: float  # up-facing area near the top, over the footprint of the box
+    levels: int  # number of large horizontal surfaces at different heights
+    hollow: bool  # the up-facing surface in the middle is lower than the top
+    squareness: float  # 1: the sides face two directions at right angles; 0: they face all around
+    outward: float  # 1: the sides face away from the center; 0: they also face inwards, as in a shelf
+    side_share: float  # vertical area over all area
+    fill: float  # area of the footprint (attached: of the outline from the front) over its bounding rectangle
     greenness: float  # share of green vertices
 
 
 def shape_facts(
     graph: MeshGraph, vertices: np.ndarray, box: UprightBox, on_floor: bool, attached: bool, carries: int
 ) -> ShapeFacts:
-    """Measure what labels are guessed from."""
+    """Measure an object: the vertices int (n,), their box, and what is known of its support."""
     points, normals, areas = graph.points[vertices], graph.normals[vertices], graph.areas[vertices]
     plan = float(np.prod(box.extents_m[:2]))
     top = box.center[2] + 0.5 * box.extents_m[2]
     up = normals[:, 2] > 0.8
     near_top = up & (points[:, 2] > top - max(0.03, 0.12 * box.extents_m[2]))
     heights = points[up, 2]
-    step = 0.04
-    levels = (
-        np.histogram(heights, np.arange(0, top + 2 * step, step), weights=areas[up])[0]
-        if up.any()
-        else np.zeros(1)
-    )
-    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
-    local = np.abs((points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]])) / (0.5 * box.extents_m[:2])
+    bins = np.arange(0, top + 2 * _LEVEL_M, _LEVEL_M)
+    levels = np.histogram(heights, bins, weights=areas[up])[0] if up.any() else np.zeros(1)
+    local = np.abs(box.plan_offsets(points)) / (0.5 * box.extents_m[:2])
     middle = (local.max(axis=1) < 0.45) & up
     hollow = bool(middle.any() and np.median(points[middle, 2]) < top - max(0.015, 0.3 * box.extents_m[2]))
     lab = graph.lab[vertices]
     green = (lab[:, 1] < -8) & (lab[:, 2] > 5)
     squareness, outward, side_share = _sides(points[:, :2] - box.center[:2], normals, areas)
     return ShapeFacts(
-        box.extents_m,
-        on_floor,
-        attached,
-        carries,
-        float(areas[near_top].sum()) / max(plan, 1e-9),
-        int((levels > 0.25 * plan).sum()),
-        hollow,
-        squareness,
-        outward,
-        side_share,
-        _fill(points, box, attached),
+        box.extents_m, on_floor, attached, carries, float(areas[near_top].sum()) / max(plan, 1e-9),
+        int((levels > 0.25 * plan).sum()), hollow, squareness, outward, side_share, _fill(points, box, attached),
         float(green.mean()),
-    )
+    )  # fmt: skip
 
 
 def _sides(flat: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> tuple[float, float, float]:
-    """Return squareness, outwardness and share of the upright part of points (n, 2) around a middle."""
+    """Return squareness, outwardness and area share of the vertical surface, of points (n, 2) around the center."""
     upright = np.abs(normals[:, 2]) < 0.5
     total = float(areas[upright].sum())
     if total <= 0:
@@ -86,17 +73,15 @@ def _sides(flat: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> tuple[fl
 
 
 def _fill(points: np.ndarray, box: UprightBox, attached: bool) -> float:
-    c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
-    local = (points[:, :2] - box.center[:2]) @ np.array([[c, -s], [s, c]])
-    outline = (
-        np.column_stack([local[:, int(np.argmax(box.extents_m[:2]))], points[:, 2]]) if attached else local
-    )
+    outline = box.plan_offsets(points)
+    if attached:
+        outline = np.column_stack([outline[:, int(np.argmax(box.extents_m[:2]))], points[:, 2]])
     hull = cv2.convexHull(outline.astype(np.float32))
     return float(cv2.contourArea(hull)) / max(float(np.prod(np.ptp(outline, axis=0))), 1e-9)
 
 
 def coarse_label(facts: ShapeFacts) -> tuple[str, float]:
-    """Return (label, confidence); an unknown thing has confidence 0."""
+    """Return label and confidence; ("unknown", 0) where no rule applies."""
     width, depth = sorted(facts.extents_m[:2], reverse=True)[:2]
     height = float(facts.extents_m[2])
     if facts.attached:
@@ -166,5 +151,5 @@ def _square_thing(width: float, depth: float, height: float, facts: ShapeFacts) 
     if height < 0.07 and width > 0.13 and facts.flat_top_share > 0.4:
         return "book", 0.3
     if height < 0.04 or facts.side_share < 0.1 or facts.outward < 0:
-        return UNKNOWN  # too little of it was seen to have a shape
+        return UNKNOWN  # too little was observed to tell the shape
     return "box", 0.5

@@ -1,4 +1,4 @@
-"""From 2D masks of any origin to things on the surface: which cluster of masks each vertex belongs to."""
+"""Lifting of 2D masks: merge masks across views, then assign each surface vertex to a cluster of masks by vote."""
 
 from dataclasses import dataclass
 
@@ -13,18 +13,17 @@ from reconstruction.instances.lifting_views import MaskViews, view_masks
 from reconstruction.instances.masks.base import FrameMasks
 from reconstruction.instances.superpoints import superpoints
 
-_MIN_VOTES_SHARE = 0.34  # of the frames that see a vertex must put it into the cluster that it goes to
+_MIN_VOTES_SHARE = 0.34  # of the frames that see a vertex must vote for its cluster
 
 
 @dataclass(frozen=True)
 class Lifted:
-    """Masks merged across views, and the surface divided among them."""
+    """Clusters of masks, and the cluster of each vertex."""
 
-    cluster: np.ndarray  # int32 (v,) from 1 on; 0 = in no mask, or never seen in one
-    share: np.ndarray  # float32 (v,) of the frames that see the vertex in some mask and agree with that
+    cluster: np.ndarray  # int32 (v,) from 1 on, 0 = in no mask
+    share: np.ndarray  # float32 (v,) share of the frames with the vertex in a mask that vote for its cluster
     views: MaskViews
-    mask_cluster: np.ndarray  # int32 (m + 1,) cluster of each mask
-    patches: np.ndarray  # int32 (v,) superpoints
+    mask_cluster: np.ndarray  # int32 (m + 1,) cluster of each mask, 0 = none
 
     @property
     def count(self) -> int:
@@ -40,45 +39,29 @@ def lift_masks(
     masks: FrameMasks,
     progress: Progress,
 ) -> Lifted:
-    """Merge masks across views and let every frame vote for every vertex that it sees.
-
-    Args:
-        graph: the surface in world space, in metres.
-        surface: what the graph is of.
-        posed: keyframes.
-        depth: their depth.
-        masks: id images of posed frames; ids of two frames are unrelated.
-        progress: told of every frame.
-    """
+    """Cluster masks across views; each frame votes for the cluster of every vertex of `graph` that it sees."""
     patches = superpoints(graph)
     views = view_masks(graph, surface, posed, depth, masks, progress)
     mask_cluster = cluster_masks(views, patches, graph.areas)
     cluster, votes, seen = vote(np.ascontiguousarray(views.seen.T), mask_cluster)
     share = (votes / np.maximum(seen, 1)).astype(np.float32)
     cluster = np.where(share >= _MIN_VOTES_SHARE, cluster, 0).astype(np.int32)
-    cluster = _fill_unseen(cluster, seen, patches, graph.areas)
-    return Lifted(cluster, share, views, mask_cluster, patches)
+    return Lifted(_fill_unseen(cluster, seen, patches, graph.areas), share, views, mask_cluster)
 
 
 @njit(cache=True, parallel=True)
 def vote(seen, mask_cluster):  # pragma: no cover - compiled
-    """Count votes: the cluster that most frames see at each vertex, how many do, and how many see any.
-
-    Frames whose mask is under-segmented there say nothing.
+    """Count the votes of frames at each vertex; masks without a cluster (under-segmented ones) do not vote.
 
     Args:
-        seen: int32 (v, n) mask in each frame, 0 = none, -1 = not seen.
+        seen: int32 (v, n) mask in each frame, 0 = none, -1 = not visible.
         mask_cluster: int32 (m + 1,) cluster of each mask, 0 = none.
 
     Returns:
-        int32 (v,) each; of two clusters with equal votes the first one.
+        Winning cluster (the lower number on a tie), its votes, and all votes, int32 (v,) each.
     """
     count, frames = seen.shape
-    winner, votes, total = (
-        np.zeros(count, np.int32),
-        np.zeros(count, np.int32),
-        np.zeros(count, np.int32),
-    )
+    winner, votes, total = np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros(count, np.int32)
     for i in prange(count):
         names = np.zeros(frames, np.int32)
         tally = np.zeros(frames, np.int32)
@@ -105,15 +88,11 @@ def vote(seen, mask_cluster):  # pragma: no cover - compiled
 
 
 def _fill_unseen(cluster: np.ndarray, seen: np.ndarray, patches: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Give vertices that no frame shows in a mask to the cluster that most of their superpoint belongs to."""
-    patch_count = int(patches.max(initial=-1)) + 1
-    known = cluster > 0
-    keys = patches[known].astype(np.int64) * (int(cluster.max(initial=0)) + 1) + cluster[known]
-    unique, inverse = np.unique(keys, return_inverse=True)
-    weight = np.bincount(inverse.reshape(-1), weights=areas[known], minlength=len(unique))
-    owner = np.zeros(patch_count, np.int32)
-    order = np.argsort(weight, kind="stable")  # the heaviest is written last
-    owner[unique[order] // (int(cluster.max(initial=0)) + 1)] = unique[order] % (
-        int(cluster.max(initial=0)) + 1
-    )
+    """Assign vertices without votes to the cluster with the most area in their superpoint."""
+    known, count = cluster > 0, int(cluster.max(initial=0)) + 1
+    keys, inverse = np.unique(patches[known].astype(np.int64) * count + cluster[known], return_inverse=True)
+    weight = np.bincount(inverse.reshape(-1), weights=areas[known], minlength=len(keys))
+    owner = np.zeros(int(patches.max(initial=-1)) + 1, np.int32)
+    keys = keys[np.argsort(weight, kind="stable")]  # ascending: the cluster with the most area wins
+    owner[keys // count] = keys % count
     return np.where((seen == 0) & ~known, owner[patches], cluster).astype(np.int32)

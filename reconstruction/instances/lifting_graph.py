@@ -1,8 +1,8 @@
-"""Masks of one thing found by their agreement across views, whatever their ids.
+"""Clustering of masks by view consensus, after MaskClustering (CVPR 2024).
 
-After view-consensus clustering (MaskClustering, CVPR 2024). Two masks show one thing if the other frames that see
-both of them put both into one mask. A mask that other frames split is under-segmented and has no say. Clusters grow
-from pairs that many frames witness to pairs that few do; a cluster is witnessed by whatever witnesses its masks.
+Two masks are of one object if most frames that observe both contain both in one mask. Masks that other frames split are
+under-segmented and are left out. Clusters grow iteratively, from pairs with many observing frames to pairs with few; a
+cluster has the observers of all its masks.
 """
 
 from dataclasses import dataclass
@@ -13,33 +13,33 @@ from scipy.sparse.csgraph import connected_components
 
 from reconstruction.instances.lifting_views import MaskViews
 
-_VISIBLE_SHARE = 0.3  # of a mask's surface must be seen in a frame for the frame to judge it
-_CONTAINED_SHARE = 0.8  # of what is seen of it must lie in one mask there
-_SPLIT_SHARE = 0.3  # of the frames that judge a mask may split it
-_CONSENSUS = 0.9
-_CHUNK = 200_000  # pairs at once
-_PURE_SHARE = 0.6  # of a superpoint's seen surface must lie in one mask
+_VISIBLE_SHARE = 0.3  # a frame observes a mask, or a superpoint, if it sees more than this share of its area
+_CONTAINED_SHARE = 0.8  # of the visible area of a mask must lie in one mask of the observing frame
+_SPLIT_SHARE = 0.3  # at most this share of the observing frames may split a mask
+_CONSENSUS = 0.9  # of the observers of two masks must contain both in one mask
+_CHUNK = 200_000  # pairs at once, which bounds the memory
+_PURE_SHARE = 0.6  # of a superpoint's visible area must lie in one mask
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What the frames say of each mask (rows: masks, without the entry for no mask)."""
+    """Relations of m masks and n frames; rows are mask numbers less 1."""
 
-    judged: csr_matrix  # (m, n) 1 where a frame sees a mask and puts it into one mask of its own
+    judged: csr_matrix  # (m, n) 1 where a frame observes a mask and contains it in one mask of its own
     contained: csr_matrix  # (m, m) 1 where a mask lies within another
     whole: np.ndarray  # bool (m,) not under-segmented
 
 
 def cluster_masks(views: MaskViews, patches: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Group the masks.
+    """Cluster the masks of all frames.
 
     Args:
-        views: which mask shows each vertex in each frame.
+        views: the mask of each vertex in each frame.
         patches: int (v,) superpoint of each vertex.
-        areas: float (v,) surface of each vertex.
+        areas: float (v,) area of each vertex.
 
     Returns:
-        int32 (m + 1,) cluster of each mask from 1 on, by its first mask; 0 for none and for under-segmented masks.
+        Cluster of each mask int32 (m + 1,), from 1 by first mask; 0 for no mask and for under-segmented masks.
     """
     out = np.zeros(views.mask_count + 1, np.int32)
     if views.mask_count == 0:
@@ -57,7 +57,7 @@ def cluster_masks(views: MaskViews, patches: np.ndarray, areas: np.ndarray) -> n
 
 
 def patch_masks(views: MaskViews, patches: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Return the mask int32 (n, s) of each superpoint in each frame; 0 = in none or torn, -1 = hardly seen."""
+    """Return the mask int32 (n, s) of each superpoint in each frame; 0 = in none or in several, -1 = hardly visible."""
     count = int(patches.max()) + 1
     total = np.bincount(patches, weights=areas, minlength=count)
     out = np.full((len(views.seen), count), -1, np.int32)
@@ -76,7 +76,13 @@ def patch_masks(views: MaskViews, patches: np.ndarray, areas: np.ndarray) -> np.
 
 
 def agree(views: MaskViews, mask_of_patch: np.ndarray, patch_area: np.ndarray) -> Agreement:
-    """Find which frames judge which masks, and which masks lie within which."""
+    """Return which frames observe which masks, and which masks lie within which.
+
+    Args:
+        views: the masks of all frames.
+        mask_of_patch: int (n, s) as `patch_masks` returns it.
+        patch_area: float (s,) area of each superpoint.
+    """
     frames, patch = np.nonzero(mask_of_patch > 0)
     mask = mask_of_patch[frames, patch] - 1
     count, frame_count = views.mask_count, len(views.seen)
@@ -88,13 +94,12 @@ def agree(views: MaskViews, mask_of_patch: np.ndarray, patch_area: np.ndarray) -
     sees = (visible > _VISIBLE_SHARE * size[:, None]) & (size[:, None] > 0)
     shared = (weighted @ member.T).tocoo()
     frame_of = views.mask_frame[1:]
-    within = (shared.data > _CONTAINED_SHARE * visible[shared.row, frame_of[shared.col]]) & sees[
-        shared.row, frame_of[shared.col]
-    ]
+    seen = shared.row, frame_of[shared.col]
+    within = (shared.data > _CONTAINED_SHARE * visible[seen]) & sees[seen]
     row, column = shared.row[within], shared.col[within]
     kept_whole = np.bincount(row, minlength=count)
     whole = (kept_whole > 0) & (sees.sum(axis=1) - kept_whole <= _SPLIT_SHARE * sees.sum(axis=1))
-    # A frame whose mask is under-segmented there says nothing of what lies within that mask.
+    # Containment in an under-segmented mask is no evidence.
     told = whole[column]
     row, column = row[told], column[told]
     one = np.ones(len(row))
@@ -106,15 +111,14 @@ def agree(views: MaskViews, mask_of_patch: np.ndarray, patch_area: np.ndarray) -
 
 
 def _grown(agreement: Agreement, chosen: np.ndarray) -> np.ndarray:
-    """Return a label for each chosen mask: merged round by round, with ever fewer witnesses asked for."""
+    """Return a label for each chosen mask: clusters are merged with a falling least number of observers."""
     label = np.arange(len(chosen))
     judged, contained = agreement.judged[chosen], agreement.contained[chosen]
     for least in _schedule(judged, contained):
         while True:
             count = int(label.max()) + 1
-            gather = csr_matrix(
-                (np.ones(len(label)), (label, np.arange(len(label)))), shape=(count, len(label))
-            )
+            members = (np.ones(len(label)), (label, np.arange(len(label))))
+            gather = csr_matrix(members, shape=(count, len(label)))
             pairs, agreed, observers = _witnesses((gather @ judged).sign(), (gather @ contained).sign())
             good = (observers >= least) & (agreed >= _CONSENSUS * observers)
             links = csr_matrix((np.ones(good.sum()), pairs[:, good]), shape=(count, count))
@@ -126,9 +130,9 @@ def _grown(agreement: Agreement, chosen: np.ndarray) -> np.ndarray:
 
 
 def _witnesses(judged: csr_matrix, contained: csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pairs int (2, p) of rows that lie in one mask anywhere, in how many, and how many frames judge both.
+    """Return pairs int (2, p) of rows that share a mask, the number of shared masks, and of frames that observe both.
 
-    All other pairs have nothing in common, and there are far too many of them.
+    Pairs without a shared mask never merge and are left out.
     """
     shared = triu(contained @ contained.T, 1).tocoo()
     pairs = np.stack([shared.row, shared.col])
@@ -141,7 +145,7 @@ def _witnesses(judged: csr_matrix, contained: csr_matrix) -> tuple[np.ndarray, n
 
 
 def _schedule(judged: csr_matrix, contained: csr_matrix) -> list[int]:
-    """Return falling numbers of witnesses: quantiles of what pairs of masks have, the last one 1."""
+    """Return falling least numbers of observers: quantiles over pairs of masks, the last one 1."""
     counts = _witnesses(judged, contained)[2]
     if len(counts) == 0:
         return [1]

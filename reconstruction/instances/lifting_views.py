@@ -1,4 +1,4 @@
-"""Which mask shows each vertex of the surface in each frame."""
+"""Projection of the surface into frames with masks: the mask of each vertex in each frame."""
 
 from dataclasses import dataclass
 
@@ -13,26 +13,26 @@ from reconstruction.instances.masks.base import FrameMasks
 from registry.geometry import invert_rigid
 
 UNSEEN = -1
-_MAX_SIDE_PX = 960
-_FACING = -0.2  # least cosine between normal and view ray; noise turns the normals of thin things
-_DEPTH_SLACK = 0.012  # of depth: a vertex this far behind what is drawn there is seen all the same
-_MIN_MASK_SHARE = 5e-5  # of the image; smaller masks are specks
-_WITNESSES = 3  # keyframes nearest to a frame, whose depth says whether a line of sight is clear
-_TURN_M = 0.5  # a turn by one radian sets two views as far apart as a step of this length
-_AGREES = 0.03  # of depth: measured depth this near to a vertex confirms it
+_MAX_SIDE_PX = 960  # masks are reduced to this size
+_FACING = -0.2  # least cosine between normal and view ray, below 0 since normals of thin objects are noisy
+_DEPTH_SLACK = 0.012  # of the depth: a vertex this far behind the rendered surface counts as visible
+_MIN_MASK_SHARE = 5e-5  # of the image; smaller masks are ignored
+_WITNESSES = 3  # keyframes nearest to a frame whose measured depth confirms vertices
+_TURN_M = 0.5  # translation in metres that counts like a rotation by one radian in the distance of two views
+_AGREES = 0.03  # of the depth: measured depth within this of a vertex confirms it
 
 
 @dataclass(frozen=True)
 class MaskViews:
-    """The surface as the masks' frames see it. Masks are numbered from 1 through all frames."""
+    """The mask of each vertex in each frame. Masks are numbered from 1 through all frames; 0 stands for no mask."""
 
-    seen: np.ndarray  # int32 (n, v): mask that shows a vertex in a frame, 0 = in no mask, -1 = not seen
-    mask_frame: np.ndarray  # int32 (m + 1,) row of the frame that each mask is of; entry 0 stands for no mask
-    mask_id: np.ndarray  # int32 (m + 1,) its id in that frame's id image
+    seen: np.ndarray  # int32 (n, v) mask number, 0 = in no mask, -1 = not visible
+    mask_frame: np.ndarray  # int32 (m + 1,) row of the frame of each mask; entry 0 stands for no mask
+    mask_id: np.ndarray  # int32 (m + 1,) id in that frame's id image
 
     @property
     def mask_count(self) -> int:
-        """Return how many masks there are."""
+        """Return the number of masks m."""
         return len(self.mask_frame) - 1
 
 
@@ -44,18 +44,10 @@ def view_masks(
     masks: FrameMasks,
     progress: Progress,
 ) -> MaskViews:
-    """Project the surface into every frame of the masks.
+    """Project the vertices of `graph`, in world space, into every frame that has masks.
 
-    What is hidden or turned away is not seen there, nor is what only shows through a hole in the surface: one of the
-    nearest keyframes must have measured depth where the vertex lies.
-
-    Args:
-        graph: the surface as a graph.
-        surface: the surface, in world space.
-        posed: keyframes.
-        depth: their depth in metres.
-        masks: id images of some frames.
-        progress: told of every frame.
+    A vertex is visible if it is not occluded, does not face away, and one of the nearest keyframes has measured its
+    depth. The last condition excludes surface that is only visible through a hole in the mesh.
     """
     masks = _at_working_size(masks)
     camera = masks.camera
@@ -88,9 +80,9 @@ def view_masks(
 
 
 def nearest_views(pose: np.ndarray, others: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows of the poses (n, 4, 4) whose place and direction are most like those of `pose`, and how far they are.
+    """Return rows of the poses (n, 4, 4) nearest to `pose`, at most `most`, and their distances.
 
-    The distance is in metres; turns count as steps do.
+    The distance is the translation in metres plus 0.5 m per radian between the viewing directions.
     """
     step = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1)
     turn = np.arccos(np.clip(others[:, :3, 2] @ pose[:3, 2], -1.0, 1.0))
@@ -106,7 +98,7 @@ def _at_working_size(masks: FrameMasks) -> FrameMasks:
 
 
 def _numbered(ids: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ids of one frame that are masks, and a table int32 from id to mask number (0: none)."""
+    """Return the ids of one frame that are large enough, and a table int32 from id to mask number, 0 = none."""
     counts = np.bincount(ids.ravel())
     counts[0] = 0
     numbers = np.flatnonzero(counts >= max(1, _MIN_MASK_SHARE * ids.size))
@@ -117,7 +109,7 @@ def _numbered(ids: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True, inline="always")
 def project(point, camera_from_world, fx, fy, cx, cy):  # pragma: no cover - compiled
-    """Return a point's pixel (u, v) and z-depth; depth 0 where it is behind the camera or too near."""
+    """Return the pixel (u, v) and z-depth of a point; depth 0 where it is nearer than 5 cm or behind the camera."""
     m = camera_from_world
     x, y, z = point
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
@@ -132,7 +124,7 @@ def project(point, camera_from_world, fx, fy, cx, cy):  # pragma: no cover - com
 def _confirm(
     points, camera_from_world, fx, fy, cx, cy, measured, agrees, confirmed
 ):  # pragma: no cover - compiled
-    """Set `confirmed` for vertices at which a keyframe measured depth."""
+    """Set `confirmed` for vertices whose depth a keyframe measured."""
     height, width = measured.shape
     for i in range(points.shape[0]):
         if confirmed[i]:
@@ -147,7 +139,7 @@ def _confirm(
 def _look_up(
     points, normals, camera_from_world, eye, fx, fy, cx, cy, drawn, mask, confirmed, slack, facing, out
 ):  # pragma: no cover - compiled
-    """Write the mask at each vertex that is seen into `out`."""
+    """Write the mask of each visible vertex into `out`."""
     height, width = drawn.shape
     for i in range(points.shape[0]):
         if not confirmed[i]:

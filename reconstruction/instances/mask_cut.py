@@ -1,9 +1,9 @@
-"""The cut by masks: clusters of masks become base or things, cleaned of what clings to them."""
+"""Segmentation by 2D masks: lift them onto the surface, classify clusters as base or objects, and clean these up."""
 
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph, pieces
 from reconstruction.core.progress import Progress
@@ -15,33 +15,28 @@ from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.lifting import Lifted, lift_masks
 from reconstruction.instances.masks.base import FrameMasks
 
-# Of the frames that see a vertex, so many must see one thing there: skirts and floaters are seen against this or that.
-_SURE_SHARE = 0.65
-_BRIDGE_M = 0.03
-# Pieces apart from the largest one of a thing: below this share of it they need several frames that agree,
-_FRAGMENT_SHARE, _FRAGMENT_FRAMES, _FRAGMENT_AGREED = 0.1, 2.0, 0.8
-_CRUMB_SHARE = 0.005  # and below this nothing helps.
-_SKIRT_RISE_M, _SKIRT_REACH_M = 0.01, 0.03  # above the foot of a thing, and around it
-_BARE_SHARE, _BARE_REACH_M = 0.08, 0.15  # what has less of its surface above the foot is bare around it
-_LEAST_AREA_SHARE = 0.5  # masks vouch for smaller things than shape alone does
-_FLAT_SHARE = 0.5  # of a cluster's surface on floor or walls: it is base, or lies flat on it
-_SEGMENT_SHARE = 0.25  # of a plane's surface: a part of the wall, no picture
-# A thing that lies flat on a plane shows in this share of it another color than the plane's; a shadow does not.
+_SURE_SHARE = 0.65  # least agreement of the frames at a vertex; flying pixels and floaters are below it
+_BRIDGE_M = 0.03  # pieces of an object within this gap are connected
+# Pieces that are not connected to the largest one: below this share of its area they need
+_FRAGMENT_SHARE = 0.1
+_FRAGMENT_FRAMES, _FRAGMENT_AGREED = 2.0, 0.8  # so many frames per vertex, and so much agreement;
+_CRUMB_SHARE = 0.005  # below this share they are always removed.
+_BLEED_RISE_M, _BLEED_REACH_M = 0.01, 0.03  # bleeding surface: above an object's foot, and around it;
+_BARE_SHARE, _BARE_REACH_M = 0.08, 0.15  # the reach for supports with less area than this share above it
+_LEAST_AREA_SHARE = 0.5  # of `min_object_area_m2`: masks confirm smaller objects than shape alone does
+_FLAT_SHARE = 0.5  # a cluster with more of its area on base planes is base, or lies flat on it
+_SEGMENT_SHARE = 0.25  # a cluster with more of a plane's area is part of the plane
+# A flat object differs from the plane's color by more than _OTHER_COLOR in this share of its vertices, a shadow less.
 _COLORED_SHARE, _OTHER_COLOR = 0.08, 8.0
-_ON_WALL_M = 0.06
-_MIN_ATTACHED_M = 0.15
+_ON_WALL_M = 0.06  # objects nearer to a wall touch it
+_MIN_ATTACHED_M = 0.15  # least height of an attached object above the floor
 
 
 def cut_by_masks(
-    shell: Shell,
-    surface: Surface,
-    posed: PosedFrames,
-    depth: DepthMaps,
-    masks: FrameMasks,
-    config: InstancesConfig,
+    shell: Shell, surface: Surface, posed: PosedFrames, depth: DepthMaps, masks: FrameMasks, config: InstancesConfig,
     progress: Progress,
-) -> Cut:
-    """Lift masks onto the surface and divide it into base and things."""
+) -> Cut:  # fmt: skip
+    """Segment the surface into base and objects by 2D masks; `labeled` of the result is at depth resolution."""
     graph = shell.graph
     lifted = lift_masks(graph, surface, posed, depth, masks, progress)
     label = np.where(shell.behind | (lifted.share < _SURE_SHARE), 0, lifted.cluster)
@@ -49,23 +44,23 @@ def cut_by_masks(
     base = base_id > 0
     frames = np.maximum((lifted.views.seen > 0).sum(axis=0), 1)
     label = _without_fragments(graph, np.where(base[label], 0, label), lifted.count, frames, lifted.share)
-    label = _without_crumbs(graph, label, lifted.count, config)
+    label = _without_small(graph, label, lifted.count, config)
     kept = np.unique(label[label > 0])
     things = [Thing(np.flatnonzero(label == c)) for c in kept]
     names = base_id.copy()
     names[kept] = len(shell.base) + 1 + np.arange(len(kept))
-    _tell(lifted, base, len(things), progress)
+    _note_counts(lifted, base, len(things), progress)
     owner = np.where(label > 0, 0, shell.owner).astype(np.int32)
     for thing, carrier in zip(things, carriers(graph, [t.vertices for t in things])):
         thing.rests_on = things[carrier] if carrier >= 0 else None
     for thing in things:
-        _drop_skirts(graph, thing, [t for t in things if t.rests_on is thing])
+        _drop_bleeding(graph, thing, [t for t in things if t.rests_on is thing])
     mark_attached(shell, things)
-    return Cut(things, owner, _named(masks.resized(depth.camera.width, depth.camera.height), lifted, names))
+    return Cut(things, owner, _labeled(masks.resized(depth.camera.width, depth.camera.height), lifted, names))
 
 
-def _named(masks: FrameMasks, lifted: Lifted, names: np.ndarray) -> FrameMasks:
-    """Return the masks with the names (count + 1,) of their clusters for ids, 0 where the cluster has none."""
+def _labeled(masks: FrameMasks, lifted: Lifted, names: np.ndarray) -> FrameMasks:
+    """Return the masks with ids `names` (count + 1,) of their clusters, 0 where the cluster has none."""
     ids = np.zeros_like(masks.ids)
     views = lifted.views
     for row, own in enumerate(masks.ids):
@@ -77,16 +72,16 @@ def _named(masks: FrameMasks, lifted: Lifted, names: np.ndarray) -> FrameMasks:
     return replace(masks, ids=ids)
 
 
-def _tell(lifted: Lifted, base: np.ndarray, things: int, progress: Progress) -> None:
+def _note_counts(lifted: Lifted, base: np.ndarray, things: int, progress: Progress) -> None:
     split = int((lifted.mask_cluster[1:] == 0).sum())
     progress.note(
-        f"{lifted.views.mask_count} masks of {len(lifted.views.seen)} frames agree on {things} things and "
-        f"{int(base.sum())} parts of floor and walls; {split} masks that other frames split had no say"
+        f"{lifted.views.mask_count} masks of {len(lifted.views.seen)} frames agree on {things} objects and "
+        f"{int(base.sum())} parts of floor and walls; {split} masks that other frames split were ignored"
     )
 
 
 def _base_clusters(shell: Shell, label: np.ndarray, count: int) -> np.ndarray:
-    """Return the base entity, int32 (count + 1,), that a cluster is part of; 0 for those that are things."""
+    """Return the base entity int32 (count + 1,) that each cluster is part of, 0 for objects."""
     graph, planes = shell.graph, len(shell.base) + 1
     table = np.zeros((count + 1, planes))
     np.add.at(table, (label, shell.owner), graph.areas)
@@ -116,13 +111,13 @@ def _color(graph: MeshGraph, chosen: np.ndarray) -> np.ndarray:
 def _without_fragments(
     graph: MeshGraph, label: np.ndarray, count: int, frames: np.ndarray, agreed: np.ndarray
 ) -> np.ndarray:
-    """Take small pieces apart from the rest of their thing away from it, unless several frames saw them.
+    """Return the labels without small disconnected pieces of clusters, unless several frames agree on them.
 
     Args:
         graph: the surface.
         label: int (v,) cluster of each vertex.
-        count: of clusters.
-        frames: int (v,) how many frames see each vertex in a mask.
+        count: number of clusters.
+        frames: int (v,) number of frames that see each vertex in a mask.
         agreed: float (v,) share of them that agree.
     """
     out = label.copy()
@@ -140,35 +135,36 @@ def _without_fragments(
     return out
 
 
-def _without_crumbs(graph: MeshGraph, label: np.ndarray, count: int, config: InstancesConfig) -> np.ndarray:
-    """Take clusters with too little surface to be things away."""
+def _without_small(graph: MeshGraph, label: np.ndarray, count: int, config: InstancesConfig) -> np.ndarray:
+    """Return the labels without clusters below the least size of objects."""
     vertices = np.bincount(label, minlength=count + 1)
     area = np.bincount(label, weights=graph.areas, minlength=count + 1)
-    crumb = (vertices < config.min_object_vertices) | (area < _LEAST_AREA_SHARE * config.min_object_area_m2)
-    return np.where(crumb[label], 0, label)
+    small = (vertices < config.min_object_vertices) | (area < _LEAST_AREA_SHARE * config.min_object_area_m2)
+    return np.where(small[label], 0, label)
 
 
-def _drop_skirts(graph: MeshGraph, carrier: Thing, carried: list[Thing]) -> None:
-    """Take from a carrier what rises right beside the things on it, in place: depth is fat at their outlines.
+def _drop_bleeding(graph: MeshGraph, carrier: Thing, carried: list[Thing]) -> None:
+    """Remove from a support, in place, the surface that rises beside the objects on it.
 
-    Frames see such skirts against the carrier, so that votes alone leave them to it.
+    Depth maps bleed over the occlusion boundaries of these objects. In the masks the bleeding surface projects onto the
+    support, so that votes do not remove it.
     """
     for thing in carried:
         own = graph.points[thing.vertices]
         points = graph.points[carrier.vertices]
         bottom = float(np.percentile(own[:, 2], 2))
-        near = points[:, 2] > bottom + _SKIRT_RISE_M
+        near = points[:, 2] > bottom + _BLEED_RISE_M
         areas = graph.areas[carrier.vertices]
-        # A table has next to nothing above its top; a tray has rims, a shelf has more boards.
+        # A table has hardly any surface above its top; a tray has rims, a shelf has more boards.
         bare = areas[near].sum() < _BARE_SHARE * areas.sum()
-        reach = _BARE_REACH_M if bare else _SKIRT_REACH_M
+        reach = _BARE_REACH_M if bare else _BLEED_REACH_M
         near[near] = cKDTree(own).query(points[near], distance_upper_bound=reach)[0] < reach
         if near.mean() < 0.5:
             carrier.vertices = carrier.vertices[~near]
 
 
 def mark_attached(shell: Shell, things: list[Thing]) -> None:
-    """Mark things that touch a wall and have nothing below them."""
+    """Set `attached` for objects without support that touch a wall and are off the floor."""
     graph = shell.graph
     for thing in things:
         points = graph.points[thing.vertices]

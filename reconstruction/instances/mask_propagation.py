@@ -1,62 +1,51 @@
-"""Mask propagation: masks of some frames in, ids of keyframes without masks out, by reprojection of their pixels.
+"""Mask propagation: ids of keyframes by reprojecting their pixels into nearby frames that have masks.
 
-The id of a pixel drawn from the surface is as good as the surface; a mask follows the picture. Between frames that are
-near each other depth need not be exact to say which pixel of the one is which of the other.
+Masks follow image edges more closely than the rendered surface does. Between nearby frames the reprojection tolerates
+inexact depth.
 """
 
 import numpy as np
 from numba import njit, prange
 
 from reconstruction.core.rasterize import rasterize_mesh
-from reconstruction.core.types import Camera, DepthMaps, PosedFrames, Surface
+from reconstruction.core.types import DepthMaps, PosedFrames, Surface
 from reconstruction.instances.lifting_views import nearest_views, project
 from reconstruction.instances.masks.base import FrameMasks
 from registry.geometry import invert_rigid
 
-_ASKED = 4  # frames with masks
-_SAME_M = 0.02  # frames that are nearer than this count alike
-_HIDDEN = 0.015  # of depth: what lies so far behind the surface drawn there is hidden
+_SOURCES = 4  # nearest frames with masks that vote for a pixel
+_SAME_M = 0.02  # added to the distance of a source, so that close ones have similar weights
+_HIDDEN = 0.015  # of the depth: a point this far behind the rendered surface is occluded
 
 
 class MaskPropagation:
     """Propagates masks of some frames to keyframes, by reprojection."""
 
-    def __init__(self, told: FrameMasks, surface: Surface) -> None:
-        """Draw the surface into the frames of the masks.
-
-        Args:
-            told: what each pixel shows; 0 = nothing is said.
-            surface: what hides what.
-        """
-        self._told = told
-        self._camera_from_world = np.stack([invert_rigid(p) for p in told.world_from_camera])
-        self._drawn = np.stack(
-            [
-                rasterize_mesh(surface.vertices, surface.faces, told.camera, pose).depth
-                for pose in told.world_from_camera
-            ]
-        ).astype(np.float32)
+    def __init__(self, labeled: FrameMasks, surface: Surface) -> None:
+        """Render the surface into the frames of the masks (ids of instances, 0 = unknown), for occlusion tests."""
+        self._labeled = labeled
+        poses = labeled.world_from_camera
+        self._camera_from_world = np.stack([invert_rigid(pose) for pose in poses])
+        vertices, faces = surface.vertices, surface.faces
+        depths = [rasterize_mesh(vertices, faces, labeled.camera, pose).depth for pose in poses]
+        self._drawn = np.stack(depths).astype(np.float32)
 
     def ids(self, drawn: np.ndarray, posed: PosedFrames, depth: DepthMaps, row: int) -> np.ndarray:
-        """Return uint16 (h, w) ids of a keyframe: as the masks say, as `drawn` (h, w) where they say nothing."""
+        """Return ids uint16 (h, w) of a keyframe from the masks, and from `drawn` (h, w) where no mask votes."""
         pose = np.asarray(posed.world_from_camera[row], np.float64)
-        near, away = nearest_views(pose, self._told.world_from_camera, _ASKED)
-        return _ask(
-            drawn, np.ascontiguousarray(depth.depth[row], np.float32), pose, _intrinsics(depth.camera),
-            self._camera_from_world[near], _intrinsics(self._told.camera), self._told.ids[near], self._drawn[near],
+        near, away = nearest_views(pose, self._labeled.world_from_camera, _SOURCES)
+        return _vote(
+            drawn, np.ascontiguousarray(depth.depth[row], np.float32), pose, depth.camera.intrinsics,
+            self._camera_from_world[near], self._labeled.camera.intrinsics, self._labeled.ids[near], self._drawn[near],
             1.0 / (away + _SAME_M), _HIDDEN,
         )  # fmt: skip
 
 
-def _intrinsics(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-
-
 @njit(cache=True, parallel=True)
-def _ask(
+def _vote(
     ids, depth, world_from_camera, own, others, their, told, drawn, weights, hidden
 ):  # pragma: no cover - compiled
-    """Return the id of each pixel that the frames asked give most weight to; the one drawn where none has a say."""
+    """Return the id of each pixel with the largest sum of votes in the other frames, or its own id without votes."""
     height, width = depth.shape
     count = others.shape[0]
     out = ids.copy()

@@ -1,9 +1,8 @@
-"""Superpoints: small patches of the surface of one direction and one color, the units in which masks are compared.
+"""Superpoints: oversegmentation of a mesh into small patches with similar normals and colors.
 
-Mesh edges are visited from the least to the most telling one, and the patches at their ends become one where they
-agree in direction and color and stay small. Patches are compared by their area-weighted means, and their size is in
-metres, so that the result hardly depends on how finely the mesh is sampled. Time is linear but for one sort of the
-edges.
+Greedy merging over mesh edges, from the smallest to the largest difference of normals and colors. Two patches merge if
+their area-weighted mean normals and colors agree and their bounding box stays small. Means are weighted by area and
+sizes are in metres, so that the result hardly depends on the density of the mesh.
 """
 
 import numpy as np
@@ -12,14 +11,14 @@ from numba import njit
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 
-MAX_SIZE_M = 0.06  # diagonal of a patch's box
-_STRONG_ANGLE_DEG, _STRONG_COLOR = 35.0, 14.0  # between neighbors: never joined
-_MEAN_ANGLE_DEG, _MEAN_COLOR = 25.0, 10.0  # between patches
-_CRUMB_M2 = 6e-5  # a patch below this has no direction of its own: only edges keep it apart
+MAX_SIZE_M = 0.06  # largest diagonal of a patch's bounding box
+_STRONG_ANGLE_DEG, _STRONG_COLOR = 35.0, 14.0  # edges with larger differences, in CIELAB, never merge patches
+_MEAN_ANGLE_DEG, _MEAN_COLOR = 25.0, 10.0  # largest differences of the means of two patches
+_CRUMB_M2 = 6e-5  # the mean normal of a smaller patch is unreliable: only its edges are tested
 
 
 def superpoints(graph: MeshGraph, max_size_m: float = MAX_SIZE_M) -> np.ndarray:
-    """Return the superpoint int32 (v,) of each vertex, numbered from 0 by their first vertices."""
+    """Return the superpoint int32 (v,) of each vertex, numbered from 0 by first vertex."""
     count = len(graph.points)
     if count == 0:
         return np.zeros(0, np.int32)
@@ -52,7 +51,7 @@ def _root(parent, i):  # pragma: no cover - compiled
 def _grow(
     edges, order, points, normals, lab, areas, max_size2, min_cos, max_color2, crumb
 ):  # pragma: no cover - compiled
-    """Return the root of each vertex's patch: the smallest vertex in it."""
+    """Return the root of each vertex's patch, by union-find: the smallest vertex in it."""
     count = points.shape[0]
     parent = np.arange(count)
     low, high = points.copy(), points.copy()
@@ -62,7 +61,7 @@ def _grow(
         for k in range(3):
             direction[i, k] = normals[i, k] * areas[i]
             color[i, k] = lab[i, k] * areas[i]
-    for relaxed in range(2):  # crumbs find a home once the patches are there
+    for relaxed in range(2):  # the second pass merges the patches below `crumb` m2
         for e in order:
             a, b = _root(parent, edges[e, 0]), _root(parent, edges[e, 1])
             if a == b or (relaxed == 1 and min(area[a], area[b]) > crumb):

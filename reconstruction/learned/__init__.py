@@ -1,1 +1,1 @@
-"""Learned models of others: loading through `transformers`, HTTP services, vision-language models. All optional."""
+"""Optional third-party models: loading by `transformers`, HTTP services, vision-language models."""

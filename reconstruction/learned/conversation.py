@@ -1,8 +1,8 @@
-"""Conversations with a vision-language model: typed answers, asked again with the reason, recorded, replayable.
+"""Ask a vision-language model for typed answers, with retries and recorded exchanges.
 
-Whoever asks says what the answer must look like (a Pydantic model, sent along as a JSON schema) and what else must
-hold; an answer that does not fit is asked for again with the reason. Exchanges can be kept in a folder: what is in it
-is not asked again, so a run can be repeated offline and gives the same answers.
+The caller gives a Pydantic model, sent as a JSON schema, and an optional check. Invalid answers are returned to the
+model with the reason, and it is asked again. Exchanges can be recorded in a folder; recorded questions are answered
+from it, so that runs can be repeated offline with the same answers.
 """
 
 import hashlib
@@ -19,29 +19,29 @@ from pydantic import BaseModel, ValidationError
 from reconstruction.learned.requesting import write_whole
 from registry.errors import SimReconError
 
-_ANSWERS = 3  # times that an answer which does not fit is asked for
+_ANSWERS = 3  # attempts per question
 _JPEG_QUALITY = 90
 Reply = TypeVar("Reply", bound=BaseModel)
 
 
 class VlmError(SimReconError):
-    """This question got no usable answer; another one may."""
+    """A question got no usable answer; other questions may."""
 
     def __init__(self, message: str, answer: BaseModel | None = None) -> None:
-        """Keep the last answer that was well-formed, though what it says cannot be."""
+        """Keep the last answer that was well-formed, but failed the check."""
         super().__init__(message)
         self.answer = answer
 
 
 class VlmUnavailable(VlmError):
-    """The model does not answer questions at all: it is away, refuses the key, or is something else."""
+    """The model answers no questions: it cannot be reached, refuses the key, or is not such a model."""
 
 
 class Conversation:
-    """Asks a model; the exchanges of one question follow each other. What sends them is up to the heirs."""
+    """Asks a model, one question at a time; subclasses implement `_request`, which sends messages."""
 
     def __init__(self, name: str, records: Path | None = None) -> None:
-        """Name the model, and the folder that exchanges are kept in and taken from."""
+        """Set the model's name and the folder of recorded exchanges."""
         self.name, self.records = name, records
 
     def ask(
@@ -51,17 +51,17 @@ class Conversation:
         reply: type[Reply],
         check: Callable[[Reply], None] | None = None,
     ) -> Reply:
-        """Return the answer to a prompt about RGB images uint8 (h, w, 3).
+        """Ask about RGB images uint8 (h, w, 3); return the parsed answer.
 
         Args:
-            prompt: The question; it should say what to answer in words, too, for endpoints that ignore schemas.
-            images: Shown after the prompt, in order.
-            reply: What the answer is parsed into.
-            check: Raises ValueError, with a message for the model, where a well-formed answer makes no sense.
+            prompt: the question; should describe the answer in words too, for endpoints that ignore schemas.
+            images: follow the prompt, in order.
+            reply: type of the answer.
+            check: raises ValueError, with a message for the model, for a well-formed but wrong answer.
 
         Raises:
             VlmUnavailable: the model cannot be used, or there is none and the answer is not recorded.
-            VlmError: no answer fitted; it holds the last one that `check` refused.
+            VlmError: all answers were invalid; it holds the last one that `check` refused.
         """
         content: list[dict] = [{"type": "text", "text": prompt}]
         content += [{"type": "image", "image": np.ascontiguousarray(image)} for image in images]
@@ -87,7 +87,7 @@ class Conversation:
         raise VlmError(f"{self.name}: no usable answer in {_ANSWERS} attempts; at last: {reason}", kept)
 
     def _exchange(self, messages: list[dict], schema: dict, schema_name: str) -> str:
-        """Return the text of one answer, from the records or from the model."""
+        """Return the text of one answer, recorded or from the model."""
         described = {"model": self.name, "schema": schema, "messages": _described(messages)}
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:32]
         file = self.records / f"{digest}.json" if self.records else None
@@ -99,17 +99,17 @@ class Conversation:
         return text
 
     def _request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
-        """Return the model's answer to messages whose images are parts {"type": "image", "image": RGB array}.
+        """Send messages, with images as parts {"type": "image", "image": RGB array}; return the answer.
 
         Raises:
-            VlmUnavailable: it cannot be used; `record` is the file that would have held the answer.
-            VlmError: it refuses this question.
+            VlmUnavailable: the model cannot be used; `record` is the file name of the missing record.
+            VlmError: the model refuses this question.
         """
         raise NotImplementedError
 
 
 def json_part(text: str) -> str:
-    """Return the JSON object in an answer: models wrap it in fences, and think aloud before it."""
+    """Return the JSON object in an answer, without code fences and reasoning around it."""
     text = re.sub(r"<think>.*?</think>", "", text, flags=re.DOTALL)
     start, end = text.find("{"), text.rfind("}")
     if start < 0 or end < start:
@@ -117,19 +117,19 @@ def json_part(text: str) -> str:
     return text[start : end + 1]
 
 
-def map_images(messages: list[dict], turn: Callable[[np.ndarray], dict]) -> list[dict]:
-    """Return messages with every image replaced by what `turn` makes of it."""
+def map_images(messages: list[dict], encode: Callable[[np.ndarray], dict]) -> list[dict]:
+    """Return messages with each image part replaced by `encode(image)`."""
     out = []
     for message in messages:
         content: Any = message["content"]
         if isinstance(content, list):
-            content = [turn(part["image"]) if part["type"] == "image" else part for part in content]
+            content = [encode(part["image"]) if part["type"] == "image" else part for part in content]
         out.append({"role": message["role"], "content": content})
     return out
 
 
 def jpeg(image: np.ndarray) -> bytes:
-    """Encode an RGB image."""
+    """Encode an RGB image uint8 (h, w, 3) as JPEG."""
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
@@ -139,7 +139,7 @@ def _image_digest(image: np.ndarray) -> str:
 
 
 def _described(messages: list[dict]) -> list[dict]:
-    """Return the messages with digests of the pixels (not of a JPEG, which differs with its library)."""
+    """Replace images by digests of their pixels (not of the JPEG, which depends on the library)."""
     return map_images(messages, lambda image: {"type": "image", "file": f"{_image_digest(image)}.jpg"})
 
 
@@ -155,6 +155,4 @@ def _recorded(file: Path) -> str:
     try:
         return str(json.loads(file.read_text())["answer"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise VlmError(
-            f"{file}: not a recorded exchange; remove it to have the question asked again"
-        ) from error
+        raise VlmError(f"{file}: not a recorded exchange; remove it to ask the question again") from error

@@ -1,7 +1,7 @@
-"""Learned depth from single images: the models of `transformers`, for the depth stage and for the scale ladder.
+"""Monocular depth estimation by models of `transformers`, for the depth stage and for metric scale.
 
-Any model that `AutoModelForDepthEstimation` opens will do: Depth Anything, DPT and MiDaS predict inverse depth up to
-scale and shift; their metric variants, ZoeDepth and Depth Pro predict metres.
+Any model that `AutoModelForDepthEstimation` loads: Depth Anything, DPT and MiDaS predict inverse depth up to scale and
+shift; their metric variants, ZoeDepth and Depth Pro predict metres.
 """
 
 import cv2
@@ -13,18 +13,18 @@ _METRIC_FAMILIES = ("zoedepth", "depth_pro")
 
 
 class DepthModel:
-    """A depth-estimation model of the Hugging Face hub, or of a local folder."""
+    """A depth estimation model from the Hugging Face hub or a local folder."""
 
     def __init__(self, model: str, *, asked_by: str, device: str = "auto") -> None:
         """Load the model.
 
         Args:
-            model: Name on the hub, or a folder with config, weights and image processor.
-            asked_by: The option that asks for it, for messages.
-            device: "cpu", "cuda", "cuda:1", ...; "auto" is cuda where there is one.
+            model: name on the hub, or a folder with config, weights and image processor.
+            asked_by: the option that selects it, for messages.
+            device: "cpu", "cuda", "cuda:1", ...; "auto" is cuda if available.
 
         Raises:
-            EnvironmentMissing: transformers or the model is not there, or cannot be loaded.
+            EnvironmentMissing: transformers or the model is missing or cannot be loaded.
         """
         request = ModelRequest(model, asked_by, f"{asked_by}_model", device)
         self._processor = load_part(request, "AutoImageProcessor")
@@ -37,9 +37,9 @@ class DepthModel:
         )
 
     def predict(self, images: list[np.ndarray]) -> list[np.ndarray]:
-        """Return what the model says of RGB images uint8 (h, w, 3), one float32 (h, w) each.
+        """Predict a depth map float32 (h, w) for each of the RGB images uint8 (h, w, 3).
 
-        That is z-depth in metres where `predicts_metres`, else inverse depth up to scale and shift.
+        Values are z-depth in metres if `predicts_metres`, else inverse depth up to scale and shift.
         """
         import torch
 

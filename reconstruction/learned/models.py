@@ -1,6 +1,6 @@
-"""Learned models through `transformers`: loading, devices, and messages for what is missing; shared by all of them.
+"""Load models by `transformers`: classes, weights, devices, and errors that say what is missing.
 
-Weights are read from a folder or from the local cache of the Hugging Face hub, which downloads them where it may.
+Weights come from a folder or from the local cache of the Hugging Face hub, which downloads them if it may.
 """
 
 from dataclasses import dataclass
@@ -12,45 +12,44 @@ from PIL import Image
 from registry.errors import EnvironmentMissing
 
 EXTRA = "models"
-_MISSING_SHARE = 0.05
-_MASKS_AT_ONCE = 32
+_MISSING_SHARE = 0.05  # of the parameters, that a checkpoint may leave out
+_MASKS_AT_ONCE = 32  # upsampled together, which bounds memory
 
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """Which model is asked for, and by which option."""
+    """A model to load, and the options to name in messages."""
 
     model: str  # name on the hub, or a folder with config and weights
-    asked_by: str  # the option that asks for it, for messages
+    asked_by: str  # the option that selects it
     model_option: str  # the option that names it
-    device: str = "auto"  # "cpu", "cuda", "cuda:1", ...; "auto" is cuda where there is one
+    device: str = "auto"  # "cpu", "cuda", "cuda:1", ...; "auto" is cuda if available
 
 
 def transformers_class(name: str, asked_by: str) -> Any:
     """Return a class of `transformers`.
 
     Raises:
-        EnvironmentMissing: transformers or torch is not installed, or it is too old to have that class.
+        EnvironmentMissing: transformers or torch is not installed, or transformers lacks the class.
     """
     install = f"`pip install -U 'simrecon[{EXTRA}]'`, or leave that option out"
     try:
-        import torch  # noqa: F401  (classes without it are hollow, and say so late)
+        import torch  # noqa: F401  (without it, classes are placeholders that fail only when used)
         import transformers
     except ImportError as error:
         raise EnvironmentMissing(f"{asked_by} needs {error.name}; {install}") from error
     try:
         return getattr(transformers, name)
     except AttributeError as error:
-        raise EnvironmentMissing(
-            f"{asked_by}: transformers {transformers.__version__} has no {name}; {install}"
-        ) from error
+        version = transformers.__version__
+        raise EnvironmentMissing(f"{asked_by}: transformers {version} has no {name}; {install}") from error
 
 
 def load_part(request: ModelRequest, class_name: str) -> Any:
-    """Load what goes with a model: its image processor, its tokenizer.
+    """Load an image processor or tokenizer of a model.
 
     Raises:
-        EnvironmentMissing: transformers or the files are not there, or cannot be loaded.
+        EnvironmentMissing: transformers or the files are missing or cannot be loaded.
     """
     cls = transformers_class(class_name, request.asked_by)
     try:
@@ -60,11 +59,11 @@ def load_part(request: ModelRequest, class_name: str) -> Any:
 
 
 def load_model(request: ModelRequest, class_name: str) -> Any:
-    """Load a model for inference, on its device.
+    """Load a model for inference onto its device.
 
     Raises:
-        EnvironmentMissing: transformers or the weights are not there, or they are those of another kind of model
-            (which transformers itself would replace by random ones).
+        EnvironmentMissing: transformers or the weights are missing, or the weights are of another architecture, for
+            which transformers itself would use random ones.
     """
     cls = transformers_class(class_name, request.asked_by)
     try:
@@ -74,7 +73,7 @@ def load_model(request: ModelRequest, class_name: str) -> Any:
         raise _not_loaded(request, error) from error
     sizes = {name: parameter.numel() for name, parameter in model.named_parameters()}
     missing = sorted(name for name in info["missing_keys"] if name in sizes)
-    # Some published weights leave out a layer that is never used.
+    # Some published weights lack a layer that is never used.
     if sum(sizes[name] for name in missing) > _MISSING_SHARE * sum(sizes.values()):
         raise EnvironmentMissing(
             f"{request.asked_by}: {request.model!r} holds no weights for {len(missing)} of the {len(sizes)} parts of "
@@ -85,7 +84,7 @@ def load_model(request: ModelRequest, class_name: str) -> Any:
 
 
 def pick_device(device: str) -> str:
-    """Return the torch device of a name; "auto" is cuda where there is one."""
+    """Return the torch device name; "auto" is cuda if available."""
     import torch
 
     if device != "auto":
@@ -103,13 +102,13 @@ def _not_loaded(request: ModelRequest, error: Exception) -> EnvironmentMissing:
 
 
 class SquareImages:
-    """Images as SAM models want them: stretched to a square, normalized.
+    """Image preprocessor of SAM models: stretch to a square, normalize.
 
-    Done here because the image processors of these models need torchvision, which SimRecon does not.
+    Replaces the image processors of these models, which need torchvision.
     """
 
     def __init__(self, request: ModelRequest, side_px: int) -> None:
-        """Read mean and deviation from the model's own preprocessing file."""
+        """Read mean and standard deviation from the model's preprocessing file."""
         mixin = transformers_class("ImageProcessingMixin", request.asked_by)
         try:
             settings, _ = mixin.get_image_processor_dict(request.model)
@@ -120,7 +119,7 @@ class SquareImages:
         self.side_px = side_px
 
     def __call__(self, image: np.ndarray) -> Any:
-        """Return a float32 tensor (1, 3, side, side) of an RGB image uint8 (h, w, 3)."""
+        """Convert an RGB image uint8 (h, w, 3) to a tensor float32 (1, 3, side, side)."""
         import torch
 
         side = self.side_px
@@ -130,7 +129,7 @@ class SquareImages:
 
 
 def masks_of(logits: Any, height: int, width: int) -> np.ndarray:
-    """Return masks bool (k, height, width): where mask logits, a tensor (k, h, w), are positive between its pixels."""
+    """Upsample mask logits, a tensor (k, h, w), bilinearly and threshold at 0: bool (k, height, width)."""
     import torch
 
     out = np.zeros((len(logits), height, width), bool)

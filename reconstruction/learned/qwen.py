@@ -1,4 +1,4 @@
-"""Qwen2.5-VL in this process, through `transformers`: questions with pictures, always answered alike."""
+"""Run Qwen2.5-VL in this process by `transformers`, with deterministic (greedy) decoding."""
 
 import inspect
 from pathlib import Path
@@ -16,12 +16,12 @@ _MAX_TOKENS = 2048
 
 
 class QwenModel(Conversation):
-    """Qwen2.5-VL of any size. It is loaded when the first question is not in the records."""
+    """Qwen2.5-VL of any size, loaded at the first question that is not recorded."""
 
     def __init__(
         self, request: ModelRequest, records: Path | None = None, max_tokens: int = _MAX_TOKENS
     ) -> None:
-        """Name the model; nothing is loaded yet."""
+        """Set the model; nothing is loaded yet."""
         super().__init__(request.model, records)
         self._request_of, self._max_tokens = request, max_tokens
         self._model: Any = None
@@ -30,12 +30,11 @@ class QwenModel(Conversation):
         """Load weights, tokenizer and image settings.
 
         Raises:
-            EnvironmentMissing: transformers or the weights are missing, or are those of another model.
+            EnvironmentMissing: transformers or the weights are missing, or the weights are of another architecture.
         """
         request = self._request_of
         self._tokenizer = load_part(request, "AutoTokenizer")
-        # The one that needs no torchvision.
-        self._images = load_part(request, "Qwen2VLImageProcessorPil")
+        self._images = load_part(request, "Qwen2VLImageProcessorPil")  # needs no torchvision
         self._model = load_model(request, "Qwen2_5_VLForConditionalGeneration")
 
     def _request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
@@ -43,18 +42,20 @@ class QwenModel(Conversation):
 
         if self._model is None:
             self.load()
+        assert self._model is not None
         inputs = self._inputs(messages)
         try:
             with torch.inference_mode():
                 tokens = self._model.generate(**inputs, max_new_tokens=self._max_tokens, do_sample=False)
         except torch.OutOfMemoryError as error:
+            remedy = "lower scene_graph.picture_side_px"
             raise VlmUnavailable(
-                f"{self.name}: not enough memory for a picture of this size; lower scene_graph.picture_side_px"
+                f"{self.name}: not enough memory for pictures of this size; {remedy}"
             ) from error
         return self._tokenizer.decode(tokens[0, inputs["input_ids"].shape[1] :], skip_special_tokens=True)
 
     def _inputs(self, messages: list[dict]) -> dict:
-        """Turn messages into tokens, with as many places for each picture as the model makes features of it."""
+        """Tokenize messages, with one image token per visual feature."""
         pictures: list[np.ndarray] = []
         text = _SYSTEM
         for message in messages:
@@ -70,15 +71,14 @@ class QwenModel(Conversation):
             inputs |= {"pixel_values": seen["pixel_values"], "image_grid_thw": seen["image_grid_thw"]}
         tokens = self._tokenizer(text, return_tensors="pt")
         inputs |= {"input_ids": tokens["input_ids"], "attention_mask": tokens["attention_mask"]}
-        if (
-            "mm_token_type_ids" in inspect.signature(self._model.forward).parameters
-        ):  # newer versions ask for it
+        # Newer versions of transformers need the token types.
+        if "mm_token_type_ids" in inspect.signature(self._model.forward).parameters:
             inputs["mm_token_type_ids"] = (tokens["input_ids"] == self._model.config.image_token_id).int()
         return {name: value.to(self._model.device) for name, value in inputs.items()}
 
 
 def _written(content: str | list[dict], pictures: list[np.ndarray]) -> str:
-    """Return a message as text with marks for its pictures, which are put before the words as in training."""
+    """Format a message with image tokens before the text, as in training; append its images to `pictures`."""
     if isinstance(content, str):
         return content.replace(_PAD, "")
     images = [part["image"] for part in content if part["type"] == "image"]

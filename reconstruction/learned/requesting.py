@@ -1,4 +1,4 @@
-"""What the clients of HTTP services share: pauses that servers ask for, excerpts for messages, files written whole."""
+"""Helpers of HTTP clients: pauses that servers request, excerpts for messages, atomic file writes."""
 
 import os
 from pathlib import Path
@@ -7,11 +7,11 @@ import requests
 
 from registry.errors import EnvironmentMissing
 
-_EXCERPT = 200
+_EXCERPT = 200  # characters
 
 
 def asked_pause(response: requests.Response) -> float:
-    """Return how many seconds a server asks to wait (`Retry-After`), 0 where it does not say."""
+    """Return the pause in seconds that a response requests (`Retry-After`); 0 if none."""
     try:
         return max(0.0, float(response.headers.get("Retry-After", 0)))
     except ValueError:  # a date
@@ -19,13 +19,13 @@ def asked_pause(response: requests.Response) -> float:
 
 
 def excerpt(text: str) -> str:
-    """Return the beginning of a reply, on one line."""
+    """Return the beginning of a text, on one line."""
     words = " ".join(text.split())
     return words if len(words) <= _EXCERPT else words[:_EXCERPT] + "..."
 
 
 def write_whole(file: Path, data: bytes) -> None:
-    """Write a file so that it is there whole or not at all; its folder is made.
+    """Write a file atomically; its folder is created.
 
     Raises:
         EnvironmentMissing: it cannot be written.
@@ -36,6 +36,4 @@ def write_whole(file: Path, data: bytes) -> None:
         partial.write_bytes(data)
         partial.replace(file)
     except OSError as error:
-        raise EnvironmentMissing(
-            f"{file.parent}: cannot keep answers there: {error.strerror or error}"
-        ) from error
+        raise EnvironmentMissing(f"{file.parent}: cannot write there: {error.strerror or error}") from error

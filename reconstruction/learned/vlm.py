@@ -1,7 +1,7 @@
-"""A vision-language model behind any OpenAI-compatible endpoint (vLLM, Ollama, a hosted one): questions with pictures.
+"""Ask a vision-language model behind an OpenAI-compatible endpoint (vLLM, Ollama, a hosted one).
 
-Environment: SIMRECON_VLM_URL (as in http://localhost:8000/v1), SIMRECON_VLM_MODEL, SIMRECON_VLM_KEY (where the
-endpoint wants one; never written anywhere), SIMRECON_VLM_RECORDS (the folder that exchanges are kept in).
+Environment: SIMRECON_VLM_URL (as in http://localhost:8000/v1), SIMRECON_VLM_MODEL, SIMRECON_VLM_KEY (if the endpoint
+needs one; never written to disk), SIMRECON_VLM_RECORDS (folder of recorded exchanges).
 """
 
 import base64
@@ -26,29 +26,29 @@ from registry.errors import EnvironmentMissing
 
 __all__ = ["Endpoint", "VlmClient", "VlmError", "VlmUnavailable", "json_part"]
 
-_TRIES = 5  # times that a request is sent to a busy or failing endpoint
+_TRIES = 5  # requests to a busy or failing endpoint
 _LONGEST_PAUSE_S = 60.0
 _MAX_TOKENS = 2048
-_OPTIONAL = ("response_format", "seed", "max_tokens")  # some endpoints refuse them
+_OPTIONAL = ("response_format", "seed", "max_tokens")  # fields that some endpoints refuse
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Where questions go."""
+    """Address and model of an endpoint."""
 
-    url: str  # base of the API; "" where only recorded answers are used
+    url: str  # base of the API; "": only recorded answers
     model: str
     key: str = ""
-    records: Path | None = None  # exchanges are kept here, and taken from here
+    records: Path | None = None  # folder of recorded exchanges
     timeout_s: float = 180.0  # for one answer
-    pause_s: float = 1.0  # before the second try; doubled before each further one
+    pause_s: float = 1.0  # before the second request; doubled before each further one
 
     @staticmethod
     def from_environment(asked_by: str, model: str = "") -> "Endpoint":
-        """Read the SIMRECON_VLM_ variables; `model` takes the place of theirs.
+        """Read the SIMRECON_VLM_ variables; `model`, if given, overrides SIMRECON_VLM_MODEL.
 
         Raises:
-            EnvironmentMissing: no endpoint and no records, or no model.
+            EnvironmentMissing: there is no endpoint and no records, or no model.
         """
         get = os.environ.get
         url, model = get("SIMRECON_VLM_URL", ""), model or get("SIMRECON_VLM_MODEL", "")
@@ -61,20 +61,20 @@ class Endpoint:
             )
         if url and not url.startswith(("http://", "https://")):
             raise EnvironmentMissing(
-                f"SIMRECON_VLM_URL is {url!r}; an address as in http://localhost:8000/v1 is expected"
+                f"SIMRECON_VLM_URL is {url!r}; a URL like http://localhost:8000/v1 is expected"
             )
         return Endpoint(url, model, get("SIMRECON_VLM_KEY", ""), Path(records) if records else None)
 
 
 class VlmClient(Conversation):
-    """Asks an endpoint."""
+    """Sends questions to an endpoint."""
 
     def __init__(self, endpoint: Endpoint) -> None:
-        """Nothing is sent yet."""
+        """Prepare a session; nothing is sent yet."""
         super().__init__(endpoint.model, endpoint.records)
         self._endpoint = endpoint
         self._session = requests.Session()
-        self._refused: set[str] = set()  # optional fields that the endpoint does not take
+        self._refused: set[str] = set()  # optional fields that the endpoint refuses
 
     def _request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
         if not self._endpoint.url:
@@ -133,7 +133,7 @@ class VlmClient(Conversation):
 
 
 def _text_of(response: requests.Response) -> str:
-    """Return the answer in a response of the chat completions protocol."""
+    """Return the answer in a chat completions response."""
     try:
         content = response.json()["choices"][0]["message"]["content"]
     except (ValueError, KeyError, IndexError, TypeError) as error:
@@ -148,8 +148,8 @@ def _text_of(response: requests.Response) -> str:
 
 
 def _encoded(messages: list[dict]) -> list[dict]:
-    def turn(image: np.ndarray) -> dict:
+    def encode(image: np.ndarray) -> dict:
         data = base64.b64encode(jpeg(image)).decode()
         return {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{data}"}}
 
-    return map_images(messages, turn)
+    return map_images(messages, encode)

@@ -1,4 +1,4 @@
-"""The ruler: a scene bundle and the truth in, the metrics of CONTRACT sections 4 and 5 out, per stage where kept."""
+"""Evaluate a scene bundle against ground truth: the metrics of CONTRACT sections 4 and 5, and figures per stage."""
 
 from reconstruction.measure.evaluate import Evaluation, evaluate_scene
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity

@@ -1,4 +1,4 @@
-"""The similarity that takes an estimated world to the true one, and the camera error that is left after it."""
+"""Align the estimated world to the true one by camera centers (Umeyama 1991) and measure the camera errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,30 +13,30 @@ _MIN_CAMERAS = 3
 
 @dataclass(frozen=True)
 class Alignment:
-    """Umeyama's similarity between camera centers, and its residuals. Everything geometric is measured after it."""
+    """A similarity from the estimated to the true world, and the camera residuals after it."""
 
     true_from_estimated: np.ndarray  # float64 (4, 4), scale inside the 3x3 block
-    indices: np.ndarray  # int32 (n,) video frames that have both cameras
-    center_errors_m: np.ndarray  # float64 (n,) true metres
+    indices: np.ndarray  # int32 (n,) video frames with both poses
+    center_errors_m: np.ndarray  # float64 (n,) in true metres
     rotation_errors_deg: np.ndarray  # float64 (n,)
-    tilt_deg: float  # between the estimated up and the true up
+    tilt_deg: float  # angle between the estimated and the true up direction
 
     @property
     def scale(self) -> float:
-        """True metres per estimated metre."""
+        """Scale of the similarity: true metres per estimated metre."""
         return split_similarity(self.true_from_estimated)[0]
 
     @property
     def ate_cm(self) -> float:
-        """Root of the mean squared center error."""
+        """Absolute trajectory error: RMSE of the camera centers."""
         return float(np.sqrt((self.center_errors_m**2).mean()) * 100)
 
     def to_true(self, points: np.ndarray) -> np.ndarray:
-        """Take estimated world points (n, 3) to the true world."""
+        """Transform points (n, 3) from the estimated to the true world."""
         return transform_points(self.true_from_estimated, points)
 
     def pose_to_true(self, world_from_camera: np.ndarray) -> np.ndarray:
-        """Take an estimated camera pose (4, 4) to the true world; the result is rigid."""
+        """Transform a pose world_from_camera (4, 4) to the true world; the result is rigid."""
         _, rotation, _ = split_similarity(self.true_from_estimated)
         out = np.eye(4)
         out[:3, :3] = rotation @ world_from_camera[:3, :3]
@@ -45,19 +45,17 @@ class Alignment:
 
 
 def align(
-    estimated: Mapping[int, np.ndarray],
-    true: Mapping[int, np.ndarray],
-    up: np.ndarray | None = None,
+    estimated: Mapping[int, np.ndarray], true: Mapping[int, np.ndarray], up: np.ndarray | None = None
 ) -> Alignment:
-    """Align by camera centers over all frames that have both poses.
+    """Estimate the similarity from the camera centers of all frames with both poses.
 
     Args:
-        estimated: video frame -> world_from_camera (4, 4), estimated world (+z up).
+        estimated: video frame -> world_from_camera (4, 4) in the estimated world (+z up).
         true: the same in the true world.
-        up: (3,) unit, against gravity in the true world; None: +z.
+        up: (3,) unit vector against gravity in the true world; None: +z.
 
     Raises:
-        UsageError: fewer than three common frames, or cameras on one line, so that no similarity is defined.
+        UsageError: fewer than three common frames, or collinear camera centers, which leave the rotation undefined.
     """
     indices = np.array(sorted(set(estimated) & set(true)), np.int32)
     if len(indices) < _MIN_CAMERAS:
@@ -69,7 +67,9 @@ def align(
     b = np.array([true[int(i)] for i in indices])
     spread = np.linalg.svd(b[:, :3, 3] - b[:, :3, 3].mean(0), compute_uv=False)
     if spread[1] < 1e-6 * max(spread[0], 1e-12):
-        raise UsageError("evaluate: the true cameras lie on one line, so they do not fix a rotation")
+        raise UsageError(
+            "evaluate: the true cameras lie on one line, so the rotation of the alignment is undefined"
+        )
     matrix = umeyama(a[:, :3, 3], b[:, :3, 3])
     _, rotation, _ = split_similarity(matrix)
     errors = np.linalg.norm(transform_points(matrix, a[:, :3, 3]) - b[:, :3, 3], axis=1)
@@ -79,7 +79,7 @@ def align(
 
 
 def _rotation_angles_deg(rotations: np.ndarray) -> np.ndarray:
-    # The skew part keeps small angles exact, where the arc cosine of the trace does not.
+    # The skew-symmetric part is accurate for small angles; the arc cosine of the trace is not.
     skew = np.stack(
         [
             rotations[:, 2, 1] - rotations[:, 1, 2],

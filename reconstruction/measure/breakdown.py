@@ -1,7 +1,7 @@
-"""Recall by what makes objects hard: size, what they stand on, how near neighbors are, how well the video shows them.
+"""Break object recall down by size, support, distance to the nearest neighbor, and visibility.
 
-Takes the records that `simrecon evaluate --json` keeps under `objects` (and under `stages.instances.boxes.objects`), of
-one capture or pooled over many.
+Input: the records that `simrecon evaluate --json` writes under `objects` and `stages.instances.boxes.objects`, of one
+capture or pooled over many.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,33 +13,33 @@ import numpy as np
 
 from reconstruction.measure.object_facts import SUPPORTS
 
-SIZE_EDGES_CM = (5.0, 10.0, 20.0, 50.0)  # of the longest side; a bin holds its lower edge
+SIZE_EDGES_CM = (5.0, 10.0, 20.0, 50.0)  # of the longest side; a bin includes its lower edge
 GAP_EDGES_CM = (2.0, 5.0, 10.0, 30.0)  # to the nearest neighbor
-SEEN_EDGES = (10_000.0, 30_000.0, 100_000.0)  # pixels in all frames together
+SEEN_EDGES = (10_000.0, 30_000.0, 100_000.0)  # visible pixels, summed over all frames
 _ON = {"floor": "on the floor", "furniture": "on furniture", "thing": "on a thing", "wall": "on a wall"}
 
 
 @dataclass(frozen=True)
 class Share:
-    """So many of so many."""
+    """A proportion: `found` of `count`."""
 
     found: int
     count: int
 
     @property
     def value(self) -> float:
-        """The share; not a number where there is nothing to find."""
+        """The proportion; NaN if `count` is 0."""
         return self.found / self.count if self.count else float("nan")
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval: where the true rate lies if these objects were drawn at random."""
+        """The 95 % Wilson score interval."""
         return wilson(self.found, self.count)
 
 
 @dataclass(frozen=True)
 class Bin:
-    """The objects of one kind."""
+    """Recall of the objects in one bin."""
 
     name: str
     recall_25: Share
@@ -47,7 +47,7 @@ class Bin:
 
 
 def wilson(found: int, count: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a rate; (0, 1) where nothing was counted."""
+    """Return the 95 % Wilson score interval of a proportion; (0, 1) if `count` is 0."""
     from scipy.stats import binomtest
 
     if not count:
@@ -57,11 +57,11 @@ def wilson(found: int, count: int) -> tuple[float, float]:
 
 
 def breakdown(records: Sequence[dict[str, Any]]) -> dict[str, list[Bin]]:
-    """Return recall by "size", "support", "gap" and "seen"; empty bins are left out, the last bin is "all".
+    """Bin records by "size", "support", "gap" and "seen"; return the non-empty bins, the last one is "all".
 
     Args:
-        records: of evaluated true objects, with `longest_side_cm`, `support`, `gap_cm`, `visible_pixels`, `found_25`
-            and `found_50`.
+        records: evaluated true objects with `longest_side_cm`, `support`, `gap_cm`, `visible_pixels`, `found_25` and
+            `found_50`.
     """
     sizes = [_bin_name(r["longest_side_cm"], SIZE_EDGES_CM) for r in records]
     gaps = [_bin_name(np.inf if r["gap_cm"] is None else r["gap_cm"], GAP_EDGES_CM) for r in records]
@@ -75,7 +75,7 @@ def breakdown(records: Sequence[dict[str, Any]]) -> dict[str, list[Bin]]:
 
 
 def bin_names(edges: Sequence[float], unit: str = "cm") -> list[str]:
-    """Name the bins between edges: below the first, between two, from the last on."""
+    """Name the bins: below the first edge, between two edges, from the last edge."""
     inner = [f"{low:,g}–{high:,g} {unit}" for low, high in pairwise(edges)]
     return [f"< {edges[0]:,g} {unit}", *inner, f"≥ {edges[-1]:,g} {unit}"]
 
@@ -87,11 +87,8 @@ def _bin_name(value: float, edges: Sequence[float], unit: str = "cm") -> str:
 def _bins(records: Sequence[dict[str, Any]], names: Sequence[str], order: Iterable[str]) -> list[Bin]:
     groups = [(name, [r for r, n in zip(records, names) if n == name]) for name in order]
     groups = [group for group in groups if group[1]] + [("all", list(records))]
-    return [
-        Bin(
-            name,
-            Share(sum(bool(r["found_25"]) for r in group), len(group)),
-            Share(sum(bool(r["found_50"]) for r in group), len(group)),
-        )
-        for name, group in groups
-    ]
+    return [Bin(name, _share(group, "found_25"), _share(group, "found_50")) for name, group in groups]
+
+
+def _share(records: Sequence[dict[str, Any]], key: str) -> Share:
+    return Share(sum(bool(r[key]) for r in records), len(records))

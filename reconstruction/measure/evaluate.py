@@ -1,4 +1,4 @@
-"""Measure a scene: every metric of CONTRACT sections 4 and 5, and every stage whose result is still at hand."""
+"""Evaluate a scene: the metrics of CONTRACT sections 4 and 5, and figures of each stage with a kept result."""
 
 import json
 from collections.abc import Callable
@@ -10,32 +10,26 @@ import numpy as np
 
 from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.frames import HELD_OUT_EVERY
+from reconstruction.measure import stages as stage_figures
 from reconstruction.measure.alignment import Alignment, align
 from reconstruction.measure.ground_truth import GroundTruth
 from reconstruction.measure.object_boxes import instance_box_figures
 from reconstruction.measure.object_scores import score_graph, score_objects
 from reconstruction.measure.outlines import measure_outlines
 from reconstruction.measure.perceptual import perceptual_scores
+from reconstruction.measure.planes import planes_figures
 from reconstruction.measure.rendering import render_views, score_pictures, video_frames
-from reconstruction.measure.scene import (
-    PlacedMesh,
-    bundle_camera,
-    bundle_poses,
-    joined,
-    placed_meshes,
-)
+from reconstruction.measure.scene import PlacedMesh, bundle_camera, bundle_poses, joined, placed_meshes
 from reconstruction.measure.stage_results import StageResults
-from reconstruction.measure.surfaces import (
-    COMPOSITION_POINTS,
-    compare,
-    sample_seen,
-)
+from reconstruction.measure.surfaces import COMPOSITION_POINTS, compare, sample_seen
 from reconstruction.measure.visibility import spread_poses
 from registry import SceneBundle
 from registry.errors import UsageError
+from registry.report_card import physics_report
+from registry.simulation import specs_from_bundle
 
 SCHEMA = "simrecon.evaluation/1"
-COMPOSITION_BOUND_M = 0.05
+COMPOSITION_BOUND_M = 0.05  # of the F-score, CONTRACT section 4
 _PHYSICS_KEYS = (
     "stable_rate",
     "stable_rate_10cm_0.1rad",
@@ -47,26 +41,28 @@ _PHYSICS_KEYS = (
 
 @dataclass
 class Evaluation:
-    """What was measured of one scene. `metrics` has the names of CONTRACT 4 and 5; None is in `left_out`."""
+    """The evaluation of one scene; `metrics` has the names of CONTRACT sections 4 and 5."""
 
     scene: str
     revision: str
     ground_truth: str | None
     metrics: dict[str, float | None] = field(default_factory=dict)
     objects: list[dict[str, Any]] = field(default_factory=list)  # one per evaluated true object
-    extra: list[dict[str, Any]] = field(default_factory=list)  # found objects that match none of them
+    extra: list[dict[str, Any]] = field(default_factory=list)  # found objects without a match
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)  # metric or stage -> why
-    labels: str | None = None  # the file of outlines
+    left_out: dict[str, str] = field(default_factory=dict)  # metric or stage -> why it is missing
+    labels: str | None = None  # path of the outlines
     outlines: dict[str, Any] = field(default_factory=dict)  # `OutlineScores.to_json()`
 
+    def leave_out(self, reason: str, *names: str) -> None:
+        """Record why metrics or stages are missing."""
+        self.left_out.update(dict.fromkeys(names, reason))
+
     def to_json(self) -> dict[str, Any]:
-        """Return strict JSON values: what is not finite becomes null."""
-        return json.loads(json.dumps({"schema": SCHEMA, **asdict(self)}, default=float), parse_constant=_null)
-
-
-def _null(_: str) -> None:
-    return None
+        """Return strict JSON values; numbers that are not finite become null."""
+        return json.loads(
+            json.dumps({"schema": SCHEMA, **asdict(self)}, default=float), parse_constant=lambda _: None
+        )
 
 
 def evaluate_scene(
@@ -79,16 +75,16 @@ def evaluate_scene(
     composition_points: int = COMPOSITION_POINTS,
     progress: Progress = NO_PROGRESS,
 ) -> Evaluation:
-    """Evaluate a scene against the truth, or without it only what needs none (physics, rendering, registration).
+    """Evaluate a scene against ground truth, or without it what needs none (physics, rendering, registration).
 
     Args:
         bundle: the scene.
-        ground_truth: folder of CONTRACT section 3, or of cameras and depth only; None where there is no truth.
-        labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); None where there are none.
-        stages: the results of the scene's stages, for the figures per stage; None leaves them out.
-        video: the video, for kept-out frames, where the stages' results are gone; None: the one beside the truth.
-        composition_points: drawn on each side's whole surface; the contract's figures need the default.
-        progress: told of each part.
+        ground_truth: folder of CONTRACT section 3, or of cameras and depth only; may be None.
+        labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); may be None.
+        stages: results of the scene's stages, for figures per stage; None: no such figures.
+        video: gives held-out frames if the stage results are missing; None: the video beside the ground truth.
+        composition_points: samples per composition; the contract's figures need the default.
+        progress: advanced after each part.
 
     Raises:
         UsageError: the truth or the labels are malformed, or not of this video.
@@ -98,25 +94,25 @@ def evaluate_scene(
     stages = stages or StageResults({}, {})
     scene = placed_meshes(bundle)
     parts: list[Callable[[], None]] = [
-        lambda: _outlines(bundle, scene, labels, stages, video, out),
-        lambda: _cost(bundle, out),
-        lambda: _physics(bundle, out),
-        lambda: _rendering(bundle, scene, stages, _video_of(video, ground_truth), out),
+        lambda: _add_outlines(bundle, scene, labels, stages, video, out),
+        lambda: _add_cost(bundle, out),
+        lambda: _add_physics(bundle, out),
+        lambda: _add_rendering(bundle, scene, stages, _video_of(video, ground_truth), out),
     ]
     alignment = None
     if truth is not None:
         alignment = align(bundle_poses(bundle), truth.world_from_camera, truth.up)
         moved = [mesh.moved(alignment.true_from_estimated) for mesh in scene]
-        _cameras(alignment, truth, out)
+        _add_cameras(alignment, out)
         parts += [
-            lambda: _composition(moved, truth, stages, alignment, composition_points, out),
-            lambda: _objects(bundle, moved, truth, out),
-            lambda: _stage_figures(truth, stages, alignment, out),
+            lambda: _add_composition(moved, truth, stages, alignment, composition_points, out),
+            lambda: _add_objects(bundle, moved, truth, out),
+            lambda: _add_stages(truth, stages, alignment, out),
         ]
     else:
         reason = "no ground truth was given" if labels is None else "labels have outlines only"
         out.left_out["cameras, geometry, objects, graph"] = reason
-    parts.append(lambda: _gaussians(truth, alignment, stages, out))
+    parts.append(lambda: _add_gaussians(truth, alignment, stages, out))
     progress.start(len(parts), "measuring")
     for part in parts:
         part()
@@ -136,18 +132,19 @@ def _video_of(video: Path | None, ground_truth: Path | None) -> Path | None:
     return next((path for path in beside if path.is_file()), None)
 
 
-def _cost(bundle: SceneBundle, out: Evaluation) -> None:
+def _add_cost(bundle: SceneBundle, out: Evaluation) -> None:
     report = bundle.scene["report"]
     out.metrics["time_s"] = float(sum(report["timings_s"].values()))
     out.metrics["peak_memory_mb"] = float(report["peak_memory_mb"])
     out.metrics["objects"] = len(bundle.scene["objects"])
     registration = report.get("registration")
     if registration:
-        out.metrics["frames_chosen"] = registration["keyframes"]
-        out.metrics["frames_registered"] = registration["registered"]
+        out.metrics.update(
+            frames_chosen=registration["keyframes"], frames_registered=registration["registered"]
+        )
 
 
-def _outlines(
+def _add_outlines(
     bundle: SceneBundle,
     scene: list[PlacedMesh],
     labels: Path | None,
@@ -162,19 +159,16 @@ def _outlines(
     out.labels, out.outlines = str(labels), scores.to_json()
     out.metrics.update(scores.metrics)
     if scores.metrics["outline_edges"] is None:
-        out.left_out["outline_edges"] = (
-            "no thing and its parent are both found, or the labels have no parents"
+        out.leave_out(
+            "no object is found together with its parent, or the labels have no parents", "outline_edges"
         )
     if scores.without_camera:
         numbers = ", ".join(map(str, scores.without_camera))
-        out.left_out[f"outlines of frame {numbers}"] = "the scene has no camera of it"
+        out.leave_out("the scene has no camera for it", f"outlines of frame {numbers}")
 
 
-def _physics(bundle: SceneBundle, out: Evaluation) -> None:
-    from registry.report_card import physics_report
-    from registry.simulation import specs_from_bundle
-
-    report = physics_report(specs_from_bundle(bundle), bundle.edges)
+def _add_physics(bundle: SceneBundle, out: Evaluation) -> None:
+    report = physics_report(specs_from_bundle(bundle), bundle.edges)  # pyright: ignore[reportArgumentType] - frozen
     out.metrics.update({key: report[key] for key in _PHYSICS_KEYS})
     out.metrics["dynamic_objects"] = report["dynamic_objects"]
     assembled = [o["assembly"] for o in bundle.scene["objects"] if "assembly" in o]
@@ -189,7 +183,7 @@ def _physics(bundle: SceneBundle, out: Evaluation) -> None:
     }
 
 
-def _rendering(
+def _add_rendering(
     bundle: SceneBundle, scene: list[PlacedMesh], stages: StageResults, video: Path | None, out: Evaluation
 ) -> None:
     camera = bundle_camera(bundle)
@@ -201,13 +195,13 @@ def _rendering(
     elif video is not None:
         frames, source = video_frames(video, sorted(poses), camera), "as decoded from the video"
     else:
-        reason = "the kept-out frames are gone; give --video, or reconstruct again"
-        out.left_out.update({"psnr_db": reason, "ssim": reason, "coverage": reason})
+        reason = "the held-out frames are not stored; give --video, or reconstruct the scene again"
+        out.leave_out(reason, "psnr_db", "ssim", "coverage")
         return
     indices = sorted(set(poses) & set(frames))
     if not indices:
-        reason = "no kept-out frame could be registered (a small folder of images has none)"
-        out.left_out.update({"psnr_db": reason, "ssim": reason, "coverage": reason})
+        reason = "no held-out frame could be registered (a small folder of images has none)"
+        out.leave_out(reason, "psnr_db", "ssim", "coverage")
         return
     pictures, covered = render_views(
         [(m.visual, m.world_from_mesh) for m in scene], camera, [poses[i] for i in indices]
@@ -215,7 +209,7 @@ def _rendering(
     true = [frames[i] for i in indices]
     score = score_pictures(pictures, covered, true)
     if score is None:
-        out.left_out["psnr_db"] = out.left_out["ssim"] = "the scene covers no pixel of the kept-out frames"
+        out.leave_out("the scene covers no pixel of the held-out frames", "psnr_db", "ssim")
         out.metrics["coverage"] = 0.0
         return
     out.metrics.update(psnr_db=score.psnr_db, ssim=score.ssim, coverage=score.coverage)
@@ -225,7 +219,7 @@ def _rendering(
     out.left_out.update(missing)
 
 
-def _cameras(alignment: Alignment, truth: GroundTruth, out: Evaluation) -> None:
+def _add_cameras(alignment: Alignment, out: Evaluation) -> None:
     out.metrics.update(
         ate_cm=alignment.ate_cm,
         scale_error=abs(alignment.scale - 1),
@@ -235,7 +229,7 @@ def _cameras(alignment: Alignment, truth: GroundTruth, out: Evaluation) -> None:
     )
 
 
-def _composition(
+def _add_composition(
     scene: list[PlacedMesh],
     truth: GroundTruth,
     stages: StageResults,
@@ -243,24 +237,19 @@ def _composition(
     count: int,
     out: Evaluation,
 ) -> None:
-    from reconstruction.measure.stages import sensor_surface, surface_figures
-
-    poses = spread_poses(list(truth.world_from_camera.values()))
+    poses = spread_poses(truth.poses)
     if truth.entities:
-        true_seen = sample_seen(*joined([e.mesh for e in truth.entities]), truth.camera, poses, count)
+        true_seen = sample_seen(*truth.mesh, truth.camera, poses, count)
     else:
-        # What a depth sensor measured stands for the surface; it tells of no normals worth comparing.
-        true_seen = sensor_surface(truth)
-        out.left_out["nc"] = "the truth is a depth sensor's points, without normals"
+        true_seen = stage_figures.sensor_surface(truth)
+        out.leave_out("the truth is a depth sensor's points, without normals", "nc")
     if not len(true_seen.points):
-        reason = "the truth has neither meshes nor depth"
-        out.left_out.update({"cd_cm": reason, "f_5cm": reason, "nc": reason})
+        out.leave_out("the truth has neither meshes nor depth", "cd_cm", "f_5cm", "nc")
         return
     estimated = sample_seen(*joined(scene), truth.camera, poses, count)
     score = compare(estimated, true_seen, COMPOSITION_BOUND_M)
     if score is None:
-        reason = "no part of the scene is where the true cameras look"
-        out.left_out.update({"cd_cm": reason, "f_5cm": reason, "nc": reason})
+        out.leave_out("no part of the scene is visible to the true cameras", "cd_cm", "f_5cm", "nc")
     else:
         out.metrics.update(cd_cm=score.cd_cm, f_5cm=score.f)
         out.metrics.update(accuracy_cm=score.accuracy_cm, completeness_cm=score.completeness_cm)
@@ -268,16 +257,18 @@ def _composition(
             out.metrics["nc"] = score.nc
     surface = stages.get("surface")
     if surface is not None:
-        figures = surface_figures(surface, alignment, truth, true_seen, COMPOSITION_BOUND_M, count)
+        figures = stage_figures.surface_figures(
+            surface, alignment, truth, true_seen, COMPOSITION_BOUND_M, count
+        )
         if not truth.entities:
             figures.pop("nc", None)
         out.stages["surface"] = figures
 
 
-def _objects(bundle: SceneBundle, scene: list[PlacedMesh], truth: GroundTruth, out: Evaluation) -> None:
+def _add_objects(bundle: SceneBundle, scene: list[PlacedMesh], truth: GroundTruth, out: Evaluation) -> None:
     if not truth.entities:
-        for name in ("object_recall_25", "object_precision_25", "object_cd_cm", "object_f_1cm", "graph_f1"):
-            out.left_out[name] = "the truth has no entities"
+        names = ("object_recall_25", "object_precision_25", "object_cd_cm", "object_f_1cm", "graph_f1")
+        out.leave_out("the truth has no entities", *names)
         return
     scores = score_objects([m for m in scene if not m.base], truth)
     edges, base = bundle.scene["graph"]["edges"], [m for m in scene if m.base]
@@ -286,50 +277,39 @@ def _objects(bundle: SceneBundle, scene: list[PlacedMesh], truth: GroundTruth, o
     out.objects, out.extra = scores.records, scores.extra
 
 
-def _stage_figures(truth: GroundTruth, stages: StageResults, alignment: Alignment, out: Evaluation) -> None:
-    from reconstruction.measure import stages as figures
-    from reconstruction.measure.planes import planes_figures
-
+def _add_stages(truth: GroundTruth, stages: StageResults, alignment: Alignment, out: Evaluation) -> None:
     posed, depth = stages.in_world()
     surface, instances = stages.get("surface"), stages.get("instances")
     if posed is None:
         return
-    out.stages["poses"] = figures.poses_figures(posed, alignment, truth)
+    out.stages["poses"] = stage_figures.poses_figures(posed, alignment, truth)
     if depth is not None:
-        _keep(out, "depth", figures.depth_figures(posed, depth, alignment, truth), "the truth has no meshes")
+        figures = stage_figures.depth_figures(posed, depth, alignment, truth)
+        if figures is None:
+            out.leave_out("the truth has no meshes", "stage depth")
+        else:
+            out.stages["depth"] = figures
     if surface is not None:
-        shown = figures.surface_depth_figures(posed, surface, alignment, truth)
-        out.stages.setdefault("surface", {}).update(
-            {f"depth_{key}": value for key, value in (shown or {}).items()}
-        )
+        figures = stage_figures.surface_depth_figures(posed, surface, alignment, truth) or {}
+        out.stages.setdefault("surface", {}).update({f"depth_{key}": value for key, value in figures.items()})
         found = planes_figures(surface, alignment, truth)
         if found is not None:
             out.stages["surface"]["planes"] = found
     if surface is not None and instances is not None:
         if truth.entities:
-            on_surface = figures.instance_figures_3d(surface, instances, alignment, truth)
-            per_view = figures.instance_figures_2d(posed, surface, instances, truth)
+            on_surface = stage_figures.instance_figures_3d(surface, instances, alignment, truth)
+            per_view = stage_figures.instance_figures_2d(posed, surface, instances, truth)
             boxes = instance_box_figures(surface, instances, alignment, truth)
             out.stages["instances"] = {"surface": on_surface, "per_view": per_view, "boxes": boxes}
         else:
             out.left_out["stage instances"] = "the truth has no entities"
 
 
-def _gaussians(
+def _add_gaussians(
     truth: GroundTruth | None, alignment: Alignment | None, stages: StageResults, out: Evaluation
 ) -> None:
-    """Kept-out frames as the Gaussians show them, which needs no truth; their depth against it where there is one."""
-    from reconstruction.measure import stages as figures
-
     posed, _ = stages.in_world()
     gaussians, depth = stages.refined_in_world()
-    if posed is None or gaussians is None:
+    if posed is None or gaussians is None or depth is None:
         return
-    out.stages["gaussians"] = figures.gaussians_figures(posed, gaussians, depth, alignment, truth)
-
-
-def _keep(out: Evaluation, stage: str, figures: dict | None, reason: str) -> None:
-    if figures is None:
-        out.left_out[f"stage {stage}"] = reason
-    else:
-        out.stages[stage] = figures
+    out.stages["gaussians"] = stage_figures.gaussians_figures(posed, gaussians, depth, alignment, truth)

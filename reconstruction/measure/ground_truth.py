@@ -1,6 +1,6 @@
 """Read a ground-truth folder (CONTRACT section 3; docs/evaluation.md).
 
-Two forms: `scene.json` with cameras and entities, and `cameras.json` with a sensor's own tracking and no entities.
+It holds `scene.json` with cameras and entities, or `cameras.json` with tracked cameras only.
 """
 
 import json
@@ -13,18 +13,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reconstruction.core.types import Camera
+from reconstruction.measure.scene import joined
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
     import trimesh
 
-_MIN_VISIBLE_PIXELS, _AT_PIXELS = 2000, 640 * 480
+_MIN_VISIBLE_PIXELS, _AT_PIXELS = (
+    2000,
+    640 * 480,
+)  # CONTRACT section 4: least visible pixels, at this image size
 _MILLIMETRE = np.float32(1e-3)
 
 
 @dataclass(frozen=True)
 class TrueEntity:
-    """One true thing: floor, wall or object."""
+    """A true object or base surface."""
 
     id: int
     name: str
@@ -38,34 +42,45 @@ class TrueEntity:
 
     @cached_property
     def mesh(self) -> "trimesh.Trimesh":
-        """The true surface in world space, in metres."""
+        """The complete surface in world space, in metres.
+
+        Raises:
+            UsageError: the file cannot be read or has no triangles.
+        """
         import trimesh
 
         try:
             mesh = trimesh.load(self.mesh_path, force="mesh", process=False)
         except Exception as error:  # trimesh raises whatever its many readers raise
             raise UsageError(f"ground truth: {self.mesh_path} cannot be read as a mesh: {error}") from error
-        if not len(mesh.faces):
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             raise UsageError(f"ground truth: {self.mesh_path} has no triangles")
         return mesh
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lower and upper corner (2, 3) of the axis-aligned bounding box."""
+        bounds = self.mesh.bounds
+        assert bounds is not None  # the mesh has triangles
+        return bounds
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """What is true of a capture. Entities are empty where only cameras (and depth) are known."""
+    """The ground truth of a capture; without entities if only cameras (and depth) are known."""
 
     folder: Path
     camera: Camera
     world_from_camera: Mapping[int, np.ndarray]  # video frame number -> float64 (4, 4), OpenCV
     entities: tuple[TrueEntity, ...]
-    up: np.ndarray  # float64 (3,) unit, against gravity, in the truth's own world
+    up: np.ndarray  # float64 (3,) unit vector against gravity, in the true world
 
     @classmethod
     def load(cls, folder: Path) -> "GroundTruth":
-        """Read a folder.
+        """Read a ground-truth folder, or its subfolder `ground_truth`.
 
         Raises:
-            UsageError: it is missing or malformed.
+            UsageError: the folder is missing or malformed.
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -89,7 +104,7 @@ class GroundTruth:
 
     @property
     def evaluated(self) -> tuple[TrueEntity, ...]:
-        """Objects that are seen well enough to be asked for (2,000 pixels of a 640x480 video, in proportion)."""
+        """The evaluated objects: those with 2,000 visible pixels at 640x480, in proportion to the image size."""
         least = _MIN_VISIBLE_PIXELS * self.camera.width * self.camera.height / _AT_PIXELS
         return tuple(e for e in self.entities if not e.base and e.visible_pixels >= least)
 
@@ -98,18 +113,33 @@ class GroundTruth:
         """Floor, walls and ceiling."""
         return tuple(e for e in self.entities if e.base)
 
+    @cached_property
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """All entities as one mesh: vertices (v, 3) in the true world, faces (f, 3)."""
+        return joined([e.mesh for e in self.entities])
+
+    @cached_property
+    def face_ids(self) -> np.ndarray:
+        """Entity id int64 (f,) of each face of `mesh`."""
+        return np.repeat([e.id for e in self.entities], [len(e.mesh.faces) for e in self.entities])
+
+    @property
+    def poses(self) -> list[np.ndarray]:
+        """All true poses world_from_camera (4, 4)."""
+        return list(self.world_from_camera.values())
+
     def depth(self, index: int) -> np.ndarray | None:
-        """Return float32 (h, w) z-depth in metres of a video frame, 0 where unknown; None where there is no file."""
+        """Read the z-depth of a video frame: float32 (h, w) in metres, 0 = unknown; None if there is no file."""
         image = self._image("depth", index)
         return None if image is None else image.astype(np.float32) * _MILLIMETRE
 
     def instances(self, index: int) -> np.ndarray | None:
-        """Return uint16 (h, w) entity ids of a video frame; None where there is no file."""
+        """Read the entity ids of a video frame: uint16 (h, w), 0 = none; None if there is no file."""
         image = self._image("instances", index)
         return None if image is None else image.astype(np.uint16)
 
     def indices(self, kind: str) -> list[int]:
-        """Return the frame numbers that have `depth` or `instances`."""
+        """Return the video frames that have an image of `kind` ("depth" or "instances")."""
         return sorted(int(path.stem) for path in (self.folder / kind).glob("*.png") if path.stem.isdigit())
 
     def _image(self, kind: str, index: int) -> np.ndarray | None:
@@ -125,15 +155,8 @@ class GroundTruth:
 
 
 def _camera(data: dict) -> Camera:
-    k = data["intrinsics"]
-    return Camera(
-        int(data["width"]),
-        int(data["height"]),
-        float(k["fx"]),
-        float(k["fy"]),
-        float(k["cx"]),
-        float(k["cy"]),
-    )
+    intrinsics = [float(data["intrinsics"][name]) for name in ("fx", "fy", "cx", "cy")]
+    return Camera(int(data["width"]), int(data["height"]), *intrinsics)
 
 
 def _poses(data: dict) -> dict[int, np.ndarray]:
@@ -144,7 +167,7 @@ def _poses(data: dict) -> dict[int, np.ndarray]:
             raise ValueError(
                 f"frame {frame['index']}: world_from_camera has shape {pose.shape}, expected (4, 4)"
             )
-        if np.isfinite(pose).all():  # a sensor that lost track writes NaN
+        if np.isfinite(pose).all():  # frames where tracking was lost have NaN
             poses[int(frame["index"])] = pose
     if not poses:
         raise ValueError("no frame has a pose")

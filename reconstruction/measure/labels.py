@@ -1,11 +1,11 @@
-"""Are coarse labels right as often as they say? True names beside them, and a table of confidence against truth."""
+"""Calibration of coarse labels: a reliability table of confidence against accuracy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 UNKNOWN = "unknown"
-# What may truly be called by each coarse label. What is in no row has no coarse label that would be right.
+# Coarse label -> true names that it is correct for. A true name in no row has no correct coarse label.
 MEANS: dict[str, frozenset[str]] = {
     label: frozenset(words.split(", "))
     for label, words in {
@@ -27,12 +27,12 @@ MEANS: dict[str, frozenset[str]] = {
         "lamp": "lamp, desk lamp, floor lamp",
     }.items()
 }
-BINS = (0.0, 0.3, 0.45, 0.6, 0.75, 1.0)
+BINS = (0.0, 0.3, 0.45, 0.6, 0.75, 1.0)  # edges of confidence
 
 
 @dataclass(frozen=True)
 class Guess:
-    """What a thing was called, how surely, and what it truly is ("" where it is no true thing at all)."""
+    """A predicted label, its confidence, and the true name ("" for an object that matches no true one)."""
 
     label: str
     confidence: float
@@ -40,23 +40,23 @@ class Guess:
 
     @property
     def right(self) -> bool:
-        """Tell whether the label is a word for what the thing is."""
+        """Whether the label is correct for the true name."""
         return self.truth.lower().replace("_", " ") in MEANS.get(self.label, frozenset([self.label]))
 
 
 @dataclass(frozen=True)
 class Bin:
-    """Guesses of about the same confidence."""
+    """The guesses in one interval of confidence."""
 
     low: float
     high: float
     count: int
-    confidence: float  # mean of what was said
-    right: float  # share that is
+    confidence: float  # mean
+    right: float  # share of correct labels
 
 
 def reliability(guesses: Sequence[Guess]) -> list[Bin]:
-    """Return the bins that hold any guess; `unknown` says nothing and is left out."""
+    """Bin the guesses by confidence, without `unknown` labels; return the non-empty bins."""
     out = []
     for low, high in pairwise(BINS):
         inside = [
@@ -65,19 +65,16 @@ def reliability(guesses: Sequence[Guess]) -> list[Bin]:
             if g.label != UNKNOWN and low <= g.confidence and (g.confidence < high or high == 1.0)
         ]
         if inside:
-            out.append(
-                Bin(
-                    low,
-                    high,
-                    len(inside),
-                    sum(g.confidence for g in inside) / len(inside),
-                    sum(g.right for g in inside) / len(inside),
-                )
+            count = len(inside)
+            confidence, right = (
+                sum(g.confidence for g in inside) / count,
+                sum(g.right for g in inside) / count,
             )
+            out.append(Bin(low, high, count, confidence, right))
     return out
 
 
 def overconfidence(guesses: Sequence[Guess]) -> float:
-    """Return by how much the mean confidence exceeds the share that is right; negative where labels are too modest."""
+    """Return mean confidence minus accuracy, without `unknown` labels; negative: underconfident."""
     said = [g for g in guesses if g.label != UNKNOWN]
     return sum(g.confidence - g.right for g in said) / len(said) if said else 0.0

@@ -1,12 +1,16 @@
-"""One-to-one matching of objects by the overlap of their boxes, and the scene graph after it."""
+"""Match objects one to one by IoU, match base surfaces, and score scene graphs."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from scipy.spatial import KDTree
+
+IOU_BOUNDS = (0.25, 0.5)  # CONTRACT sections 4 and 5
+EdgeTriple = tuple[object, object, object]  # (child, relation, parent)
 
 
 def box_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the IoU (n, m) of axis-aligned boxes (n, 2, 3) and (m, 2, 3): lower and upper corners."""
+    """Compute the IoU (n, m) of axis-aligned boxes (n, 2, 3) and (m, 2, 3), given by lower and upper corner."""
     a, b = np.asarray(a, np.float64).reshape(-1, 2, 3), np.asarray(b, np.float64).reshape(-1, 2, 3)
     low = np.maximum(a[:, None, 0], b[None, :, 0])
     high = np.minimum(a[:, None, 1], b[None, :, 1])
@@ -17,7 +21,7 @@ def box_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def match(iou: np.ndarray, bound: float) -> list[tuple[int, int]]:
-    """Pair rows with columns one to one so that the summed IoU of the pairs of at least `bound` is the greatest."""
+    """Return the one-to-one pairs (row, column) with IoU >= `bound` that maximize the summed IoU (Hungarian)."""
     from scipy.optimize import linear_sum_assignment
 
     if not iou.size:
@@ -27,11 +31,8 @@ def match(iou: np.ndarray, bound: float) -> list[tuple[int, int]]:
     return [(int(r), int(c)) for r, c in zip(rows, columns) if iou[r, c] >= bound]
 
 
-EdgeTriple = tuple[object, str, object]  # (child, relation, parent)
-
-
 def graph_f1(estimated: Iterable[EdgeTriple], true: Iterable[EdgeTriple]) -> float:
-    """F1 of two sets of (child, relation, parent), between 0 and 1; 1 where both are empty."""
+    """Return the F1 score, 0 to 1, of two sets of edges; 1 if both are empty."""
     estimated, true = set(estimated), set(true)
     if not estimated and not true:
         return 1.0
@@ -39,20 +40,18 @@ def graph_f1(estimated: Iterable[EdgeTriple], true: Iterable[EdgeTriple]) -> flo
 
 
 def match_base(estimated: Sequence, true: Sequence) -> dict[int, int]:
-    """Say which true floor or wall each estimated one is: the nearest, of the same label where there is one.
+    """Assign each estimated base surface the nearest true one, of the same label if there is any.
 
     Args:
         estimated: items with `id`, `label`, `vertices` and `faces`, in the true world.
         true: items with `id`, `label` and `mesh`.
 
     Returns:
-        Estimated id -> true id. Two estimated walls may be parts of the same true one.
+        Estimated id -> true id; not one to one, since two estimated walls may be parts of one true wall.
     """
-    from scipy.spatial import cKDTree
-
     from reconstruction.measure.surfaces import sample
 
-    trees = {e.id: cKDTree(sample(e.mesh.vertices, e.mesh.faces, 20_000).points) for e in true}
+    trees = {e.id: KDTree(sample(e.mesh.vertices, e.mesh.faces, 20_000).points) for e in true}
     out = {}
     for item in estimated:
         candidates = [e for e in true if e.label == item.label] or list(true)

@@ -1,33 +1,33 @@
-"""What makes a true object easy or hard to find: its size, what it stands on, how near its neighbor is."""
+"""Facts of true objects for breakdowns of recall: size, support, distance to the nearest neighbor."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
 from reconstruction.measure.surfaces import sample
 
 SUPPORTS = ("floor", "furniture", "thing", "wall")
-_SAMPLES = 10_000
-_NEIGHBORS_REFINED = 3
-_STEPS = 60
-_CONVERGED_M = 1e-6
+_SAMPLES = 10_000  # points per object for approximate distances
+_NEIGHBORS_REFINED = 3  # nearest neighbors by samples whose exact distance is computed
+_STEPS, _CONVERGED_M = 60, 1e-6  # limits of the alternating projection
 
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """Facts of one true object; they depend on the truth alone."""
+    """Facts of one true object, from the truth alone."""
 
-    longest_side_m: float  # of its smallest upright box
+    longest_side_m: float  # of its smallest upright bounding box
     support: str  # of SUPPORTS, see `support_of`
-    gap_m: float  # between its surface and the nearest other thing's; inf where there is none
-    neighbor: int | None  # that thing's id
+    gap_m: float  # distance between its surface and the nearest other object's; inf without one
+    neighbor: int | None  # id of that object
 
 
 def object_facts(truth: GroundTruth) -> dict[int, ObjectFacts]:
-    """Return the facts of every object of a truth by id, whether it is seen well enough to be evaluated or not."""
+    """Compute the facts of all true objects by id, evaluated or not."""
     things = [e for e in truth.entities if not e.base]
-    by_id = {e.id: e for e in truth.entities}
+    by_id: dict[int | None, TrueEntity] = {e.id: e for e in truth.entities}
     gaps = _gaps(things, by_id)
     return {
         e.id: ObjectFacts(longest_side(np.asarray(e.mesh.vertices)), support_of(e, by_id), *gaps[e.id])
@@ -43,11 +43,11 @@ def longest_side(vertices: np.ndarray) -> float:
     return float(max(*sides, np.ptp(vertices[:, 2])))
 
 
-def support_of(entity: TrueEntity, by_id: dict[int, TrueEntity]) -> str:
-    """Say what an object is on.
+def support_of(entity: TrueEntity, by_id: dict[int | None, TrueEntity]) -> str:
+    """Classify the support of an object as one of SUPPORTS.
 
-    "wall": it is attached to something. "floor": it stands there. "furniture": it stands on what stands on the floor or
-    hangs on a wall. "thing": it stands on anything else, such as a plate on a table.
+    "wall": attached to anything. "floor": on the base. "furniture": on an object that is on the base or attached.
+    "thing": on any other object, such as a plate on a table.
     """
     if entity.relation == "attached_to":
         return "wall"
@@ -59,55 +59,56 @@ def support_of(entity: TrueEntity, by_id: dict[int, TrueEntity]) -> str:
     return "furniture" if on_base or parent.relation == "attached_to" else "thing"
 
 
-def _gaps(things: list[TrueEntity], by_id: dict[int, TrueEntity]) -> dict[int, tuple[float, int | None]]:
-    """Return by id the distance to the nearest thing that neither carries the object nor is carried by it."""
-    from scipy.spatial import cKDTree
-
+def _gaps(
+    things: list[TrueEntity], by_id: dict[int | None, TrueEntity]
+) -> dict[int, tuple[float, int | None]]:
+    """Return per id the distance to, and id of, the nearest object that is not connected to it by support."""
     triangles = {e.id: np.asarray(e.mesh.triangles, np.float64) for e in things}
     points = {
         e.id: np.concatenate([sample(e.mesh.vertices, e.mesh.faces, _SAMPLES).points, e.mesh.vertices])
         for e in things
     }
-    trees = {i: cKDTree(p) for i, p in points.items()}
-    carriers = {e.id: _carriers(e, by_id) for e in things}
+    trees = {i: KDTree(p) for i, p in points.items()}
+    supports = {e.id: _ancestors(e, by_id) for e in things}
     out: dict[int, tuple[float, int | None]] = {}
     for a in things:
         others = [
-            b for b in things if b is not a and b.id not in carriers[a.id] and a.id not in carriers[b.id]
+            b for b in things if b is not a and b.id not in supports[a.id] and a.id not in supports[b.id]
         ]
         near: list[tuple[float, int, np.ndarray, np.ndarray]] = []
         for b in sorted(others, key=lambda b: _box_distance(a, b)):
             if len(near) >= _NEIGHBORS_REFINED and _box_distance(a, b) > near[0][0]:
-                break  # this one and all after it are farther than what was found
-            distance, nearest = trees[b.id].query(points[a.id])
+                break  # the lower bound of this and all later ones exceeds the smallest distance found
+            distance, nearest = map(np.atleast_1d, trees[b.id].query(points[a.id]))
             at = int(np.argmin(distance))
             near.append((float(distance[at]), b.id, points[a.id][at], points[b.id][nearest[at]]))
             near.sort(key=lambda item: item[:2])
         exact = [
-            (_approach(triangles[a.id], triangles[i], p, q), i) for _, i, p, q in near[:_NEIGHBORS_REFINED]
+            (_surface_distance(triangles[a.id], triangles[i], p, q), i)
+            for _, i, p, q in near[:_NEIGHBORS_REFINED]
         ]
         out[a.id] = min(exact, default=(float("inf"), None))
     return out
 
 
 def _box_distance(a: TrueEntity, b: TrueEntity) -> float:
-    """Return the distance between the axis-aligned boxes of two things, which theirs cannot be below."""
-    (low_a, high_a), (low_b, high_b) = a.mesh.bounds, b.mesh.bounds
+    """Return the distance between two axis-aligned bounding boxes, a lower bound of the surface distance."""
+    (low_a, high_a), (low_b, high_b) = a.bounds, b.bounds
     return float(np.linalg.norm(np.maximum(0.0, np.maximum(low_a - high_b, low_b - high_a))))
 
 
-def _carriers(entity: TrueEntity, by_id: dict[int, TrueEntity]) -> set[int]:
-    """Return all that the object stands on or hangs from, down to the base."""
+def _ancestors(entity: TrueEntity, by_id: dict[int | None, TrueEntity]) -> set[int]:
+    """Return the ids of the object's ancestors in the scene graph."""
     out: set[int] = set()
     parent = entity.parent
-    while parent in by_id and parent not in out:
+    while parent is not None and parent in by_id and parent not in out:
         out.add(parent)
         parent = by_id[parent].parent
     return out
 
 
-def _approach(a: np.ndarray, b: np.ndarray, p: np.ndarray, q: np.ndarray) -> float:
-    """Return the distance between triangles (n, 3, 3) and (m, 3, 3), found by stepping from a near pair of points."""
+def _surface_distance(a: np.ndarray, b: np.ndarray, p: np.ndarray, q: np.ndarray) -> float:
+    """Minimize the distance of triangles (n, 3, 3) and (m, 3, 3) by alternating projection from points p, q (3,)."""
     before = float(np.linalg.norm(p - q))
     for _ in range(_STEPS):
         q = _closest_point(b, p)
@@ -120,7 +121,7 @@ def _approach(a: np.ndarray, b: np.ndarray, p: np.ndarray, q: np.ndarray) -> flo
 
 
 def _closest_point(triangles: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return the point (3,) of triangles (n, 3, 3) that is nearest to a point (3,)."""
+    """Return the closest point (3,) on triangles (n, 3, 3) to a point (3,)."""
     from trimesh.triangles import closest_point
 
     near = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))

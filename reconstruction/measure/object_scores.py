@@ -1,4 +1,4 @@
-"""Objects of a scene against the true ones: which were found, how good their surfaces are, how they are related."""
+"""Score the objects of a scene against the true ones: detection, complete surface, scene graph."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,27 +6,27 @@ from typing import Any
 import numpy as np
 
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
-from reconstruction.measure.matching import graph_f1, match_base
-from reconstruction.measure.object_boxes import IOU_BOUNDS, match_boxes, object_records
+from reconstruction.measure.matching import IOU_BOUNDS, graph_f1, match_base
+from reconstruction.measure.object_boxes import match_boxes, object_records
 from reconstruction.measure.object_facts import object_facts
 from reconstruction.measure.scene import PlacedMesh
 from reconstruction.measure.surfaces import OBJECT_POINTS, compare, sample
 
-OBJECT_BOUND_M = 0.01
+OBJECT_BOUND_M = 0.01  # of the F-score, CONTRACT section 4
 
 
 @dataclass(frozen=True)
 class ObjectScores:
-    """What `score_objects` returns."""
+    """The result of `score_objects`."""
 
     metrics: dict[str, float | None]
     records: list[dict[str, Any]]  # one per evaluated true object
-    extra: list[dict[str, Any]]  # found objects that match none of them
-    true_of: dict[int, int]  # id of a found object -> id of the true one that it was matched with
+    extra: list[dict[str, Any]]  # found objects without a match
+    true_of: dict[int, int]  # id of a found object -> id of its true match
 
 
 def score_objects(found: list[PlacedMesh], truth: GroundTruth) -> ObjectScores:
-    """Match found objects (in the true world) with the true ones by their boxes and compare the matched surfaces."""
+    """Match found objects, moved to the true world, with the evaluated true ones by boxes; compare their surfaces."""
     wanted = list(truth.evaluated)
     matched = match_boxes(wanted, np.array([m.bounds for m in found]))
     pairs = matched.pairs[IOU_BOUNDS[0]]
@@ -49,23 +49,19 @@ def _mean_or_none(values: list[float]) -> float | None:
 
 
 def _surface_score(entity: TrueEntity, found: PlacedMesh | None) -> dict[str, Any]:
-    """Compare complete surfaces; a miss counts as the object's diagonal and as 0."""
-    out: dict[str, Any] = {}
-    score = None
-    if found is not None:
-        out["found_label"] = found.label
-        true = sample(entity.mesh.vertices, entity.mesh.faces, OBJECT_POINTS)
-        score = compare(sample(found.vertices, found.faces, OBJECT_POINTS), true, OBJECT_BOUND_M)
+    """Compare complete surfaces; a miss gets the object's diagonal as Chamfer distance and 0 as F-score."""
+    diagonal = float(np.linalg.norm(entity.bounds[1] - entity.bounds[0]))
+    miss = {"cd_cm": 100 * diagonal, "f_1cm": 0.0}
+    if found is None:
+        return miss
+    out = {"found_label": found.label}
+    true = sample(entity.mesh.vertices, entity.mesh.faces, OBJECT_POINTS)
+    score = compare(sample(found.vertices, found.faces, OBJECT_POINTS), true, OBJECT_BOUND_M)
     if score is None:
-        diagonal = float(np.linalg.norm(entity.mesh.bounds[1] - entity.mesh.bounds[0]))
-        return {**out, "cd_cm": 100 * diagonal, "f_1cm": 0.0}
-    center = found.bounds.mean(axis=0) - entity.mesh.bounds.mean(axis=0)
-    return {
-        **out,
-        "cd_cm": score.cd_cm,
-        "f_1cm": score.f,
-        "center_error_cm": float(100 * np.linalg.norm(center)),
-    }
+        return out | miss
+    center = found.bounds.mean(axis=0) - entity.bounds.mean(axis=0)
+    error_cm = float(100 * np.linalg.norm(center))
+    return out | {"cd_cm": score.cd_cm, "f_1cm": score.f, "center_error_cm": error_cm}
 
 
 def score_graph(
@@ -75,9 +71,9 @@ def score_graph(
     true_of: dict[int, int],
     records: list[dict[str, Any]],
 ) -> dict[str, float]:
-    """Return F1 of the edges over everything evaluated, and over matched children only.
+    """Return the F1 score of the scene graph over all evaluated objects and over matched children only.
 
-    Writes `relation_right` into the record of each object that was matched and has an edge.
+    Also sets `relation_right` in the record of each matched object with an edge.
     """
     base_of = match_base(base, truth.base)
 
@@ -94,9 +90,5 @@ def score_graph(
         if child in edge_of:
             record["relation_right"] = edge_of[child] in true
     matched = {("true", i) for i in true_of.values()}
-    return {
-        "graph_f1": graph_f1(estimated, true),
-        "graph_f1_matched": graph_f1(
-            {e for e in estimated if e[0] in matched}, {e for e in true if e[0] in matched}
-        ),
-    }
+    of_matched = [{e for e in side if e[0] in matched} for side in (estimated, true)]
+    return {"graph_f1": graph_f1(estimated, true), "graph_f1_matched": graph_f1(*of_matched)}

@@ -1,8 +1,8 @@
-"""The truth in place of a stage's output, to see what that stage costs the end result.
+"""Replace the output of a stage by ground truth, to measure how much the stage's error costs the end result.
 
-`simrecon reconstruct VIDEO --oracle depth --ground-truth DIR` runs everything as usual but takes the depth maps from
-the true meshes. Whatever the oracle hands over is expressed in the spaces that the stages before it left, so that only
-the one stage's error is gone. Oracle runs are for measuring; their bundles say what they are.
+`simrecon reconstruct VIDEO --oracle depth --ground-truth DIR` runs all stages but takes the depth maps from the true
+meshes. The output is expressed in the space of the preceding stages, so that only the error of one stage is removed.
+The bundle of such a run names the replaced stages.
 """
 
 import hashlib
@@ -32,33 +32,36 @@ from reconstruction.core.types import (
 from reconstruction.depth.images import sized_camera
 from reconstruction.measure.alignment import Alignment, align
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
-from reconstruction.measure.scene import joined
+from reconstruction.measure.surfaces import nearest_entities
 from reconstruction.poses import PosesConfig, estimate_poses
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
+    from reconstruction.core.mesh_graph import MeshGraph
+    from reconstruction.instances.cut import Thing
     from reconstruction.pipeline import Call
 
 ORACLE_STAGES = ("poses", "depth", "world", "instances")
-_NEAR_TRUTH_M = 0.05
-_MIN_VERTICES = 30
+_NEAR_TRUTH_M = 0.05  # farther vertices belong to no entity
+_MIN_VERTICES = 30  # entities with fewer are no instances
+_SAMPLES = 40_000  # per object, to find nearest surfaces
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """Which stages the truth stands in for."""
+    """The stages that ground truth replaces."""
 
     stages: tuple[str, ...]
     truth: GroundTruth
-    digest: str  # of the truth, part of the fingerprints of the stages that it replaces
+    digest: str  # SHA-256 of the truth's files, part of the fingerprints of the replaced stages
 
     @classmethod
     def load(cls, stages: Sequence[str], ground_truth: Path | None) -> "Oracle":
-        """Read the truth for some stages.
+        """Read the ground truth for some stages.
 
         Raises:
-            UsageError: a stage has no oracle, or the truth lacks what it needs.
+            UsageError: a stage cannot be replaced, or the truth lacks what it needs.
         """
         unknown = sorted(set(stages) - set(ORACLE_STAGES))
         if unknown:
@@ -79,11 +82,11 @@ class Oracle:
         return cls(tuple(s for s in ORACLE_STAGES if s in stages), truth, digest.hexdigest())
 
     def of_stage(self, stage: str) -> list[str]:
-        """Return what belongs into a stage's fingerprint: nothing where the stage runs as usual."""
+        """Return additional parts of a stage's fingerprint; none if the stage is not replaced."""
         return [self.digest, code_digest(__name__)] if stage in self.stages else []
 
     def make(self, stage: str, call: "Call") -> Any:
-        """Return the artifact of a stage, computed from the ground truth."""
+        """Compute the artifact of a stage from the ground truth."""
         call.progress.note(f"{stage}: taken from the ground truth")
         if stage == "poses":
             return self.poses(call["frames"], call.options, work_dir=call.scratch, progress=call.progress)
@@ -96,19 +99,15 @@ class Oracle:
     def poses(
         self, frames: FrameSet, config: PosesConfig, *, work_dir: Path, progress: Progress
     ) -> PosedFrames:
-        """Return the frames with true cameras and the points that our own matches give with them."""
+        """Return the frames with the true cameras, and points triangulated from our own matches with them."""
         camera, truth = self.truth.camera, self.truth.world_from_camera
         work_dir.mkdir(parents=True, exist_ok=True)
         path = work_dir / "transforms.json"
         wanted = sorted({int(i) for i in (*frames.indices, *frames.held_out_indices)} & set(truth))
         names = _image_names(frames)
         data = {
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
+            **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
+            **{"cx": camera.cx, "cy": camera.cy},
             "frames": [
                 {
                     "file_path": names[i] if names else f"frame_{i:06d}.png",
@@ -122,9 +121,9 @@ class Oracle:
         return estimate_poses(frames, config, work_dir=work_dir, progress=progress)
 
     def depth(self, posed: PosedFrames, camera: Camera) -> DepthMaps:
-        """Return depth maps of the true meshes, in the units of the poses."""
+        """Render depth maps of the true meshes at the aligned cameras, in the units of the poses."""
         alignment = self._align(posed)
-        vertices, faces = joined([e.mesh for e in self.truth.entities])
+        vertices, faces = self.truth.mesh
         depth = np.stack(
             [
                 rasterize_mesh(vertices, faces, camera, alignment.pose_to_true(pose)).depth
@@ -135,11 +134,11 @@ class Oracle:
         return DepthMaps(camera, depth, np.where(depth > 0, 2, 0).astype(np.uint8))
 
     def world(self, posed: PosedFrames) -> WorldFrame:
-        """Return the similarity to the true world."""
+        """Return the similarity from sfm to the true world."""
         alignment = self._align(posed)
         return WorldFrame(
             world_from_sfm=alignment.true_from_estimated,
-            scale=ScaleEstimate("ground-truth", 0.0, "an oracle run: the truth gave the scale"),
+            scale=ScaleEstimate("ground-truth", 0.0, "an oracle run: the scale is that of the ground truth"),
             gravity_method="ground-truth",
             gravity_sigma_deg=0.0,
             floor_observed=True,
@@ -147,18 +146,19 @@ class Oracle:
         )
 
     def instances(self, posed: PosedFrames, depth: DepthMaps, surface: Surface) -> InstanceSet:
-        """Return the true things: each surface vertex belongs to the nearest true surface within 5 cm."""
+        """Return the true instances: each surface vertex gets the nearest true entity within 5 cm."""
         from reconstruction.core.mesh_graph import MeshGraph
         from reconstruction.instances.describe import describe
 
         alignment = self._align(posed)
         entities = [e for e in self.truth.entities if e.visible_pixels > 0]
-        owner = _owners(surface, entities, alignment)
+        points = alignment.to_true(surface.vertices)
+        owner = nearest_entities(points, entities, _SAMPLES, _NEAR_TRUTH_M)
         entities = [e for e in entities if (owner == e.id).sum() >= _MIN_VERTICES]
         graph = MeshGraph.from_surface(surface)
         base = _base(entities, owner, graph, posed)
         planes = [e for e in entities if e.base]
-        # An assumed floor, where none was seen, stands before them and is nobody's truth.
+        # If no true floor is visible, `base` begins with an assumed one.
         numbers = {e.id: b.id for e, b in zip(planes, base[len(base) - len(planes) :])}
         things = _things(entities, owner)
         vertex_instance = np.zeros(len(owner), np.int32)
@@ -174,9 +174,11 @@ class Oracle:
     def _id_maps(
         self, posed: PosedFrames, depth: DepthMaps, alignment: Alignment, numbers: dict[int, int]
     ) -> np.ndarray:
+        vertices, faces = self.truth.mesh
         entities = self.truth.entities
-        vertices, faces = joined([e.mesh for e in entities])
-        face_number = np.concatenate([np.full(len(e.mesh.faces), numbers.get(e.id, 0)) for e in entities])
+        face_number = np.repeat(
+            [numbers.get(e.id, 0) for e in entities], [len(e.mesh.faces) for e in entities]
+        )
         maps = np.zeros(np.shape(depth.depth), np.uint16)
         for row, pose in enumerate(posed.world_from_camera):
             face = rasterize_mesh(vertices, faces, depth.camera, alignment.pose_to_true(pose)).face
@@ -192,28 +194,17 @@ class Oracle:
 
 
 def _image_names(frames: FrameSet) -> list[str]:
-    """Return the file names of a folder of images; nothing for a video."""
+    """Return the file names of a folder of images; [] for a video."""
     from reconstruction.frames.decoding import ImageFolder
 
     source = Path(frames.source.file)
     return [path.name for path in ImageFolder(source).files] if source.is_dir() else []
 
 
-def _owners(surface: Surface, entities: list[TrueEntity], alignment: Alignment) -> np.ndarray:
-    """Return the true id (v,) of each surface vertex, 0 where no true surface is near."""
-    from scipy.spatial import cKDTree
-
-    from reconstruction.measure.surfaces import sample
-
-    samples = [sample(e.mesh.vertices, e.mesh.faces, 80_000 if e.base else 40_000).points for e in entities]
-    ids = np.concatenate([np.full(len(p), e.id) for p, e in zip(samples, entities)])
-    tree = cKDTree(np.concatenate(samples))
-    distance, nearest = tree.query(alignment.to_true(surface.vertices), workers=-1)
-    return np.where(distance < _NEAR_TRUTH_M, ids[np.minimum(nearest, len(ids) - 1)], 0)
-
-
-def _base(entities, owner: np.ndarray, graph, posed: PosedFrames):
-    """Fit a plane to the seen part of each true floor and wall; floors come first, as the stages expect."""
+def _base(
+    entities: list[TrueEntity], owner: np.ndarray, graph: "MeshGraph", posed: PosedFrames
+) -> tuple[BaseEntity, ...]:
+    """Fit a plane to the visible vertices of each true base surface; floors come first, as later stages expect."""
     from reconstruction.instances.base import assumed_floor
     from reconstruction.surface.base_planes import base_outline
 
@@ -235,8 +226,8 @@ def _base(entities, owner: np.ndarray, graph, posed: PosedFrames):
     return tuple(out)
 
 
-def _things(entities: list[TrueEntity], owner: np.ndarray) -> dict:
-    """Return the stage's own description of each true object: its vertices, what it rests on, whether it hangs."""
+def _things(entities: list[TrueEntity], owner: np.ndarray) -> dict[int, "Thing"]:
+    """Convert each true object to the segment type of the instances stage: vertices, support, attachment."""
     from reconstruction.instances.cut import Thing
 
     things = {

@@ -1,4 +1,4 @@
-"""A file of labels in, `OutlineLabels` out: the project's own format, COCO or labelme, told by its keys."""
+"""Read a file of outlines in the project's own format, COCO or labelme, recognized by its keys."""
 
 import json
 from collections.abc import Sequence
@@ -12,22 +12,21 @@ from registry.errors import UsageError
 _KNOWN = (
     "simrecon labels (`frames`, `things`), COCO (`images`, `annotations`), labelme (`shapes`, `imagePath`)"
 )
-
-_SEE = "docs/evaluation.md has the formats"
+_SEE = "docs/evaluation.md describes the formats"
 
 
 def load_outlines(path: Path, names: Sequence[str] | None = ()) -> OutlineLabels:
-    """Read labels: CONTRACT section 5, COCO polygons, or labelme (one file a picture, or a folder of such files).
+    """Read outlines: CONTRACT section 5, COCO polygons, or labelme (one file per image, or a folder of them).
 
-    COCO and labelme name pictures, not frames: the number in `frame_00120.jpg` is the video frame. Of a scene that was
-    made from a folder of images, the picture's place in name order is.
+    COCO and labelme name images. The frame index is the number in the name (`frame_00120.jpg`), or the position in name
+    order for a scene made from a folder of images.
 
     Args:
         path: the file, or the folder of labelme files.
-        names: files of the folder of images in name order; empty for a video; None: a folder that is not at hand.
+        names: image files of the scene in name order; empty for a video; None for a folder that is missing.
 
     Raises:
-        UsageError: the file is missing or malformed, of no known format, or names a picture that is no frame.
+        UsageError: the file is missing, malformed or of no known format, or an image is not a frame of the scene.
     """
     path = Path(path)
     try:
@@ -59,10 +58,10 @@ def _read(path: Path, names: Sequence[str] | None) -> OutlineLabels:
     if {"shapes", "imagePath"} <= keys:
         return from_labelme(path, {path: data}, names)
     if "intrinsics" in keys:
-        raise UsageError(f"labels {path}: these are true cameras; give the folder, {path.parent}")
+        raise UsageError(f"labels {path}: this file holds true cameras; give the folder, {path.parent}")
     if "frames" in keys:
         return _from_contract(path, data)
-    raise UsageError(f"labels {path}: of no known format; known are {_KNOWN}")
+    raise UsageError(f"labels {path}: no known format; known are {_KNOWN}")
 
 
 def _json(path: Path) -> Any:
@@ -79,6 +78,6 @@ def _from_contract(path: Path, data: dict) -> OutlineLabels:
     if "things" in data:
         things = {name: facts.get("parent") for name, facts in data["things"].items()}
         kinds = {name: facts["kind"] for name, facts in data["things"].items() if "kind" in facts}
-    else:  # nothing but outlines is said of them
+    else:  # the file has outlines only
         things, kinds = {o.name: None for frame in frames for o in frame.outlines}, {}
     return OutlineLabels(path, tuple(frames), things, kinds, frozenset(data.get("ignore", [])))

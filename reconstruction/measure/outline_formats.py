@@ -1,4 +1,4 @@
-"""COCO and labelme files in, `OutlineLabels` out. The name of a class is the name of a thing: one thing, one name."""
+"""Convert COCO and labelme files to `OutlineLabels`; each class name names one object."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,16 +9,16 @@ import numpy as np
 
 from reconstruction.measure.outline_labels import LabelledFrame, Outline, OutlineLabels, points, whole
 
-IGNORE = "ignore"  # shapes of this name are ignored regions
+IGNORE = "ignore"  # name of shapes that are ignored regions
 
 
 def from_coco(path: Path, data: dict, names: Sequence[str] | None) -> OutlineLabels:
-    """Read COCO: a category is a thing, an annotation its polygons, in the file's order from back to front.
+    """Convert COCO: a category is an object, an annotation its polygons; file order is back to front.
 
-    Crowds (`iscrowd`) and annotations of the category `ignore` are ignored regions.
+    Crowds (`iscrowd`) and annotations of the category `ignore` are ignored regions. `names`: see `load_outlines`.
 
     Raises:
-        ValueError: an annotation has no polygons, two of one picture have the same category, a reference leads nowhere.
+        ValueError: an annotation has no polygons, a category occurs twice in one image, or a reference is invalid.
     """
     category = {c["id"]: str(c["name"]) for c in data.get("categories", [])}
     outlines: dict[Any, list[Outline]] = {image["id"]: [] for image in data["images"]}
@@ -36,8 +36,8 @@ def from_coco(path: Path, data: dict, names: Sequence[str] | None) -> OutlineLab
             continue
         if any(outline.name == name for outline in outlines[picture]):
             raise ValueError(
-                f"{where}: image {picture} has two annotations of {name!r}; give two things two categories, and pieces "
-                "of one thing one annotation"
+                f"{where}: image {picture} has two annotations of {name!r}; give two objects two categories, and put "
+                "all polygons of one object into one annotation"
             )
         outlines[picture] += [Outline(name, polygon) for polygon in polygons]
     frames = [
@@ -49,7 +49,7 @@ def from_coco(path: Path, data: dict, names: Sequence[str] | None) -> OutlineLab
             tuple(ignored[image["id"]]),
         )
         for image in data["images"]
-        if outlines[image["id"]] or ignored[image["id"]]  # pictures without annotations are not labelled
+        if outlines[image["id"]] or ignored[image["id"]]  # images without annotations count as unlabelled
     ]
     return _labels(path, frames)
 
@@ -57,29 +57,29 @@ def from_coco(path: Path, data: dict, names: Sequence[str] | None) -> OutlineLab
 def _coco_polygons(segmentation: Any, where: str) -> list[np.ndarray]:
     if not isinstance(segmentation, list) or not segmentation:
         raise ValueError(
-            f"{where}: `segmentation` is no list of polygons; export polygons instead of masks (RLE)"
+            f"{where}: `segmentation` is not a list of polygons; export polygons instead of masks (RLE)"
         )
     out = []
     for numbers in segmentation:
         flat = np.array(numbers, np.float64)
         if flat.ndim != 1 or flat.size % 2:
-            raise ValueError(f"{where}: a polygon of COCO is a flat list x1, y1, x2, y2, …")
+            raise ValueError(f"{where}: a COCO polygon is a flat list x1, y1, x2, y2, …")
         out.append(flat.reshape(-1, 2))
     return out
 
 
 def from_labelme(path: Path, files: Mapping[Path, Any], names: Sequence[str] | None) -> OutlineLabels:
-    """Read labelme, one file a picture: a label is a thing; shapes in the file's order from back to front.
+    """Convert labelme, one file per image: a label is an object; file order is back to front.
 
-    Shapes of one label in one file are pieces of one thing and share a `group_id`.
+    Shapes with the same label in one file are parts of one object and share a `group_id`. `names`: see `load_outlines`.
 
     Raises:
-        ValueError: a file is something else, a shape is no polygon or rectangle, two things have the same label.
+        ValueError: a file has another format, a shape is no polygon or rectangle, or two objects have the same label.
     """
     frames = []
     for file, data in files.items():
         if not isinstance(data, dict) or not {"shapes", "imagePath"} <= set(data):
-            raise ValueError(f"{file.name} is no labelme file; give one labels file instead of the folder")
+            raise ValueError(f"{file.name} is not a labelme file; give one labels file instead of the folder")
         outlines, ignored, groups = [], [], {}
         for shape in data["shapes"]:
             name, polygon = str(shape["label"]), _labelme_polygon(shape, file)
@@ -89,7 +89,7 @@ def from_labelme(path: Path, files: Mapping[Path, Any], names: Sequence[str] | N
             group = shape.get("group_id")
             if name in groups and (group is None or groups[name] != group):
                 raise ValueError(
-                    f"{file.name}: two shapes are {name!r}; give two things two labels, and pieces of one thing the "
+                    f"{file.name}: two shapes are {name!r}; give two objects two labels, and parts of one object the "
                     "same group id"
                 )
             groups[name] = group
@@ -111,15 +111,15 @@ def _labelme_polygon(shape: dict, file: Path) -> np.ndarray:
 
 
 def frame_of(picture: str, names: Sequence[str] | None) -> int:
-    """Return the frame that a picture's file shows, by the names of all pictures or by the number in its own.
+    """Return the frame index of an image file: its position in `names`, or for a video the number in its name.
 
     Raises:
-        ValueError: the picture is not among the images, or its name has not exactly one number.
+        ValueError: `names` is None or lacks the image, or its name does not contain exactly one number.
     """
     stem = Path(picture.replace("\\", "/")).stem
     if names is None:
         raise ValueError(
-            f"which frame {picture} is cannot be told: the scene was made from a folder of images, which is gone; "
+            f"the frame index of {picture} is unknown, because the scene's folder of images is missing; "
             "give it with `simrecon evaluate --video FOLDER`"
         )
     if names:
@@ -130,8 +130,8 @@ def frame_of(picture: str, names: Sequence[str] | None) -> int:
     digits = re.fullmatch(r"\D*(\d+)\D*", stem)
     if digits is None:
         raise ValueError(
-            f"which frame {picture} is cannot be told; name pictures by the number of their video frame, "
-            "for example frame_00120.jpg"
+            f"the frame index of {picture} is unknown; name images by the number of their video frame, for example "
+            "frame_00120.jpg"
         )
     return int(digits[1])
 

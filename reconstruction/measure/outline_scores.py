@@ -1,4 +1,4 @@
-"""Outlines and a scene in, recall, precision and relations out: one-to-one matching by IoU over the labelled frames."""
+"""Score a scene against outlines: recall, precision and relations after one-to-one matching by mask IoU."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reconstruction.measure.matching import match
+from reconstruction.measure.matching import IOU_BOUNDS, match
 from reconstruction.measure.outline_labels import BASE_NAMES, OutlineLabels
 from reconstruction.measure.outline_views import OutlineView, draw_views
 from reconstruction.measure.scene import PlacedMesh
@@ -16,19 +16,18 @@ from registry.errors import UsageError
 if TYPE_CHECKING:
     from reconstruction.poses.lens import Lens
 
-IOU_BOUNDS = (0.25, 0.5)
-_LEAST_SHARE = 0.0008  # of a frame that an object covers to be counted for precision
+_LEAST_SHARE = 0.0008  # CONTRACT section 5: of a frame, that an object must cover to count for precision
 
 
 @dataclass(frozen=True)
 class OutlineScores:
-    """What `score_outlines` returns."""
+    """The result of `score_outlines`."""
 
-    metrics: dict[str, float | None]  # names of CONTRACT section 5, the IoU in percent at their end
-    things: list[dict[str, Any]]  # one record a thing that is asked for
-    extra: list[dict[str, Any]]  # objects that count for precision and match no thing
-    views: tuple[OutlineView, ...]  # frames that were measured, in the labels' order
-    without_camera: tuple[int, ...]  # labelled frames of which the scene has no camera
+    metrics: dict[str, float | None]  # names of CONTRACT section 5, with the IoU bound in percent as suffix
+    things: list[dict[str, Any]]  # one record per evaluated outlined object
+    extra: list[dict[str, Any]]  # objects that count for precision and match no outline
+    views: tuple[OutlineView, ...]  # evaluated frames, in the labels' order
+    without_camera: tuple[int, ...]  # labelled frames without a camera in the scene
 
     def to_json(self) -> dict[str, Any]:
         """Return the records as JSON values."""
@@ -46,14 +45,14 @@ def score_outlines(
     """Compute `outline_recall`, `outline_precision` and `outline_edges` of a scene (CONTRACT section 5).
 
     Args:
-        bundle: the scene; its cameras and graph are read.
+        bundle: the scene, for its cameras and graph.
         meshes: all of its meshes, base included, in its world (`placed_meshes`).
-        labels: outlines on frames as filmed.
-        lens: from the film to the straightened frames of the bundle's cameras; None: the film has no distortion.
+        labels: outlines on frames of the video.
+        lens: distortion between the video and the bundle's undistorted cameras; None: no distortion.
 
     Raises:
-        UsageError: a labelled frame does not exist or has another shape than the film; no labelled frame has a camera;
-            nothing that is asked for is outlined.
+        UsageError: a labelled frame does not exist or has another aspect ratio than the video; no labelled frame has a
+            camera; no evaluated object is outlined.
     """
     views, without = draw_views(bundle, meshes, labels, lens)
     names = list(labels.things)
@@ -63,7 +62,7 @@ def score_outlines(
     asked = np.flatnonzero(~ignored & (counts[:, : len(names)].sum(axis=(0, 2)) > 0))
     if not len(asked):
         raise UsageError(
-            f"labels {labels.path}: nothing that is asked for is outlined in a frame with a camera"
+            f"labels {labels.path}: no object that is evaluated is outlined in a frame with a camera"
         )
     iou = _iou(counts)[asked]
     pairs = {bound: dict(match(iou, bound)) for bound in IOU_BOUNDS}
@@ -99,9 +98,9 @@ def score_outlines(
 
 
 def _shared_pixels(view: OutlineView, names: Sequence[str], ids: Sequence[int]) -> np.ndarray:
-    """Count pixels int64 (len(names) + 2, len(ids) + 1) by what is outlined (`label_map`) and which object shows.
+    """Count pixels by label (`label_map`) and rendered object: int64 (len(names) + 2, len(ids) + 1).
 
-    The last column is everything that is no object.
+    The last column counts base and background.
     """
     drawn = view.frame.label_map(names)
     column_of = np.full(max([0, *ids]) + 1, len(ids))
@@ -112,7 +111,7 @@ def _shared_pixels(view: OutlineView, names: Sequence[str], ids: Sequence[int]) 
 
 
 def _iou(counts: np.ndarray) -> np.ndarray:
-    """Return the IoU (things, objects) over all frames of counts (frames, things + 2, objects + 1)."""
+    """Compute the IoU (things, objects), summed over frames, from counts (frames, things + 2, objects + 1)."""
     shared = counts.sum(axis=0)
     both = shared[:-2, :-1]
     union = shared[:-2].sum(axis=1)[:, None] + shared[:, :-1].sum(axis=0)[None] - both
@@ -120,12 +119,12 @@ def _iou(counts: np.ndarray) -> np.ndarray:
 
 
 def _counted(counts: np.ndarray, ignored: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Tell which objects count for precision: large enough in some frame, and mostly outside of what is ignored.
+    """Return which objects count for precision: large enough in a frame, and mostly outside of ignored areas.
 
     Args:
-        counts: (frames, things + 2, objects + 1) as `_shared_pixels` has them.
-        ignored: (things,) whether a thing is not asked for.
-        pixels: (frames,) of the whole frame.
+        counts: (frames, things + 2, objects + 1) of `_shared_pixels`.
+        ignored: bool (things,), outlined objects that are not evaluated.
+        pixels: (frames,) image size in pixels.
     """
     rows = np.array([*ignored, True, False])
     judged, not_judged = counts[:, ~rows, :-1].sum(axis=1), counts[:, rows, :-1].sum(axis=1)
@@ -136,14 +135,14 @@ def _counted(counts: np.ndarray, ignored: np.ndarray, pixels: np.ndarray) -> np.
 def _relations(
     bundle: SceneBundle, labels: OutlineLabels, match_of: dict[str, PlacedMesh]
 ) -> dict[str, bool]:
-    """Tell by name whether a matched thing has the right parent; things whose parent is not matched are left out."""
+    """Return by name whether a matched object has the right parent; without those whose parent is unmatched."""
     parent_of = {edge["child"]: edge["parent"] for edge in bundle.scene["graph"]["edges"]}
     base = {item["id"]: item["label"] for item in bundle.scene["base"]}
     out = {}
     for name, found in match_of.items():
-        parent = labels.things[name]
+        parent, estimated = labels.things[name], parent_of.get(found.id)
         if parent in match_of:
-            out[name] = parent_of.get(found.id) == match_of[parent].id
+            out[name] = estimated == match_of[parent].id
         elif parent in BASE_NAMES and parent not in labels.things:
-            out[name] = base.get(parent_of.get(found.id)) == parent
+            out[name] = base.get(estimated) == parent
     return out

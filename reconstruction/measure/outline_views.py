@@ -1,4 +1,4 @@
-"""The ids of a scene's objects drawn at the cameras of labelled frames, in the pixels of the film."""
+"""Render the object ids of a scene at the cameras of labelled frames, in the distorted pixels of the video."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,30 +16,26 @@ from registry.errors import UsageError
 if TYPE_CHECKING:
     from reconstruction.poses.lens import Lens
 
-_ASPECT_TOLERANCE = 0.02
+_ASPECT_TOLERANCE = 0.02  # relative
 
 
 @dataclass(frozen=True)
 class OutlineView:
-    """One labelled frame: what was drawn by hand, and what the scene shows there."""
+    """One labelled frame with its outlines and the rendered object ids."""
 
     frame: LabelledFrame
-    shown: np.ndarray  # int32 (h, w) id of the object at each pixel as filmed, 0 = base or nothing
+    shown: np.ndarray  # int32 (h, w) object id per pixel of the video frame, 0 = base or background
 
 
 def draw_views(
     bundle: SceneBundle, meshes: Sequence[PlacedMesh], labels: OutlineLabels, lens: "Lens | None"
 ) -> tuple[tuple[OutlineView, ...], tuple[int, ...]]:
-    """Draw the ids of a scene at each labelled frame that has a camera; also return the frames that have none.
+    """Render the object ids at each labelled frame with a camera; also return the labelled frames without one.
 
-    Args:
-        bundle: the scene; its cameras are read.
-        meshes: all of its meshes, base included, in its world.
-        labels: outlines on frames as filmed.
-        lens: from the film to the straightened frames of the bundle's cameras; None: the film has no distortion.
+    Arguments as of `score_outlines`.
 
     Raises:
-        UsageError: a labelled frame does not exist or has another shape than the film, or none has a camera.
+        UsageError: a labelled frame does not exist or has another aspect ratio than the video, or none has a camera.
     """
     camera, poses = bundle_camera(bundle), bundle_poses(bundle)
     count, where = bundle.scene["source"]["frame_count"], f"labels {labels.path}"
@@ -52,7 +48,7 @@ def draw_views(
         ratio = frame.width / frame.height * camera.height / camera.width
         if abs(ratio - 1) > _ASPECT_TOLERANCE:
             raise UsageError(
-                f"{where}: frame {frame.index} is {frame.width}x{frame.height}, but the film is "
+                f"{where}: frame {frame.index} is {frame.width}x{frame.height}, but the video is "
                 f"{camera.width}x{camera.height}; label whole upright frames, of any resolution"
             )
     with_camera = [frame for frame in labels.frames if frame.index in poses]
@@ -71,7 +67,7 @@ def draw_views(
 
 
 def _listed(numbers: Sequence[int], most: int = 12) -> str:
-    """Return at most `most` numbers, evenly chosen, as text."""
+    """Format at most `most` of the numbers, evenly chosen."""
     shown = [numbers[i] for i in np.linspace(0, len(numbers) - 1, min(most, len(numbers))).astype(int)]
     return ", ".join(map(str, shown)) + (", …" if len(shown) < len(numbers) else "")
 
@@ -84,9 +80,15 @@ def _faces_seen(
     size: tuple[int, int],
     lens: "Lens | None",
 ) -> np.ndarray:
-    """Return int32 (h, w): which triangle the film shows at the center of each pixel, -1 = none.
+    """Return the triangle int32 (h, w) at the center of each pixel of the distorted video frame, -1 = none.
 
-    `camera` is that of the straightened frames; `size` (width, height) is the picture's.
+    Args:
+        vertices: (v, 3) of the scene, world space.
+        faces: (f, 3).
+        camera: of the undistorted frames.
+        pose: world_from_camera (4, 4).
+        size: (width, height) of the output.
+        lens: distortion; None: none.
     """
     width, height = size
     camera = camera.resized(width, height)
@@ -95,17 +97,11 @@ def _faces_seen(
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     scale = np.array([lens.width / width, lens.height / height])
     source = lens.straightened(grid * scale) / scale
-    # The film shows more than the straightened frame, which is drawn with a margin as wide as it needs.
+    # The video frame can exceed the undistorted one, which is rendered with a margin as wide as needed.
     over = np.maximum(-source, source - np.array(size)).max(axis=0)
     margin_x, margin_y = (int(np.ceil(np.clip(side, 0, max(size)))) + 1 for side in over)
-    wide = Camera(
-        width + 2 * margin_x,
-        height + 2 * margin_y,
-        camera.fx,
-        camera.fy,
-        camera.cx + margin_x,
-        camera.cy + margin_y,
-    )
+    center = camera.cx + margin_x, camera.cy + margin_y
+    wide = Camera(width + 2 * margin_x, height + 2 * margin_y, camera.fx, camera.fy, *center)
     drawn = rasterize_mesh(vertices, faces, wide, pose).face
     column, row = np.floor(source + np.array([margin_x, margin_y])).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < wide.width) & (row < wide.height)

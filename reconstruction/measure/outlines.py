@@ -1,4 +1,4 @@
-"""A scene and a file of labels in, outline scores out: what ties frames, lens and labels together."""
+"""Score a scene against a file of outlines: reads the labels, estimates the lens distortion, compares."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,14 +21,14 @@ def measure_outlines(
     stages: StageResults,
     video: Path | None = None,
 ) -> OutlineScores:
-    """Measure a scene by outlines drawn by hand.
+    """Score a scene against outlines drawn by hand.
 
     Args:
         bundle: the scene.
         meshes: all of its meshes, base included, in its world.
-        labels: a file that `load_outlines` reads.
-        stages: where the frames are kept, the lens is measured on them; else the film counts as free of distortion.
-        video: the video or folder of images that the scene was made from, where the stages are gone.
+        labels: a file or folder for `load_outlines`.
+        stages: gives the frames to estimate the lens from; without them no distortion is assumed.
+        video: the scene's video or folder of images, if the stage results are missing.
 
     Raises:
         UsageError: the labels cannot be read, or are not of this scene.
@@ -45,7 +45,7 @@ def _lens(stages: StageResults) -> "Lens | None":
 
 
 def _picture_names(bundle: SceneBundle, stages: StageResults, video: Path | None) -> list[str] | None:
-    """Return the images of a folder in name order, nothing for a video, None where the folder is not at hand."""
+    """Return the image files in name order; [] for a video; None if the folder is missing."""
     from reconstruction.frames.decoding import ImageFolder
 
     posed = stages.get("poses")

@@ -1,4 +1,4 @@
-"""How well the surface stage's planes agree with the true ones: floor, walls and support tops of the true meshes."""
+"""Score the planes of the surface stage against the true ones: floor, walls and tops of supports."""
 
 from dataclasses import dataclass
 
@@ -8,36 +8,37 @@ import numpy as np
 from reconstruction.core.types import Surface, SurfacePlane
 from reconstruction.measure.alignment import Alignment
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
-from reconstruction.measure.scene import joined
 from reconstruction.measure.surfaces import sample
 from reconstruction.measure.visibility import seen_points, spread_poses
 from reconstruction.surface.base_planes import plane_axes
 from registry.geometry import split_similarity
 
-_MIN_SEEN_M2 = {"floor": 0.4, "wall": 0.4, "support": 0.05}
+_MIN_SEEN_M2 = {"floor": 0.4, "wall": 0.4, "support": 0.05}  # least visible area of an evaluated plane
 _SAMPLES_PER_M2, _FEWEST_SAMPLES = 2000.0, 400
-_LEVEL_DEG, _SAME_DEG, _SAME_M = 5.0, 2.0, 0.003  # what is level; what is one patch
-_OVER_FLOOR_M = 0.03
+_LEVEL_DEG = 5.0  # tolerance of horizontal and vertical
+_SAME_DEG, _SAME_M = 2.0, 0.003  # tolerances of triangles of one patch
+_OVER_FLOOR_M = 0.03  # lower supports are part of the floor, such as rugs
+# A match: greatest angle and offset, least share of the true points inside the outline, tolerance of its border.
 _MATCH_DEG, _MATCH_M, _MATCH_SHARE, _BORDER_M = 10.0, 0.01, 0.5, 0.02
 
 
 @dataclass(frozen=True)
 class TruePlane:
-    """A planar patch of the truth that the true cameras saw some of."""
+    """A planar patch of a true mesh that is partly visible to the true cameras."""
 
     label: str  # "floor" | "wall" | "support"
     entity: int
-    plane: np.ndarray  # float64 (4,), n towards free space
-    points: np.ndarray  # float64 (k, 3) area-uniform, those that some true camera sees
-    seen_m2: float
+    plane: np.ndarray  # float64 (4,), normal towards free space
+    points: np.ndarray  # float64 (k, 3) area-uniform samples visible to some true camera
+    seen_m2: float  # visible area
 
 
 def planes_figures(
     surface: Surface, alignment: Alignment, truth: GroundTruth
 ) -> dict[str, float | int] | None:
-    """Share of the true planes found, and their angle and offset errors; None where the truth has no meshes.
+    """Return the share of true planes found and their median angle and offset errors; None without true meshes.
 
-    A true plane is found by a plane of its kind within 10 degrees and 1 cm whose outline holds half of its seen points.
+    A match has the same label, is within 10 degrees and 1 cm, and its outline contains half of the visible points.
     """
     if not truth.entities:
         return None
@@ -60,12 +61,11 @@ def planes_figures(
 
 
 def true_planes(truth: GroundTruth) -> list[TruePlane]:
-    """Return what was seen of the true floor, walls and support tops.
+    """Extract the visible planar patches of floor, walls and supports (horizontal, facing up) from the true meshes.
 
-    A floor or wall counts from 0.4 m2 seen; a support is a level up-facing patch of which 0.05 m2 are seen.
+    Patches count from a visible area of 0.4 m2 (floor, wall) or 0.05 m2 (support).
     """
     patches = [patch for entity in truth.entities for patch in _patches(entity, truth.up)]
-    vertices, faces = joined([e.mesh for e in truth.entities])
     samples = []
     for _, _, _, triangles, area in patches:
         corners = np.arange(3 * len(triangles)).reshape(-1, 3)
@@ -73,8 +73,7 @@ def true_planes(truth: GroundTruth) -> list[TruePlane]:
         samples.append(sample(triangles.reshape(-1, 3), corners, count).points)
     if not samples:
         return []
-    poses = spread_poses(list(truth.world_from_camera.values()))
-    seen = seen_points(np.concatenate(samples), vertices, faces, truth.camera, poses)
+    seen = seen_points(np.concatenate(samples), *truth.mesh, truth.camera, spread_poses(truth.poses))
     ends = np.cumsum([len(points) for points in samples])
     out = []
     for (label, entity, plane, _, area), points, mark in zip(patches, samples, np.split(seen, ends[:-1])):
@@ -82,16 +81,15 @@ def true_planes(truth: GroundTruth) -> list[TruePlane]:
         if seen_m2 >= _MIN_SEEN_M2[label]:
             out.append(TruePlane(label, entity, plane, points[mark], seen_m2))
     floors = [true for true in out if true.label == "floor"]
-    return [t for t in out if t.label != "support" or not any(_lies_on(t, floor) for floor in floors)]
+    return [t for t in out if t.label != "support" or not any(_is_on_floor(t, floor) for floor in floors)]
 
 
-def _lies_on(support: TruePlane, floor: TruePlane) -> bool:
-    """Tell a rug from a support."""
+def _is_on_floor(support: TruePlane, floor: TruePlane) -> bool:
     return float(np.median(support.points @ floor.plane[:3] + floor.plane[3])) < _OVER_FLOOR_M
 
 
 def _patches(entity: TrueEntity, up: np.ndarray) -> list[tuple[str, int, np.ndarray, np.ndarray, float]]:
-    """Return (label, id, plane, triangles (f, 3, 3), area) of an entity's planar patches that may count."""
+    """Group coplanar triangles greedily; return (label, id, plane, triangles (f, 3, 3), area) of large patches."""
     label = entity.label if entity.base else "support"
     if label not in _MIN_SEEN_M2:
         return []
@@ -120,7 +118,7 @@ def _patches(entity: TrueEntity, up: np.ndarray) -> list[tuple[str, int, np.ndar
 def _best_error(
     true: TruePlane, found: tuple[SurfacePlane, ...], alignment: Alignment
 ) -> tuple[float, float] | None:
-    """Return (angle in degrees, offset in metres) of the nearest plane that covers the true one; None: missed."""
+    """Return the angle (degrees) and offset (metres) of the match with the smallest offset; None if missed."""
     _, rotation, _ = split_similarity(alignment.true_from_estimated)
     best = None
     for candidate in found:
@@ -139,7 +137,7 @@ def _best_error(
 
 
 def _inside(points: np.ndarray, polygon: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Tell which points (n, 3) lie over a polygon on a plane, or within 2 cm of it."""
+    """Return which points (n, 3), at most 4000, project into a polygon on a plane, with a tolerance of 2 cm."""
     axes = np.stack(plane_axes(plane), axis=1)
     outline = np.ascontiguousarray(polygon @ axes, np.float32)
     distance = [cv2.pointPolygonTest(outline, (float(u), float(v)), True) for u, v in points[:4000] @ axes]

@@ -1,4 +1,4 @@
-"""The assembled scene drawn at the cameras of kept-out frames, against those frames."""
+"""Render the assembled scene at held-out cameras and compare it with the held-out frames: PSNR, SSIM, coverage."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,26 +8,26 @@ import numpy as np
 from reconstruction.core.types import Camera, TexturedMesh
 from reconstruction.publish.preview import render_textured
 
-_SSIM_SIGMA = 1.5
+_SSIM_SIGMA = 1.5  # pixels, standard deviation of the window
 
 
 @dataclass(frozen=True)
 class RenderScore:
-    """Agreement of pictures over the pixels that the scene covers; means over frames."""
+    """Image similarity over the covered pixels; means over frames."""
 
     psnr_db: float
     ssim: float
-    coverage: float  # share of the pixels that the scene covers
+    coverage: float  # share of covered pixels
     frames: int
 
 
 def score_pictures(
     rendered: list[np.ndarray], covered: list[np.ndarray], true: list[np.ndarray]
 ) -> RenderScore | None:
-    """Compare pictures uint8 (h, w, 3) where `covered` (h, w) holds; frames with nothing covered count as coverage 0.
+    """Compare images uint8 (h, w, 3) over the covered pixels bool (h, w); None if no frame has any.
 
-    PSNR of a frame is 10 log10(255^2 / MSE over its covered pixels and channels). SSIM is Wang's, Gaussian window of
-    sigma 1.5, mean of the map over the covered pixels.
+    PSNR of a frame is 10 log10(255^2 / MSE over its covered pixels and channels). SSIM (Wang et al. 2004) has a
+    Gaussian window of sigma 1.5; its map is averaged over the covered pixels. Uncovered frames add coverage 0.
     """
     from skimage.metrics import structural_similarity
 
@@ -38,9 +38,9 @@ def score_pictures(
             continue
         error = (picture.astype(np.float64) - truth.astype(np.float64))[mask]
         psnr.append(10 * np.log10(255.0**2 / max(float((error**2).mean()), 1e-10)))
-        # Outside the covered part both pictures are made equal, so that the window does not see the background.
+        # Outside of the covered pixels both images are made equal, so that the background does not affect the window.
         filled = np.where(mask[..., None], picture, truth)
-        _, full = structural_similarity(
+        _, full = structural_similarity(  # pyright: ignore[reportAssignmentType]
             truth,
             filled,
             channel_axis=2,
@@ -59,7 +59,7 @@ def score_pictures(
 def render_views(
     meshes: list[tuple[TexturedMesh, np.ndarray]], camera: Camera, poses: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Draw textured meshes, each with its `world_from_mesh`; return pictures and which pixels they cover."""
+    """Render textured meshes, each with its `world_from_mesh`; return images and masks of covered pixels."""
     pictures, covered = [], []
     for pose in poses:
         picture, depth = render_textured(meshes, camera, pose)
@@ -69,7 +69,7 @@ def render_views(
 
 
 def video_frames(video: Path, indices: list[int], camera: Camera) -> dict[int, np.ndarray]:
-    """Decode some frames of a video (or read some images of a folder) at the size of a camera, as decoded."""
+    """Decode frames of a video, or read images of a folder, by index; resized to the camera, not undistorted."""
     import cv2
 
     from reconstruction.frames.decoding import ImageFolder, VideoReader

@@ -1,5 +1,6 @@
-"""The meshes of a bundle, placed."""
+"""Read the meshes and cameras of a bundle."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from registry.geometry import transform_points
 
 @dataclass(frozen=True)
 class PlacedMesh:
-    """One base surface or object of a scene, in some world."""
+    """One base surface or object of a scene, in the scene's or the true world."""
 
     id: int
     label: str
@@ -21,21 +22,21 @@ class PlacedMesh:
     dynamic: bool
     vertices: np.ndarray  # float64 (v, 3)
     faces: np.ndarray  # int32 (f, 3)
-    visual: TexturedMesh  # in its own space
-    world_from_mesh: np.ndarray  # float64 (4, 4) as the bundle has it
+    visual: TexturedMesh  # in object space
+    world_from_mesh: np.ndarray  # float64 (4, 4) of the bundle
 
     @property
     def bounds(self) -> np.ndarray:
-        """Lower and upper corner (2, 3) of its axis-aligned box."""
+        """Lower and upper corner (2, 3) of the axis-aligned bounding box."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def moved(self, b_from_a: np.ndarray) -> "PlacedMesh":
-        """Return it with its vertices taken to another world."""
+        """Return a copy with the vertices transformed to another world."""
         return replace(self, vertices=transform_points(b_from_a, self.vertices))
 
 
 def placed_meshes(bundle: SceneBundle) -> list[PlacedMesh]:
-    """Read every mesh of a bundle: base surfaces first, then objects, in the bundle's world."""
+    """Read all meshes of a bundle in its world: base surfaces first, then objects."""
     out = []
     for item in bundle.scene["base"]:
         mesh = read_glb(bundle.resolve(item["mesh"]))
@@ -44,37 +45,26 @@ def placed_meshes(bundle: SceneBundle) -> list[PlacedMesh]:
     for item in bundle.scene["objects"]:
         mesh = read_glb(bundle.resolve(item["visual"]))
         pose = np.asarray(item["world_from_object"], np.float64)
-        out.append(
-            PlacedMesh(
-                item["id"],
-                item["label"],
-                False,
-                bool(item["dynamic"]),
-                transform_points(pose, mesh.vertices),
-                mesh.faces,
-                mesh,
-                pose,
-            )
-        )
+        vertices, dynamic = transform_points(pose, mesh.vertices), bool(item["dynamic"])
+        out.append(PlacedMesh(item["id"], item["label"], False, dynamic, vertices, mesh.faces, mesh, pose))
     return out
 
 
-def joined(meshes: list) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (v, 3) and faces (f, 3) of several meshes as one."""
+def joined(meshes: Sequence) -> tuple[np.ndarray, np.ndarray]:
+    """Concatenate meshes with `vertices` and `faces`: float64 (v, 3) and int32 (f, 3)."""
     if not meshes:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     vertices = np.concatenate([np.asarray(m.vertices, np.float64) for m in meshes])
-    return vertices, np.concatenate([np.asarray(m.faces) + o for m, o in zip(meshes, offsets)]).astype(
-        np.int32
-    )
+    faces = np.concatenate([np.asarray(m.faces) + offset for m, offset in zip(meshes, offsets)])
+    return vertices, faces.astype(np.int32)
 
 
 def bundle_camera(bundle: SceneBundle) -> Camera:
     """Return the bundle's camera.
 
     Raises:
-        UsageError: it has lens distortion; pictures would have to be undistorted first.
+        UsageError: it has lens distortion.
     """
     cameras = bundle.cameras
     params = [float(x) for x in cameras.params]
@@ -87,6 +77,6 @@ def bundle_camera(bundle: SceneBundle) -> Camera:
 
 
 def bundle_poses(bundle: SceneBundle) -> dict[int, np.ndarray]:
-    """Return world_from_camera (4, 4) by video frame number."""
+    """Return world_from_camera (4, 4) by video frame."""
     cameras = bundle.cameras
     return {int(i): pose for i, pose in zip(cameras.indices, cameras.world_from_camera)}

@@ -1,4 +1,4 @@
-"""What the stages of a scene made, where the work folder still holds it."""
+"""Load the stage results of a scene from its work folder, as far as they still exist."""
 
 import json
 from dataclasses import dataclass, field
@@ -17,28 +17,28 @@ _MANIFEST = "manifest.json"
 
 @dataclass
 class StageResults:
-    """Artifacts of a scene's stages by name, loaded when first asked for (large arrays memory-mapped)."""
+    """Artifacts of a scene's stages by name, loaded lazily (large arrays memory-mapped)."""
 
     folders: dict[str, Path]
-    missing: dict[str, str]  # stage -> why its result cannot be had
+    missing: dict[str, str]  # stage -> why its result is unavailable
     work_dir: Path | None = None
     _loaded: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def find(cls, bundle: SceneBundle, registry_root: Path, work_dir: Path | None = None) -> "StageResults":
-        """Look for the results that the bundle was made from.
+        """Locate the results that a bundle was made from.
 
         Args:
             bundle: the scene.
-            registry_root: its registry; work folders lie beside it unless another was chosen.
-            work_dir: the folder that `simrecon reconstruct --work-dir` was given, if it was.
+            registry_root: its registry; the default work folders lie beside it.
+            work_dir: value of `simrecon reconstruct --work-dir`, if it was given.
         """
         work = bundle.scene["report"].get("volatile", {}).get("work")
         if not work:
-            reason = "the bundle does not say which stage results it was made from"
+            reason = "the bundle does not name the stage results that it was made from"
             return cls({}, {stage.name: reason for stage in STAGES})
         folder = work_dir or registry_root.parent / "work" / work["input_digest"][:16]
-        keys = {**work["stage_keys"], **_noted_keys(folder, bundle)}
+        keys = {**work["stage_keys"], **_latest_keys(folder, bundle)}
         folders, missing = {}, {}
         for number, stage in enumerate(STAGES, start=1):
             key = keys.get(stage.name)
@@ -48,13 +48,13 @@ class StageResults:
             if key is None:
                 missing[stage.name] = "this scene was made without the stage"
             elif not (place / _MANIFEST).is_file():
-                missing[stage.name] = f"{place} is gone; reconstruct the scene again to have it"
+                missing[stage.name] = f"{place} does not exist; reconstruct the scene again to create it"
             else:
                 folders[stage.name] = place
         return cls(folders, missing, folder)
 
     def get(self, stage: str) -> Any | None:
-        """Return a stage's artifact, or None where it is missing."""
+        """Return a stage's artifact; None if it is missing or damaged, see `missing`."""
         if stage not in self.folders:
             return None
         if stage not in self._loaded:
@@ -62,13 +62,13 @@ class StageResults:
             try:
                 self._loaded[stage] = artifacts.load(kind, self.folders[stage])
             except BundleError as error:
-                self.missing[stage] = f"{error}; reconstruct the scene again to have it"
+                self.missing[stage] = f"{error}; reconstruct the scene again to create it"
                 del self.folders[stage]
                 return None
         return self._loaded[stage]
 
     def in_world(self) -> tuple[PosedFrames | None, DepthMaps | None]:
-        """Return posed frames and depth maps as measured, in world space, in metres; None for what is missing."""
+        """Return the posed frames and the depth stage's maps in world space, in metres; None for missing ones."""
         world: WorldFrame | None = self.get("world")
         posed, depth = self.get("poses"), self.get("depth")
         if world is None:
@@ -76,15 +76,15 @@ class StageResults:
         return posed and world.apply_to(posed), depth and world.scale_depth(depth)
 
     def refined_in_world(self) -> tuple[Gaussians | None, DepthMaps | None]:
-        """Return the Gaussians and the depth maps that they corrected, in world space, in metres."""
+        """Return the Gaussians and the depth maps refined by them, in world space, in metres; None if missing."""
         world, scene = self.get("world"), self.get("gaussians")
         if world is None or scene is None:
             return None, None
         return scene.in_world(world), world.scale_depth(scene.depth)
 
 
-def _noted_keys(folder: Path, bundle: SceneBundle) -> dict[str, str]:
-    """Return the stages of the latest run that gave this very bundle, where the work folder knows of it."""
+def _latest_keys(folder: Path, bundle: SceneBundle) -> dict[str, str]:
+    """Return the stage keys of the latest run that produced this revision, if the work folder has a record of it."""
     try:
         noted = json.loads((folder / f"published-{bundle.scene['id']}.json").read_text())
     except (OSError, json.JSONDecodeError):

@@ -1,6 +1,6 @@
-"""Figures of single stages, so that a bad end result can be traced to where it began.
+"""Compare the artifacts of single stages with ground truth, to locate the stage that causes an error.
 
-Every function takes one stage's artifact in the estimated world (metres) and the alignment to the true one.
+Artifacts are in the estimated world, in metres; `alignment` maps it to the true one.
 """
 
 import numpy as np
@@ -11,19 +11,19 @@ from reconstruction.gaussians import Gaussians, evaluate_gaussians
 from reconstruction.measure.alignment import Alignment
 from reconstruction.measure.ground_truth import GroundTruth
 from reconstruction.measure.matching import match
-from reconstruction.measure.scene import joined
-from reconstruction.measure.surfaces import Samples, compare, sample_seen
+from reconstruction.measure.surfaces import Samples, compare, nearest_entities, sample_seen
 from reconstruction.measure.visibility import spread_poses
 from registry.geometry import transform_points
 
 _MAX_DEPTH_FRAMES = 24
-_FAR_M = 5.0
-_LARGE_ERROR = 0.05
-_NEAR_TRUTH_M = 0.03
+_FAR_M = 5.0  # farther pixels are not compared
+_LARGE_ERROR = 0.05  # relative
+_NEAR_TRUTH_M, _ENTITY_SAMPLES = 0.03, 30_000  # assignment of surface vertices to true entities
+_MIN_ENTITY_PX = 50  # smaller entities in a view are not evaluated
 
 
 def poses_figures(posed: PosedFrames, alignment: Alignment, truth: GroundTruth) -> dict[str, float]:
-    """Camera error after alignment, registered share, focal length."""
+    """Return camera errors after alignment, the share of registered frames and the focal length error."""
     true_fx = truth.camera.fx * posed.camera.width / truth.camera.width
     return {
         "ate_cm": alignment.ate_cm,
@@ -38,27 +38,27 @@ def poses_figures(posed: PosedFrames, alignment: Alignment, truth: GroundTruth) 
 def depth_figures(
     posed: PosedFrames, depth: DepthMaps, alignment: Alignment, truth: GroundTruth
 ) -> dict[str, float] | None:
-    """Relative depth error on up to 24 keyframes against the true meshes, drawn at the aligned cameras."""
+    """Return relative depth errors of up to 24 keyframes against the true meshes rendered at the aligned cameras.
+
+    None without true meshes, or if no pixel can be compared.
+    """
     if not truth.entities:
         return None
-    vertices, faces = joined([e.mesh for e in truth.entities])
     rows = np.unique(np.linspace(0, len(posed.images) - 1, _MAX_DEPTH_FRAMES).round().astype(int))
-    errors, measured, known, asked = [], [], 0, 0
+    errors, measured, asked = [], [], 0
     for row in rows:
         pose = alignment.pose_to_true(posed.world_from_camera[row])
-        true = rasterize_mesh(vertices, faces, depth.camera, pose).depth
-        estimated = np.asarray(depth.depth[row]) * alignment.scale
-        inside = (true > 0) & (true < _FAR_M)
-        both = inside & (estimated > 0)
-        asked, known = asked + int(inside.sum()), known + int(both.sum())
-        errors.append(np.abs(estimated[both] / true[both] - 1))
+        true = rasterize_mesh(*truth.mesh, depth.camera, pose).depth
+        relative, both, count = _relative_errors(np.asarray(depth.depth[row]) * alignment.scale, true)
+        asked += count
+        errors.append(relative)
         measured.append(np.asarray(depth.confidence[row])[both] >= 2)
     error, sure = np.concatenate(errors), np.concatenate(measured)
     if not len(error):
         return None
     return {
         **_depth_error(error),
-        "known_share": known / max(asked, 1),
+        "known_share": len(error) / max(asked, 1),
         "measured_share": float(sure.sum() / max(asked, 1)),
         "measured_median_rel": float(np.median(error[sure])) if sure.any() else float("nan"),
         "completed_median_rel": float(np.median(error[~sure])) if (~sure).any() else float("nan"),
@@ -73,10 +73,10 @@ def gaussians_figures(
     alignment: Alignment | None,
     truth: GroundTruth | None,
 ) -> dict[str, float | int | dict]:
-    """Kept-out frames as the Gaussians show them, over all pixels, at the frames' working resolution.
+    """Return the image quality of the Gaussians on held-out frames, over all pixels, at working resolution.
 
-    Where the truth has depth, the median relative error of their expected depth in those frames beside it; where it
-    has meshes, the figures of the keyframes' depth maps after the correction under `depth_maps`.
+    Adds the median relative error of their expected depth if the truth has depth images, and under `depth_maps` the
+    figures of the refined depth maps of the keyframes if it has meshes.
     """
     true_depth = None
     if truth is not None and alignment is not None:
@@ -105,21 +105,28 @@ def gaussians_figures(
 def surface_depth_figures(
     posed: PosedFrames, surface: Surface, alignment: Alignment, truth: GroundTruth
 ) -> dict[str, float] | None:
-    """Relative depth error of the fused surface, drawn at kept-out cameras, against the truth's depth images."""
-    errors, known, asked = [], 0, 0
+    """Return relative depth errors of the fused surface rendered at held-out cameras against true depth images."""
+    errors, asked = [], 0
     for index, pose in zip(posed.held_out_indices, posed.held_out_world_from_camera):
         true = truth.depth(int(index))
         if true is None:
             continue
         camera = posed.camera.resized(true.shape[1], true.shape[0])
         estimated = rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth * alignment.scale
-        inside = (true > 0) & (true < _FAR_M)
-        both = inside & (estimated > 0)
-        asked, known = asked + int(inside.sum()), known + int(both.sum())
-        errors.append(np.abs(estimated[both] / true[both] - 1))
+        relative, _, count = _relative_errors(estimated, true)
+        asked += count
+        errors.append(relative)
+    known = sum(len(relative) for relative in errors)
     if not known:
         return None
     return {**_depth_error(np.concatenate(errors)), "known_share": known / asked, "frames": len(errors)}
+
+
+def _relative_errors(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Compare depth maps (h, w): relative errors (k,), mask of the k compared pixels, number with true depth."""
+    inside = (true > 0) & (true < _FAR_M)
+    both = inside & (estimated > 0)
+    return np.abs(estimated[both] / true[both] - 1), both, int(inside.sum())
 
 
 def _depth_error(error: np.ndarray) -> dict[str, float]:
@@ -130,17 +137,20 @@ def _depth_error(error: np.ndarray) -> dict[str, float]:
 
 
 def surface_figures(
-    surface: Surface,
-    alignment: Alignment,
-    truth: GroundTruth,
-    true_seen: Samples,
-    bound_m: float,
-    count: int,
+    surface: Surface, alignment: Alignment, truth: GroundTruth, true_seen: Samples, bound_m: float, count: int
 ) -> dict[str, float]:
-    """Chamfer distance, F-score and normal consistency of the visible surface, before it is cut into objects."""
+    """Return Chamfer distance, F-score and normal consistency of the visible part of the fused surface.
+
+    Args:
+        surface: before segmentation.
+        alignment: to the true world.
+        truth: for its cameras.
+        true_seen: samples of the visible true surface.
+        bound_m: of the F-score.
+        count: samples drawn on the whole surface.
+    """
     vertices = alignment.to_true(surface.vertices)
-    poses = spread_poses(list(truth.world_from_camera.values()))
-    seen = sample_seen(vertices, surface.faces, truth.camera, poses, count)
+    seen = sample_seen(vertices, surface.faces, truth.camera, spread_poses(truth.poses), count)
     score = compare(seen, true_seen, bound_m)
     if score is None:
         return {}
@@ -156,19 +166,9 @@ def surface_figures(
 def instance_figures_3d(
     surface: Surface, instances: InstanceSet, alignment: Alignment, truth: GroundTruth
 ) -> dict[str, float]:
-    """Overlap of found and true instances on the surface; a vertex is of the nearest true entity within 3 cm."""
-    from scipy.spatial import cKDTree
-
-    from reconstruction.measure.surfaces import sample
-
-    samples = [
-        sample(e.mesh.vertices, e.mesh.faces, 60_000 if e.base else 30_000).points for e in truth.entities
-    ]
-    owner = np.concatenate([np.full(len(p), e.id) for p, e in zip(samples, truth.entities)])
-    distance, nearest = cKDTree(np.concatenate(samples)).query(
-        alignment.to_true(surface.vertices), workers=-1
-    )
-    true = np.where(distance < _NEAR_TRUTH_M, owner[np.minimum(nearest, len(owner) - 1)], 0)
+    """Score instances by IoU over surface vertices, which get the id of the nearest true entity within 3 cm."""
+    points = alignment.to_true(surface.vertices)
+    true = nearest_entities(points, truth.entities, _ENTITY_SAMPLES, _NEAR_TRUTH_M)
     found = np.asarray(instances.vertex_instance)
     counted = true > 0
     return _overlap_figures(true[counted], found[counted], truth, [o.id for o in instances.objects])
@@ -177,7 +177,7 @@ def instance_figures_3d(
 def instance_figures_2d(
     posed: PosedFrames, surface: Surface, instances: InstanceSet, truth: GroundTruth
 ) -> dict[str, float] | None:
-    """Overlap of found and true instances per kept-out view, where the truth has an id image; mean over views."""
+    """Score instances by IoU over pixels of held-out frames with a true id image; means over frames, None without."""
     views = []
     for index, pose in zip(posed.held_out_indices, posed.held_out_world_from_camera):
         true = truth.instances(int(index))
@@ -210,11 +210,11 @@ def _overlap_figures(
     object_ids: list[int],
     only: set[int] | None = None,
 ) -> dict[str, float]:
-    """Match evaluated true entities with found objects by the IoU of their elements."""
+    """Match evaluated true entities with found objects by IoU; `true` and `found` are ids (n,) per vertex or pixel."""
     wanted = [e.id for e in truth.evaluated if only is None or e.id in only]
     sizes_true = np.bincount(true, minlength=max([*wanted, 0]) + 1)
-    if only is not None:  # a sliver of a few pixels at the image's edge tells nothing
-        wanted = [i for i in wanted if sizes_true[i] >= 50]
+    if only is not None:
+        wanted = [i for i in wanted if sizes_true[i] >= _MIN_ENTITY_PX]
     ids = sorted(set(object_ids))
     iou = np.zeros((len(wanted), len(ids)))
     sizes_found = np.bincount(found, minlength=max([*ids, 0]) + 1)
@@ -236,19 +236,18 @@ def _overlap_figures(
 
 
 def sensor_surface(truth: GroundTruth, voxel_m: float = 0.01) -> Samples:
-    """Return the points that the truth's depth images measured within 5 m, one per voxel (no normals: zeros)."""
+    """Back-project the true depth images within 5 m; return one point per voxel, with zero normals."""
     camera = truth.camera
     clouds = []
     for index in truth.indices("depth"):
         if index not in truth.world_from_camera:
             continue
         depth = truth.depth(index)
+        assert depth is not None  # `indices` lists existing files
         rows, columns = np.nonzero((depth > 0) & (depth < _FAR_M))
         z = depth[rows, columns].astype(np.float64)
         small = camera.resized(depth.shape[1], depth.shape[0])
-        local = np.stack(
-            [(columns + 0.5 - small.cx) / small.fx * z, (rows + 0.5 - small.cy) / small.fy * z, z], axis=1
-        )
+        local = small.unproject(columns + 0.5, rows + 0.5, z)
         clouds.append(transform_points(truth.world_from_camera[index], local))
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
     _, first = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0, return_index=True)

@@ -1,30 +1,37 @@
-"""Distances between two surfaces: Chamfer, F-score, normal consistency (CONTRACT section 4)."""
+"""Compare two surfaces by samples: Chamfer distance, F-score, normal consistency (CONTRACT section 4)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from reconstruction.core.types import Camera
+from reconstruction.measure.visibility import seen_points
 
-COMPOSITION_POINTS, OBJECT_POINTS = 1_000_000, 50_000
+if TYPE_CHECKING:
+    from reconstruction.measure.ground_truth import TrueEntity
+
+COMPOSITION_POINTS, OBJECT_POINTS = 1_000_000, 50_000  # CONTRACT section 4
 _SEED = 0
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Area-uniform points on a surface."""
+    """Area-uniform samples of a surface."""
 
     points: np.ndarray  # float64 (n, 3)
-    normals: np.ndarray  # float64 (n, 3) unit, of the triangle
+    normals: np.ndarray  # float64 (n, 3) unit normals of the triangles
 
 
 @dataclass(frozen=True)
 class SurfaceScore:
-    """How well two surfaces agree. Distances in centimetres, shares in percent."""
+    """Agreement of two surfaces: distances in centimetres, shares in percent."""
 
-    cd_cm: float  # mean of the two mean nearest distances
-    f: float  # harmonic mean of the two shares within the bound
-    nc: float  # mean of the two mean absolute cosines of nearest normals
+    cd_cm: float  # Chamfer distance: mean of the two mean nearest distances
+    f: float  # F-score: harmonic mean of precision and recall
+    nc: float  # normal consistency: mean of the two mean absolute cosines of nearest normals
     precision: float  # share of the estimated points within the bound
     recall: float  # share of the true points within the bound
     accuracy_cm: float  # mean distance from estimated to true
@@ -32,7 +39,7 @@ class SurfaceScore:
 
 
 def sample(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = _SEED) -> Samples:
-    """Draw area-uniform points with their triangles' normals."""
+    """Sample a mesh area-uniformly; no samples if its area is zero."""
     corners = np.asarray(vertices, np.float64)[np.asarray(faces)]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(cross, axis=1)
@@ -56,22 +63,18 @@ def sample_seen(
     count: int = COMPOSITION_POINTS,
     seed: int = _SEED,
 ) -> Samples:
-    """Draw `count` area-uniform points and keep those that some camera sees within 5 m."""
-    from reconstruction.measure.visibility import seen_points
-
+    """Sample a mesh area-uniformly and keep the samples that some camera sees within 5 m; `count` is before that."""
     drawn = sample(vertices, faces, count, seed)
     seen = seen_points(drawn.points, vertices, faces, camera, world_from_camera)
     return Samples(drawn.points[seen], drawn.normals[seen])
 
 
 def compare(estimated: Samples, true: Samples, bound_m: float) -> SurfaceScore | None:
-    """Compare two sets of samples; None where either is empty."""
-    from scipy.spatial import cKDTree
-
+    """Compare two sets of samples, with `bound_m` for the F-score; None if either is empty."""
     if not len(estimated.points) or not len(true.points):
         return None
-    to_estimated, i = cKDTree(estimated.points).query(true.points, workers=-1)
-    to_true, j = cKDTree(true.points).query(estimated.points, workers=-1)
+    to_estimated, i = KDTree(estimated.points).query(true.points, workers=-1)
+    to_true, j = KDTree(true.points).query(estimated.points, workers=-1)
     precision, recall = float((to_true < bound_m).mean()), float((to_estimated < bound_m).mean())
     cosines_true = np.abs(np.einsum("nc,nc->n", true.normals, estimated.normals[i]))
     cosines_estimated = np.abs(np.einsum("nc,nc->n", estimated.normals, true.normals[j]))
@@ -84,3 +87,16 @@ def compare(estimated: Samples, true: Samples, bound_m: float) -> SurfaceScore |
         accuracy_cm=float(100 * to_true.mean()),
         completeness_cm=float(100 * to_estimated.mean()),
     )
+
+
+def nearest_entities(
+    points: np.ndarray, entities: Sequence["TrueEntity"], samples: int, bound_m: float
+) -> np.ndarray:
+    """Return the id (n,) of the true entity nearest to each point (n, 3) of the true world, 0 beyond `bound_m`.
+
+    Objects are given by this many samples, base surfaces by twice as many.
+    """
+    clouds = [sample(e.mesh.vertices, e.mesh.faces, (1 + e.base) * samples).points for e in entities]
+    ids = np.repeat([e.id for e in entities], [len(cloud) for cloud in clouds])
+    distance, nearest = KDTree(np.concatenate(clouds)).query(points, workers=-1)
+    return np.where(distance < bound_m, ids[np.minimum(nearest, len(ids) - 1)], 0)

@@ -1,4 +1,4 @@
-"""Viewpoints by the truth: how much of a thing's real surface they see, and whether a camera can be there."""
+"""Evaluate viewpoints in the true scene: visible surface, occlusion, and whether the position is free."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,36 +7,33 @@ import numpy as np
 from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
-from reconstruction.measure.scene import joined
 from reconstruction.measure.surfaces import sample
 from reconstruction.measure.visibility import seen_points
 
-_POINTS = 3000
-_HIDDEN_SIDE_PX = 320
-_INSIDE = 0.5  # winding number
+_POINTS = 3000  # samples per object
+_HIDDEN_SIDE_PX = 320  # longer side of the images in which occlusion is counted
+_INSIDE = 0.5  # winding number, above which a point is inside of a mesh
 
 
 class TrueViews:
-    """Measures viewpoints in the true scene; the meshes are joined once."""
+    """Evaluates viewpoints in the true scene."""
 
     def __init__(self, truth: GroundTruth) -> None:
         self.truth = truth
-        self.vertices, self.faces = joined([e.mesh for e in truth.entities])
-        counts = [len(e.mesh.faces) for e in truth.entities]
-        self._face_entity = np.repeat([e.id for e in truth.entities], counts)
+        self.vertices, self.faces = truth.mesh
 
     def points_of(self, entity: TrueEntity) -> np.ndarray:
-        """Return points (n, 3), evenly on the whole surface of a thing."""
+        """Sample the complete surface of an entity: points (n, 3)."""
         return sample(entity.mesh.vertices, entity.mesh.faces, _POINTS).points
 
     def seen(self, points: np.ndarray, camera: Camera, world_from_camera: np.ndarray) -> np.ndarray:
-        """Tell which points on a thing (n, 3) a camera sees, past everything that is there."""
+        """Return which points (n, 3) on an entity are visible to a camera, with occlusion by the whole scene."""
         return seen_points(points, self.vertices, self.faces, camera, [world_from_camera])
 
     def seen_by_any(
         self, points: Mapping[int, np.ndarray], camera: Camera, world_from_camera: Sequence[np.ndarray]
     ) -> dict[int, np.ndarray]:
-        """Tell by id which points (n, 3) of each thing some of the cameras see."""
+        """Return per id which points (n, 3) of an entity are visible to at least one camera."""
         if not points:
             return {}
         seen = seen_points(
@@ -46,9 +43,9 @@ class TrueViews:
         return dict(zip(points, np.split(seen, ends)))
 
     def hidden_shares(self, world_from_camera: Sequence[np.ndarray]) -> dict[int, float]:
-        """Return by id how much of each thing's outline other things hide, over these poses of the input camera.
+        """Return per id the share of an object's silhouette that other entities occlude, over poses of the true camera.
 
-        Both outlines end where the picture ends. Things that no pose has in its picture are left out.
+        Silhouettes are clipped to the image. Objects outside of all images are left out.
         """
         scale = _HIDDEN_SIDE_PX / max(self.truth.camera.width, self.truth.camera.height)
         camera = self.truth.camera.resized(
@@ -58,7 +55,7 @@ class TrueViews:
         visible, whole = np.zeros(len(things)), np.zeros(len(things))
         for pose in world_from_camera:
             face = rasterize_mesh(self.vertices, self.faces, camera, pose).face
-            shown = self._face_entity[face[face >= 0]]
+            shown = self.truth.face_ids[face[face >= 0]]
             for row, entity in enumerate(things):
                 visible[row] += (shown == entity.id).sum()
                 alone = rasterize_mesh(entity.mesh.vertices, entity.mesh.faces, camera, pose).face
@@ -70,7 +67,7 @@ class TrueViews:
         }
 
     def inside(self, eye: np.ndarray) -> str | None:
-        """Return the name of what a camera at `eye` (3,) is inside of, or of the wall or floor that it is behind."""
+        """Return the entity that contains `eye` (3,), "behind NAME" for a base surface before it, or None if free."""
         for entity in self.truth.entities:
             vertices, faces = np.asarray(entity.mesh.vertices), np.asarray(entity.mesh.faces)
             if abs(winding_number(eye, vertices, faces)) > _INSIDE:
@@ -80,7 +77,7 @@ class TrueViews:
         return None
 
     def _behind(self, eye: np.ndarray, vertices: np.ndarray) -> bool:
-        """Tell whether a flat piece of the base lies between the eye and the cameras that filmed."""
+        """Return whether a base surface, thin along one axis, lies between the eye and the true cameras."""
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         axis = int(np.argmin(high - low))
         filmed = float(np.mean([pose[axis, 3] for pose in self.truth.world_from_camera.values()]))
@@ -88,7 +85,10 @@ class TrueViews:
 
 
 def winding_number(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return how often a mesh winds around a point (3,): 1 inside of a closed one, 0 outside."""
+    """Compute the winding number of a mesh around a point (3,): 1 inside of a closed mesh, 0 outside.
+
+    Sums the solid angles of the triangles (Van Oosterom and Strackee 1983).
+    """
     a, b, c = (vertices[faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))

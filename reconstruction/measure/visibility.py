@@ -1,4 +1,4 @@
-"""Which points of a surface some camera sees: the triangle at each pixel, compared with each point's own ray."""
+"""Compute which points of a surface are visible to a camera, from rendered triangle ids and exact ray-plane tests."""
 
 import os
 from collections.abc import Sequence
@@ -11,19 +11,19 @@ from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera
 from registry.geometry import invert_rigid
 
-MAX_DISTANCE_M = 5.0  # CONTRACT section 4: what is farther does not count
+MAX_DISTANCE_M = 5.0  # CONTRACT section 4: farther points do not count
 MAX_CAMERAS = 200
-_SIDE_PX = 960
-_TOLERANCE_M = 0.001
+_SIDE_PX = 960  # longer side of the rendered images
+_TOLERANCE_M = 0.001  # of a point behind the visible triangle
 
 
 @njit(cache=True, parallel=True)
 def _mark_seen(
     points, m, eye, fx, fy, cx, cy, face, normals, offsets, far, tolerance, seen
 ):  # pragma: no cover
-    """Mark points within `far` of the camera that do not lie behind the triangle seen at their pixel.
+    """Mark points within `far` of the camera that are not behind the triangle visible at their pixel.
 
-    The triangle's plane is cut with the very ray to the point, so slanted surfaces need no slack for the pixel's size.
+    The ray to the point is intersected with the triangle's plane, so slanted surfaces need no tolerance for pixel size.
     """
     height, width = face.shape
     for i in prange(points.shape[0]):
@@ -60,19 +60,16 @@ def seen_points(
     max_distance_m: float = MAX_DISTANCE_M,
     side_px: int = _SIDE_PX,
 ) -> np.ndarray:
-    """Tell which points on a mesh some camera sees.
+    """Return bool (n,): which points on a mesh are visible to at least one camera.
 
     Args:
         points: (n, 3) on the mesh, world space, metres.
-        vertices: (v, 3) of everything that can hide them.
+        vertices: (v, 3) of the occluding mesh.
         faces: (f, 3).
-        camera: of all poses.
+        camera: intrinsics of all poses.
         world_from_camera: poses (4, 4), OpenCV.
-        max_distance_m: from the camera's center.
-        side_px: longer side of the pictures in which what the cameras see is drawn.
-
-    Returns:
-        bool (n,).
+        max_distance_m: from the camera center.
+        side_px: longer side of the rendered images.
     """
     scale = side_px / max(camera.width, camera.height)
     small = camera.resized(round(camera.width * scale), round(camera.height * scale))
@@ -83,7 +80,7 @@ def seen_points(
     seen = np.zeros(len(points), np.bool_)
     points = np.ascontiguousarray(points, np.float64)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        # Drawing leaves the interpreter to other threads; marking is parallel in itself and runs here alone.
+        # Rasterization releases the GIL and runs in threads; the marking kernel is parallel itself and runs here.
         drawn = pool.map(lambda pose: rasterize_mesh(vertices, faces, small, pose).face, world_from_camera)
         for pose, face in zip(world_from_camera, drawn):
             _mark_seen(
@@ -94,6 +91,6 @@ def seen_points(
 
 
 def spread_poses(world_from_camera: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return at most 200 poses, evenly spread: neighbors of a long film see the same."""
+    """Return at most 200 evenly spaced poses, since neighboring video frames see the same."""
     rows = np.unique(np.linspace(0, len(world_from_camera) - 1, MAX_CAMERAS).round().astype(int))
     return [world_from_camera[row] for row in rows]

@@ -1,1 +1,1 @@
-"""Exports of phone apps, which hold images and poses, and poses by the names of images."""
+"""Read exports of phone apps: images, and poses by image name."""

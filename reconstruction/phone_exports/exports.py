@@ -1,6 +1,6 @@
-"""Exports of phone apps, that hold images and poses: Record3D (`.r3d`, or unzipped) and Polycam's raw data.
+"""Find and read exports of phone apps with images and poses: Record3D (`.r3d`, or unzipped) and Polycam's raw data.
 
-Such a folder or file is an input of its own: stage 1 takes its images, stage 2 its poses.
+Such a folder or file is a pipeline input: stage 1 reads its images, stage 2 its poses.
 """
 
 import json
@@ -19,16 +19,16 @@ _ARCHIVES = (".r3d", ".zip")
 
 @dataclass(frozen=True)
 class Export:
-    """Where an export keeps its things; names are relative to its root, with slashes."""
+    """The files of an export; names are relative to its root, with slashes."""
 
     kind: str  # "record3d" | "polycam"
     path: Path  # a folder or a zip
-    root: str  # folder inside a zip, or "": where names begin
-    images: tuple[str, ...]  # in the order of frames
+    root: str  # folder inside of a zip that names are relative to, or ""
+    images: tuple[str, ...]  # in frame order
     cameras: str  # folder of the camera files (Polycam), or the metadata file (Record3D)
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file."""
+        """Read a file. Raises `InputError` where that fails, as does `read_json`."""
         try:
             if self.path.is_dir():
                 return (self.path / name).read_bytes()
@@ -38,14 +38,14 @@ class Export:
             raise InputError(f"poses: {self.path} has no readable {name}: export it again") from error
 
     def read_json(self, name: str) -> dict:
-        """Return the content of a JSON file."""
+        """Read a JSON file."""
         try:
             return json.loads(self.read(name))
         except ValueError as error:
             raise InputError(f"poses: {name} in {self.path} is not JSON: export it again") from error
 
     def unpack_images(self, folder: Path) -> Path:
-        """Return a folder with the images: the export's own, or `folder` with those of a zip written to it."""
+        """Return a folder that holds the images: the export's own, or `folder`, to which those of a zip are written."""
         if self.path.is_dir():
             return (self.path / self.images[0]).parent
         with zipfile.ZipFile(self.path) as archive:
@@ -55,7 +55,7 @@ class Export:
 
 
 def find_export(path: Path) -> Export | None:
-    """Return what export a path is, or None where it is something else."""
+    """Detect whether a path is an export; None where it is not."""
     if path.is_dir():
         names = _names_in(path)
     elif path.is_file() and path.suffix.lower() in _ARCHIVES and zipfile.is_zipfile(path):
@@ -63,7 +63,7 @@ def find_export(path: Path) -> Export | None:
             names = [name for name in archive.namelist() if not name.endswith("/")]
     else:
         return None
-    for depth in (0, 1):  # zips often have one folder around everything
+    for depth in (0, 1):  # the root, or a single folder around everything, as zips often have
         roots = {"/".join(n.split("/")[:depth]) + "/" * bool(depth) for n in names if n.count("/") >= depth}
         for root in sorted(roots) if path.is_file() or depth == 0 else []:
             found = _match(path, root, [n[len(root) :] for n in names if n.startswith(root)])
@@ -73,7 +73,7 @@ def find_export(path: Path) -> Export | None:
 
 
 def _names_in(path: Path) -> list[str]:
-    """List the files that matter: exports also hold thousands of depth maps."""
+    """List the relevant files of a folder; exports also hold thousands of depth maps."""
     names = [f.name for f in path.iterdir() if f.is_file()]
     for folder in ("rgb", "rgbd", *(f"keyframes/{x}" for x in _POLYCAM_FOLDERS)):
         if (path / folder).is_dir():
@@ -104,17 +104,17 @@ def _match(path: Path, root: str, names: list[str]) -> Export | None:
 
 
 def natural(name: str) -> list:
-    """Sort key: img2 before img10."""
+    """Return the sort key of natural name order: img2 before img10."""
     return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in re.split(r"(\d+)", name.lower())]
 
 
 def upright_turns(world_from_camera: np.ndarray) -> int:
-    """Return the counter-clockwise quarter turns that bring images upright: cameras (n, 4, 4), world +y up."""
+    """Return the counter-clockwise quarter turns that make images upright, from poses (n, 4, 4) in a +y up world."""
     ups = [-(world_from_camera[:, :3, :3] @ turned_camera(k)[:3, 1])[:, 1].mean() for k in range(4)]
     return int(np.argmax(ups))
 
 
 def turned_camera(turns: int) -> np.ndarray:
-    """Return camera_from_turned (4, 4): the camera of an image that was turned (`np.rot90(image, turns)`)."""
+    """Return camera_from_turned (4, 4) of an image turned by `np.rot90(image, turns)`."""
     quarter = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     return np.linalg.matrix_power(quarter, turns % 4)

@@ -1,37 +1,41 @@
-"""What all readers of poses return."""
+"""Poses by image name, as readers return them, and by video frame number."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-# ARKit, nerfstudio and OpenGL: +x right, +y up, looking along -z.
+if TYPE_CHECKING:
+    import pycolmap
+
+# Camera axes of ARKit, nerfstudio and OpenGL: +x right, +y up, -z forward.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class NamedPoses:
-    """What a reader finds: one lens, and a camera for each image name."""
+    """What a reader returns: the shared intrinsics and a pose per image name."""
 
-    camera: object  # pycolmap.Camera at the size of the images
+    camera: "pycolmap.Camera"  # at the size of the images
     named: list[tuple[str, np.ndarray]]  # image name, world_from_camera (4, 4) OpenCV; sorted by name
-    metric: bool = False  # in metres
-    roll_unknown: bool = False  # cameras may be turned by quarters about the optical axis
+    metric: bool = False  # poses are in metres
+    roll_unknown: bool = False  # all cameras may be turned by a multiple of 90 degrees about the optical axis
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ImportedPoses:
-    """Cameras by video frame number, and the lens that they share."""
+    """Poses by video frame number and the shared intrinsics; flags as in `NamedPoses`."""
 
-    camera: object  # pycolmap.Camera at the size of the frames
+    camera: "pycolmap.Camera"  # at the size of the frames
     world_from_camera: dict[int, np.ndarray]  # float64 (4, 4) OpenCV
     metric: bool = False
     roll_unknown: bool = False
     notes: tuple[str, ...] = ()
 
 
-def pinhole(fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> object:
-    """Return a pycolmap.Camera without distortion."""
+def pinhole(fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> "pycolmap.Camera":
+    """Return a pinhole camera; all arguments in pixels."""
     import pycolmap
 
     camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", fx, width, height)

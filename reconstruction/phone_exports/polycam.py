@@ -1,4 +1,4 @@
-"""Polycam's raw data export: one JSON file a keyframe, in ARKit's space (+y up, metres)."""
+"""Read poses from Polycam's raw data: one JSON file per keyframe, in ARKit's world (+y up, metres)."""
 
 from pathlib import PurePosixPath
 
@@ -8,12 +8,16 @@ from reconstruction.phone_exports.exports import Export, turned_camera, upright_
 from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, pinhole
 from registry.errors import InputError
 
-_MAX_FOCAL_SPREAD = 0.03  # relative; autofocus moves it by less
+_MAX_FOCAL_SPREAD = 0.03  # relative deviation from the median; autofocus causes less
 _LENS = ("fx", "fy", "cx", "cy")
 
 
 def read_polycam(export: Export) -> NamedPoses:
-    """Read the poses of the images turned upright (see `polycam_turns`), and the median lens."""
+    """Read the poses of the images turned upright (see `polycam_turns`), and the median intrinsics.
+
+    Raises:
+        InputError: a camera file is malformed, or focal lengths vary too much.
+    """
     stored, lenses, size = _read(export)
     lens = np.median(lenses, axis=0)
     spread = float(np.abs(lenses[:, :2] / lens[:2] - 1).max())
@@ -35,12 +39,12 @@ def read_polycam(export: Export) -> NamedPoses:
 
 
 def polycam_turns(export: Export) -> int:
-    """Return the quarter turns (`np.rot90`) that bring the images upright: the sensor lies on its side in portrait."""
+    """Return the quarter turns (`np.rot90`) that make the images upright; files have the sensor's orientation."""
     return upright_turns(np.stack(list(_read(export)[0].values())))
 
 
 def _read(export: Export) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[int, int]]:
-    """Return world_from_camera (OpenCV) by image name, fx fy cx cy (n, 4), and the images' (width, height)."""
+    """Return world_from_camera (OpenCV) by image name, fx, fy, cx, cy float64 (n, 4), and (width, height)."""
     stored, lenses, size = {}, [], (0, 0)
     for name in export.images:
         file = f"{export.cameras}/{PurePosixPath(name).stem}.json"
@@ -51,8 +55,7 @@ def _read(export: Export) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[int,
             lenses.append([float(data[key]) for key in _LENS])
             size = (int(data["width"]), int(data["height"]))
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"poses: {file} in {export.path} is no Polycam camera ({type(error).__name__} {error})"
-            ) from error
+            why = f"{type(error).__name__} {error}"
+            raise InputError(f"poses: {file} in {export.path} is no Polycam camera ({why})") from error
         stored[name] = pose @ OPENGL_FROM_OPENCV
     return stored, np.array(lenses), size

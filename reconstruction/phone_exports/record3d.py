@@ -1,4 +1,4 @@
-"""Record3D: `metadata` (JSON) beside `rgb/` or `rgbd/`, in a folder or an `.r3d` file."""
+"""Read poses from Record3D: `metadata` (JSON) beside `rgb/` or `rgbd/`, in a folder or an `.r3d` file."""
 
 import numpy as np
 
@@ -10,8 +10,11 @@ from registry.errors import InputError
 def read_record3d(export: Export) -> NamedPoses:
     """Read the poses of a recording with the rear (LiDAR) camera.
 
-    They are in metres, relative to the first frame, so they say nothing of gravity. Versions of the app differ in
-    which way round a camera held upright is meant, so its roll is left to the pictures (`roll_unknown`).
+    They are in metres, relative to the first frame, so gravity is unknown. Versions of the app differ in the roll of a
+    camera held upright, so the roll is determined from the images (`roll_unknown`).
+
+    Raises:
+        InputError: the metadata is malformed, or the camera does not move.
     """
     from scipy.spatial.transform import Rotation
 
@@ -21,8 +24,9 @@ def read_record3d(export: Export) -> NamedPoses:
         lens = _lens(data)
         width, height = int(data["w"]), int(data["h"])
     except (KeyError, TypeError, ValueError) as error:
+        why = f"{type(error).__name__} {error}"
         raise InputError(
-            f"poses: {export.cameras} in {export.path} is no Record3D metadata ({type(error).__name__} {error})"
+            f"poses: {export.cameras} in {export.path} is no Record3D metadata ({why})"
         ) from error
     if len(rows) < 2 or np.abs(rows - rows[0]).max() < 1e-9:
         raise InputError(
@@ -32,17 +36,16 @@ def read_record3d(export: Export) -> NamedPoses:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, :4]).as_matrix()  # x, y, z, w
     poses[:, :3, 3] = rows[:, 4:]
-    named = [
-        (name, poses[number] @ OPENGL_FROM_OPENCV)
-        for number, name in ((int(n.rsplit("/", 1)[-1].split(".")[0]), n) for n in export.images)
-        if number < len(poses)
-    ]
+    numbers = {name: int(name.rsplit("/", 1)[-1].split(".")[0]) for name in export.images}
+    named = [(name, poses[i] @ OPENGL_FROM_OPENCV) for name, i in numbers.items() if i < len(poses)]
     return NamedPoses(pinhole(*lens, width, height), named, metric=True, roll_unknown=True)
 
 
 def _lens(data: dict) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy: the median over frames where each has its own (the focus moves), else K."""
+    """Return fx, fy, cx, cy: the median of per-frame intrinsics (autofocus) where there are any, else those of K."""
     if data.get("perFrameIntrinsicCoeffs"):
-        return tuple(np.median(np.array(data["perFrameIntrinsicCoeffs"], np.float64)[:, :4], axis=0).tolist())
-    k = np.array(data["K"], np.float64).reshape(3, 3).T  # column after column
+        per_frame = np.array(data["perFrameIntrinsicCoeffs"], np.float64)
+        fx, fy, cx, cy = np.median(per_frame[:, :4], axis=0).tolist()
+        return fx, fy, cx, cy
+    k = np.array(data["K"], np.float64).reshape(3, 3).T  # stored in column-major order
     return float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])

@@ -1,4 +1,4 @@
-"""Stage 2: poses. A `FrameSet` in, `PosedFrames` in `sfm` space out."""
+"""Stage 2, structure from motion: a `FrameSet` in, `PosedFrames` in `sfm` space out."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from reconstruction.poses.estimate import estimate_poses
 
 
 def outside_inputs(config: PosesConfig) -> tuple[str, ...]:
-    """Return the digest of imported poses: other ones must not reuse a result."""
+    """Return the digest of imported pose files, which become part of the cache key."""
     path = Path(config.import_path) if config.import_path else None
     return (digest_input(path),) if path is not None and path.exists() else ()
 

@@ -1,4 +1,4 @@
-"""The seam for learned poses: images in, rough cameras out; our own matches then make them accurate."""
+"""Learned pose backends: images in, approximate cameras out, to be refined by bundle adjustment on our matches."""
 
 import tempfile
 from dataclasses import dataclass
@@ -8,6 +8,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from reconstruction.core.plugins import load_plugin
+from reconstruction.poses.config import PosesConfig
 from registry.errors import EnvironmentMissing
 
 _VGGT_WIDTH_PX = 518  # what its loader scales every image to
@@ -15,7 +17,7 @@ _VGGT_WIDTH_PX = 518  # what its loader scales every image to
 
 @dataclass(frozen=True)
 class PredictedPoses:
-    """One camera for each image, in any space; a few degrees and a few percent off at most."""
+    """One camera per image, in any space, with errors of at most a few degrees and a few percent."""
 
     world_from_camera: np.ndarray  # float64 (n, 4, 4) OpenCV
     focal_px: float  # shared, at the size of the images
@@ -28,10 +30,11 @@ class PoseBackend(Protocol):
 
     def predict(self, images: np.ndarray) -> PredictedPoses:
         """Return one camera for each of the images uint8 (n, h, w, 3)."""
+        ...
 
 
 class VggtBackend:
-    """VGGT (facebookresearch/vggt), where it is installed; its weights are fetched on first use."""
+    """VGGT (facebookresearch/vggt), if installed; its weights are downloaded on first use."""
 
     name = "vggt"
 
@@ -39,10 +42,10 @@ class VggtBackend:
         """Load the weights.
 
         Raises:
-            EnvironmentMissing: the package is not installed, or its weights cannot be had.
+            EnvironmentMissing: the package is not installed, or its weights cannot be loaded.
         """
         try:
-            from vggt.models.vggt import VGGT
+            from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise EnvironmentMissing(
                 "poses: the backend vggt is not installed. Run: pip install "
@@ -54,15 +57,13 @@ class VggtBackend:
         try:
             self._model = VGGT.from_pretrained(model).to(self._device).eval()
         except OSError as error:
-            raise EnvironmentMissing(
-                f"poses: the weights {model} of vggt cannot be loaded: {error}"
-            ) from error
+            raise EnvironmentMissing(f"poses: weights {model} of vggt cannot be loaded: {error}") from error
 
     def predict(self, images: np.ndarray) -> PredictedPoses:
         """See `PoseBackend.predict`."""
         import torch
-        from vggt.utils.load_fn import load_and_preprocess_images
-        from vggt.utils.pose_enc import pose_encoding_to_extri_intri
+        from vggt.utils.load_fn import load_and_preprocess_images  # pyright: ignore[reportMissingImports]
+        from vggt.utils.pose_enc import pose_encoding_to_extri_intri  # pyright: ignore[reportMissingImports]
 
         with tempfile.TemporaryDirectory() as folder, torch.no_grad():
             files = [str(Path(folder) / f"{row:05d}.png") for row in range(len(images))]
@@ -79,4 +80,6 @@ class VggtBackend:
 
 def load_pose_backend(name: str) -> PoseBackend | None:
     """Return the backend of this name; None for `colmap`, which needs no prediction."""
-    return VggtBackend() if name == "vggt" else None
+    if name == "colmap":
+        return None
+    return VggtBackend() if name == "vggt" else load_plugin("poses.backend", name, PosesConfig)()

@@ -1,15 +1,18 @@
-"""Parts of a video that share no pictures with each other: a cut, another room, a blocked view."""
+"""Connected components of the match graph, and pairs that may connect them.
+
+Components arise where parts of a video show nothing in common: a cut, another room, a blocked view.
+"""
 
 import numpy as np
 
 from reconstruction.poses.pairs import VerifiedPair
 
-_MIN_PART = 3  # frames; fewer are not worth a search
-_MAX_BRIDGES = 150  # pairs tried between two parts
+_MIN_PART = 3  # frames; smaller components are not searched for bridges
+_MAX_BRIDGES = 150  # pairs tried between a component and the rest
 
 
 def label_parts(count: int, pairs: list[VerifiedPair]) -> np.ndarray:
-    """Return the part (count,) of each frame: frames joined by a chain of pairs; 0 is the largest part."""
+    """Label the connected components of frames under verified pairs: int (count,), 0 is the largest component."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -25,12 +28,12 @@ def label_parts(count: int, pairs: list[VerifiedPair]) -> np.ndarray:
 def propose_bridges(
     parts: np.ndarray, scores: np.ndarray, tried: list[tuple[int, int, bool]]
 ) -> list[tuple[int, int, bool]]:
-    """Return pairs (row, later row, True) between each larger part and the rest, most alike first.
+    """Propose pairs (row, later row, True) between each component but the largest and all other frames.
 
     Args:
         parts: (n,) from `label_parts`.
-        scores: (n, n) how much frames look alike.
-        tried: pairs that were matched already; those matched by all features are not proposed again.
+        scores: (n, n) overlap scores; the pairs with the highest are proposed.
+        tried: pairs matched already, as of `choose_pairs`; those matched by all features are not proposed again.
     """
     done = np.zeros_like(scores, bool)
     for i, j, near in tried:

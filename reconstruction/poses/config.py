@@ -6,56 +6,56 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class PosesConfig:
-    """How cameras are recovered from the keyframes."""
+    """How camera poses and intrinsics are estimated from the keyframes."""
 
     import_path: str = ""
-    """Poses that you have: a COLMAP model folder, a nerfstudio `transforms.json`, a Record3D recording or
-    Polycam's raw data. Empty: those of the input, if it is such an export; else they are estimated."""
+    """Poses to import: a COLMAP model folder, a nerfstudio `transforms.json`, a Record3D recording or Polycam's raw
+    data. Empty: those of the input, if it is such an export; else poses are estimated."""
 
-    backend: Literal["colmap", "vggt"] = "colmap"
-    """Where first cameras come from: `colmap` from matches; `vggt` from the learned model of that name, if it is
-    installed. Its prediction is then adjusted to our own matches."""
+    backend: Literal["colmap", "vggt"] | str = "colmap"
+    """Source of the initial cameras: `colmap` (incremental mapping) or `vggt` (the learned model, if installed),
+    whose prediction is then refined by bundle adjustment."""
 
     refine_imported: Literal["auto", "always", "never"] = "auto"
-    """Adjust imported poses to the pictures, keeping their scale and place. `auto`: those of phone apps, which
-    drift; not those of COLMAP and nerfstudio, which were adjusted already."""
+    """Refine imported poses by bundle adjustment, keeping their scale and coordinate frame. `auto`: those of phone
+    apps, which drift; not those of COLMAP and nerfstudio, which were adjusted already."""
 
     max_features: int = 2048
-    """SIFT features kept in each frame, the strongest first."""
+    """SIFT features kept per frame, the strongest first."""
 
     contrast_threshold: float = 0.01
-    """SIFT contrast below which a feature is noise; half of COLMAP's, since rooms have pale walls."""
+    """SIFT contrast threshold; half of COLMAP's, since rooms have pale walls."""
 
     sequential_overlap: int = 8
-    """In a video every frame is matched to this many that follow it."""
+    """Each frame of a video is matched to this many following ones."""
 
     max_pairs_per_frame: int = 20
-    """Further partners of a frame, chosen by what the frames show: this closes loops and orders folders."""
+    """Further partners of a frame, chosen by visual overlap: they close loops and order image folders."""
 
     min_inliers: int = 20
-    """Matches that must agree with one two-view geometry before a pair counts."""
+    """Inliers of the two-view geometry that a pair needs."""
 
     camera_model: Literal["auto", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = "auto"
-    """Lens model that all frames share. `auto` is SIMPLE_RADIAL, at the end RADIAL where there are enough
-    frames to support its second term."""
+    """COLMAP camera model that all frames share. `auto`: SIMPLE_RADIAL, and RADIAL in the last bundle adjustment if
+    there are enough frames for its second term."""
 
     min_registered_share: float = 0.35
-    """Fewer registered keyframes than this share of those given: the input is rejected."""
+    """Least share of the keyframes that must be registered; else the input is rejected."""
 
     second_try_below_share: float = 0.9
-    """Below this registered share the global mapper is tried too, and the better model is kept."""
+    """Below this registered share the global mapper runs too, and the larger model is kept."""
 
     max_point_error_px: float = 2.0
-    """Sparse points with a larger mean reprojection error are dropped from the result."""
+    """Largest mean reprojection error of a sparse point, pixels."""
 
     min_track_length: int = 3
-    """Sparse points seen in fewer frames are dropped from the result."""
+    """Least number of frames that observe a sparse point."""
 
     min_held_out_inliers: int = 20
-    """2D-3D matches that a held-out frame needs to be located."""
+    """2D-3D inliers that a held-out frame needs to be localized."""
 
     seed: int = 0
-    """Seed of every random sampling."""
+    """Seed of all random sampling."""
 
 
 POSES_PRESETS: dict[str, PosesConfig] = {

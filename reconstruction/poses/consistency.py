@@ -1,9 +1,9 @@
-"""Pairs of frames that contradict the others: the same tile, poster or chair at two places.
+"""Reject pairs of frames that match repeated structure (two copies of a tile, poster or chair) by track consistency.
 
-Matches make tracks: the features of one point in many frames. Frames that follow each other are hardly ever
-confused, so tracks grow from them; then pairs further apart are asked. A match between two tracks that some
-frame shows side by side, at different places, cannot be right: they are two points that look alike. A pair
-most of whose matches say so shows two look-alikes and is dropped, from other pairs only those matches go.
+Matches are merged into tracks: the features of one 3D point, at most one per frame. Pairs near in time are merged
+first, as they hardly ever confuse copies; then more distant pairs are tested. A match between two tracks that another
+frame observes at different positions is contradicted: the tracks are different points. A pair with mostly
+contradicted matches is dropped; from other pairs only the contradicted matches are dropped.
 """
 
 from dataclasses import dataclass, replace
@@ -13,21 +13,19 @@ import numpy as np
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
 
-_SAME_PLACE = 0.006  # of the image's diagonal; SIFT gives one corner several features nearby
-_MIN_CONTRADICTIONS = 8  # fewer are chance
-_MAX_CONTRADICTED_SHARE = 0.35  # of the matches that some frame can judge
-
-
-_MANY_REJECTED_SHARE = 0.1  # of all pairs: the place is full of look-alikes
-_MIN_SUPPORT_SHARE = 0.3  # of a distant pair's matches, there, that must be one point by other frames' word
+_SAME_PLACE = 0.006  # share of the image diagonal; SIFT detects one corner several times nearby
+_MIN_CONTRADICTIONS = 8  # matches; fewer are chance
+_MAX_CONTRADICTED_SHARE = 0.35  # of the matches that other frames confirm or contradict
+_MANY_REJECTED_SHARE = 0.1  # of all pairs; with more, distant pairs need support
+_MIN_SUPPORT_SHARE = 0.3  # of a distant pair's matches that the tracks must confirm then
 
 
 @dataclass(frozen=True)
 class ConsistentPairs:
-    """Pairs that do not contradict each other."""
+    """Pairs whose matches do not contradict each other."""
 
     pairs: list[VerifiedPair]  # in the order given
-    rejected: int  # number of pairs that show look-alikes, or may well do so
+    rejected: int  # number of pairs dropped as repeated structure
 
 
 def reject_look_alikes(
@@ -37,17 +35,17 @@ def reject_look_alikes(
     min_inliers: int,
     image_size: tuple[int, int],
 ) -> ConsistentPairs:
-    """Drop pairs and matches that join points which another frame shows apart.
+    """Drop pairs and matches that merge points which another frame observes at different positions.
 
-    Where many pairs are dropped, what has no such contradiction may still be wrong. Pairs that are not near in
-    time are then used only where other frames support them: rather an open loop than one closed wrongly.
+    If many pairs are dropped, pairs without a contradiction may be wrong too. Pairs that are not near in time are
+    then kept only where other frames support them: an open loop is better than a wrong loop closure.
 
     Args:
         pairs: verified pairs.
-        features: of all frames.
-        near: frames of a video at most this many apart are near in time, and believed first; 0: no video, pairs
-            with most matches are believed first.
-        min_inliers: a pair that keeps fewer matches is dropped.
+        features: features of all frames.
+        near: largest distance in rows of pairs near in time, which are merged first; 0 for unordered images, where
+            pairs with most matches are merged first.
+        min_inliers: pairs that keep fewer matches are dropped.
         image_size: width and height in pixels.
     """
     tolerance_px = _SAME_PLACE * float(np.hypot(*image_size))
@@ -60,7 +58,7 @@ def reject_look_alikes(
 def _grow(
     pairs: list[VerifiedPair], tracks: "_Tracks", near: int, min_inliers: int, strict: bool
 ) -> ConsistentPairs:
-    """Take pairs in the order of trust; `strict`: distant ones need the support of others."""
+    """Test and merge pairs in the order of trust; `strict`: distant pairs need support."""
 
     def trust(number: int) -> tuple[int, int]:
         pair = pairs[number]
@@ -71,10 +69,12 @@ def _grow(
     for number in sorted(range(len(pairs)), key=trust):
         pair = pairs[number]
         same, apart = tracks.judge(pair)
-        doubted, supported = int(apart.sum()), int(same.sum())
-        refuted = doubted >= _MIN_CONTRADICTIONS and doubted > _MAX_CONTRADICTED_SHARE * (doubted + supported)
+        contradicted, supported = int(apart.sum()), int(same.sum())
+        most = _MAX_CONTRADICTED_SHARE * (contradicted + supported)
         distant = pair.rows[1] - pair.rows[0] > near
-        if refuted or (strict and distant and supported < _MIN_SUPPORT_SHARE * len(pair.matches)):
+        if (contradicted >= _MIN_CONTRADICTIONS and contradicted > most) or (
+            strict and distant and supported < _MIN_SUPPORT_SHARE * len(pair.matches)
+        ):
             rejected += 1
             continue
         matches = pair.matches[~apart]
@@ -85,30 +85,27 @@ def _grow(
 
 
 class _Tracks:
-    """Which features of all frames are one point, as far as is known; each feature begins alone."""
+    """Partition of all features into tracks, at most one feature per frame; initially each feature is on its own."""
 
     def __init__(self, features: list[Features], tolerance_px: float) -> None:
         self.tolerance_px = tolerance_px
         self.first = np.concatenate([[0], np.cumsum([len(f.keypoints) for f in features])])
         self.positions = np.concatenate([f.keypoints for f in features])
-        self.track_of = np.full(self.first[-1], -1, np.int64)  # by feature; -1: alone
+        self.track_of = np.full(self.first[-1], -1, np.int64)  # by feature; -1: on its own
         self.frames = len(features)
         self.members = np.full((1024, self.frames), -1, np.int32)  # by track and frame: feature or -1
         self.count = 0
 
     def judge(self, pair: VerifiedPair) -> tuple[np.ndarray, np.ndarray]:
-        """Return for each match whether its ends are one point already, and whether a frame shows them apart."""
-        a, b = (
-            self._members_of(pair.rows[0], pair.matches[:, 0]),
-            self._members_of(pair.rows[1], pair.matches[:, 1]),
-        )
+        """Return for each match, bool (k,) each: the tracks confirm it; a frame contradicts it."""
+        a, b = (self._members_of(row, rows) for row, rows in zip(pair.rows, pair.matches.T))
         both = (a >= 0) & (b >= 0)
         gap = np.linalg.norm(self.positions[a] - self.positions[b], axis=2)
         apart = (both & (gap > self.tolerance_px)).any(axis=1)
         return both.any(axis=1) & ~apart, apart
 
     def _members_of(self, row: int, features: np.ndarray) -> np.ndarray:
-        """Return (m, frames) the features that are known to be the same point as each given one."""
+        """Return the track of each given feature of a frame: features by frame (m, frames), -1 where none."""
         ids = self.first[row] + features.astype(np.int64)
         tracks = self.track_of[ids]
         out = self.members[tracks]
@@ -117,11 +114,11 @@ class _Tracks:
         return out
 
     def join(self, rows: tuple[int, int], matches: np.ndarray) -> None:
-        """Take the two features of each match for one point, unless an earlier one of these matches forbids it."""
+        """Merge the tracks of each match, unless both have a feature in one frame."""
         for a, b in zip(
             self.first[rows[0]] + matches[:, 0].astype(np.int64), self.first[rows[1]] + matches[:, 1]
         ):
-            one, other = self.track_of[a], self.track_of[b]
+            one, other = int(self.track_of[a]), int(self.track_of[b])
             if one < 0 and other < 0:
                 one = self._new()
             elif one < 0:
@@ -140,7 +137,7 @@ class _Tracks:
         return self.count - 1
 
     def _merge(self, one: int, other: int) -> None:
-        """Move the features of `other` to `one`; where both have one in a frame they stay apart."""
+        """Move the features of track `other` to `one`, unless both have a feature in one frame."""
         a, b = self.members[one], self.members[other]
         if ((a >= 0) & (b >= 0)).any():
             return

@@ -1,28 +1,28 @@
-"""Why an input cannot be reconstructed, in words for the person who filmed it."""
+"""Detect inputs that structure from motion cannot reconstruct, and say why and what to film instead."""
 
 import cv2
 import numpy as np
 
 from reconstruction.core.types import FrameSet
+from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
 from registry.errors import InputError
 
 MIN_FRAMES = 8
-_MIN_FEATURES = 60  # fewer in the median frame: nothing to match
-_STILL_SHARE = 0.01  # of the image's diagonal; a camera that moves less over the whole video is still
-_HOMOGRAPHY_ERROR_PX = 3.0
-_ROTATION_EXPLAINED = 0.95  # share of matches that one homography explains when the camera only turns
-_MIN_TRIANGULATION_DEG = 2.0
+_MIN_FEATURES = 60  # in the median frame
+_STILL_SHARE = 0.01  # of the image diagonal; largest image motion of a camera at rest
+_HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
+_ROTATION_EXPLAINED = 0.95  # inlier share of the homography under pure rotation
+_MIN_TRIANGULATION_DEG = 2.0  # median triangulation angle
 
 _HOW_TO_FILM = (
-    "Film again: walk sideways around the things for 10-60 s, slowly, in good light, so that every spot is "
-    "seen from several places."
+    "Film again: walk slowly around the objects for 10-60 s, in good light, seeing all from several places."
 )
 
 
 def check_features(features: list[Features], indices: np.ndarray) -> None:
-    """Raise `InputError` where there is nothing to match."""
+    """Raise `InputError` where frames or features are too few to match."""
     if len(features) < MIN_FRAMES:
         raise InputError(
             f"poses: {len(features)} usable frames, at least {MIN_FRAMES} are needed. {_HOW_TO_FILM}"
@@ -31,14 +31,14 @@ def check_features(features: list[Features], indices: np.ndarray) -> None:
     if np.median(counts) < _MIN_FEATURES:
         raise InputError(
             f"poses: the frames show almost no texture (median {int(np.median(counts))} features per frame, "
-            f"{_MIN_FEATURES} are needed; frames {_ranges(indices[counts < _MIN_FEATURES])}). A blank wall, "
+            f"{_MIN_FEATURES} are needed; frames {describe_frames(indices[counts < _MIN_FEATURES])}). A blank wall, "
             "darkness or heavy blur cannot be reconstructed. Film something with texture, with more light, "
             "moving more slowly."
         )
 
 
 def check_motion(features: list[Features], pairs: list[VerifiedPair], image_size: tuple[int, int]) -> None:
-    """Raise `InputError` where the frames do not overlap, the camera stood still or only turned."""
+    """Raise `InputError` where frames do not overlap, the camera is at rest, or its motion is a pure rotation."""
     if not pairs:
         raise InputError(
             f"poses: no two of the {len(features)} frames could be matched: they show different things, "
@@ -48,12 +48,12 @@ def check_motion(features: list[Features], pairs: list[VerifiedPair], image_size
     diagonal = float(np.hypot(*image_size))
     if np.quantile(moved, 0.95) < _STILL_SHARE * diagonal:
         raise InputError(
-            f"poses: the camera stood still (the picture moves by {np.quantile(moved, 0.95):.1f} px over the "
-            f"whole video). Depth needs a camera that moves. {_HOW_TO_FILM}"
+            f"poses: the camera stood still (image motion {np.quantile(moved, 0.95):.1f} px over the whole video). "
+            f"Depth needs a camera that moves. {_HOW_TO_FILM}"
         )
     explained, modulus = np.array(explained), np.array(modulus)
-    # A camera that turns on the spot maps every frame to every other by K R K^-1, whose eigenvalues have
-    # modulus 1 whatever K is; a camera that moves past a plane also gives homographies, but not such ones.
+    # Under pure rotation all frames are related by homographies K R K^-1, whose eigenvalues have modulus 1 for
+    # any K. A camera that moves past a plane gives homographies too, but with other eigenvalues.
     far = np.array(moved) > np.median(moved)
     if not far.any():
         far[:] = True
@@ -65,8 +65,8 @@ def check_motion(features: list[Features], pairs: list[VerifiedPair], image_size
         )
 
 
-def check_model(model: object | None, chosen: int, indices: np.ndarray, min_share: float) -> None:
-    """Raise `InputError` where too few frames were registered or the model has no depth."""
+def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, min_share: float) -> None:
+    """Raise `InputError` where too few frames are registered or triangulation angles are too small."""
     registered = [] if model is None else sorted(i - 1 for i in model.reg_image_ids())
     least = max(MIN_FRAMES, int(np.ceil(min_share * chosen)))
     if len(registered) < least:
@@ -80,9 +80,10 @@ def check_model(model: object | None, chosen: int, indices: np.ndarray, min_shar
             )
         )
         raise InputError(
-            f"poses: {found}; not registered: frames {_ranges(missing)}. They are blurred, show too little "
+            f"poses: {found}; not registered: frames {describe_frames(missing)}. They are blurred, show too little "
             f"texture, or share too little with the others. {_HOW_TO_FILM}"
         )
+    assert model is not None
     angle = _median_triangulation_deg(model)
     if angle < _MIN_TRIANGULATION_DEG:
         raise InputError(
@@ -92,12 +93,12 @@ def check_model(model: object | None, chosen: int, indices: np.ndarray, min_shar
 
 
 def missing_notes(frames: FrameSet, registered: list[int], parts: np.ndarray) -> list[str]:
-    """Say which keyframes are dropped, why, and what to do: one note for each reason.
+    """Describe the keyframes without a pose: one note per reason, with what to do.
 
     Args:
         frames: all keyframes.
-        registered: rows of those that have a camera.
-        parts: (n,) which keyframes share pictures with each other, from `label_parts`.
+        registered: rows of the registered ones.
+        parts: int (n,) connected components of the match graph, from `label_parts`.
     """
     missing = np.setdiff1d(np.arange(len(frames.indices)), registered)
     main = np.bincount(parts[registered]).argmax()
@@ -115,24 +116,23 @@ def missing_notes(frames: FrameSet, registered: list[int], parts: np.ndarray) ->
             when = f" ({_times(frames.times_s, rows)})" if frames.ordered else ""
             notes.append(
                 f"poses: {len(rows)} of {len(frames.indices)} keyframes were not registered and are dropped: frames "
-                f"{_ranges(frames.indices[rows])}{when}: {reason}"
+                f"{describe_frames(frames.indices[rows])}{when}: {reason}"
             )
     return notes
 
 
 def _times(times_s: np.ndarray, rows: np.ndarray, most: int = 6) -> str:
-    """Write the time ranges of runs of rows."""
+    """Format the time ranges of runs of rows."""
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 2) + 1)
     text = ", ".join(f"{times_s[run[0]]:.1f}-{times_s[run[-1]]:.1f} s" for run in runs[:most])
     return text + (f" and {len(runs) - most} more" if len(runs) > most else "")
 
 
 def _pair_motion(features: list[Features], pair: VerifiedPair) -> tuple[float, float, float]:
-    """Return the median motion in px, the share one homography explains, and its | |eigenvalue| - 1 |."""
+    """Fit a homography: the median motion in pixels, the inlier share, the largest | |eigenvalue| - 1 |."""
     i, j = pair.rows
     a, b = features[i].keypoints[pair.matches[:, 0]], features[j].keypoints[pair.matches[:, 1]]
     moved = float(np.median(np.linalg.norm(a - b, axis=1)))
-    # Centered and scaled coordinates change neither the fit nor the eigenvalues, but condition both.
     matrix, inliers = cv2.findHomography(a, b, cv2.USAC_DEFAULT, _HOMOGRAPHY_ERROR_PX)
     if matrix is None:
         return moved, 0.0, np.inf
@@ -140,8 +140,8 @@ def _pair_motion(features: list[Features], pair: VerifiedPair) -> tuple[float, f
     return moved, float(inliers.mean()), float(np.abs(np.abs(np.linalg.eigvals(matrix)) - 1).max())
 
 
-def _median_triangulation_deg(model: object) -> float:
-    """Return the median over points of the widest angle between two of the rays that see a point."""
+def _median_triangulation_deg(model: Reconstruction) -> float:
+    """Return the median over (sampled) points of the largest triangulation angle, degrees."""
     centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     angles = []
     for point_id in sorted(model.point3D_ids())[:: max(1, model.num_points3D() // 2000)]:
@@ -152,9 +152,9 @@ def _median_triangulation_deg(model: object) -> float:
     return float(np.degrees(np.median(angles))) if angles else 0.0
 
 
-def _ranges(numbers: np.ndarray, most: int = 6) -> str:
-    """Write sorted frame numbers briefly: neighbors in the list that are near each other become a range."""
-    numbers = [int(x) for x in numbers]
+def describe_frames(indices: np.ndarray, most: int = 6) -> str:
+    """Format sorted frame numbers (n,) as at most `most` ranges; small gaps do not end a range."""
+    numbers = [int(x) for x in indices]
     if not numbers:
         return "none"
     step = max(2, int(np.median(np.diff(numbers))) * 2) if len(numbers) > 1 else 2
@@ -166,6 +166,3 @@ def _ranges(numbers: np.ndarray, most: int = 6) -> str:
             runs.append([x, x])
     text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs[:most])
     return text + (f" and {len(runs) - most} more ranges" if len(runs) > most else "")
-
-
-describe_frames = _ranges

@@ -1,7 +1,7 @@
-"""Stage 2: one camera per frame, in `sfm` space.
+"""Stage 2: estimate the camera of each frame by structure from motion, in `sfm` space.
 
-SIFT, matching of likely pairs, COLMAP's incremental mapper (the global one as the second try), a robust
-bundle adjustment. Held-out frames are located against the finished model and never enter it.
+SIFT features, matching of likely pairs, COLMAP's incremental mapper (the global one as the second try), robust bundle
+adjustment. Held-out frames are localized against the finished model and never enter it.
 """
 
 from dataclasses import replace
@@ -13,6 +13,7 @@ from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.core.types import FrameSet, PosedFrames
 from reconstruction.poses import diagnose, importers, mapping
 from reconstruction.poses.backends import PoseBackend, load_pose_backend
+from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.components import label_parts
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, extract_features, match
@@ -22,8 +23,8 @@ from reconstruction.poses.matching import matched_database
 from reconstruction.poses.refine import refine_model
 from reconstruction.poses.undistort import undistort
 
-_PLAUSIBLE_FOCAL = (0.35, 4.0)  # of the longer side; metadata beyond is wrong
-_DEFAULT_FOCAL_SHARE = 1.0  # of the longer side, where the metadata says nothing
+_PLAUSIBLE_FOCAL = (0.35, 4.0)  # of the longer image side; metadata beyond is ignored
+_DEFAULT_FOCAL_SHARE = 1.0  # of the longer image side, where the metadata has no focal length
 
 
 def estimate_poses(
@@ -40,11 +41,11 @@ def estimate_poses(
         frames: keyframes and held-out frames.
         config: settings; equal settings and frames give equal bits on one machine.
         work_dir: folder for COLMAP's database, models and logs; created, may be deleted afterwards.
-        backend: predicts first cameras; None: the one that `config.backend` names.
-        progress: told about features, matching, mapping and held-out frames.
+        backend: predicts initial cameras; None: the one that `config.backend` names.
+        progress: receives steps and notes.
 
     Returns:
-        Undistorted frames that could be registered, with cameras and sparse points in `sfm` space.
+        The registered frames, undistorted, with cameras and sparse points in `sfm` space.
 
     Raises:
         InputError: the frames cannot be reconstructed; the message says why and what to do.
@@ -57,9 +58,8 @@ def estimate_poses(
         diagnose.check_features(features, frames.indices)
         known: dict[int, np.ndarray] = {}
         metric = False
-        poses_from = config.import_path or (
-            importers.find_export(Path(frames.source.file)) and frames.source.file
-        )
+        export = importers.find_export(Path(frames.source.file))
+        poses_from = config.import_path or (frames.source.file if export else "")
         if poses_from:
             imported = importers.read_poses(Path(poses_from), frames)
             for note in imported.notes:
@@ -78,7 +78,7 @@ def estimate_poses(
 
 
 def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> importers.ImportedPoses:
-    """Return the backend's cameras in the form of imported ones, with a lens that may still bend."""
+    """Return the backend's cameras as imported poses; the camera model has a distortion term, initially 0."""
     import pycolmap
 
     progress.note(f"poses: first cameras are predicted by {backend.name}, then adjusted to our own matches")
@@ -89,8 +89,8 @@ def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> impo
     return importers.ImportedPoses(camera, poses)
 
 
-def initial_camera(frames: FrameSet, config: PosesConfig) -> object:
-    """Return the shared camera that the mapper starts from."""
+def initial_camera(frames: FrameSet, config: PosesConfig) -> ColmapCamera:
+    """Return the shared camera that the mapper starts from: focal length from metadata or the default."""
     import pycolmap
 
     height, width = frames.images.shape[1:3]
@@ -105,8 +105,8 @@ def initial_camera(frames: FrameSet, config: PosesConfig) -> object:
 
 def _reconstruct(
     frames: FrameSet, features: list[Features], config: PosesConfig, work_dir: Path, progress: Progress
-) -> object:
-    """Run structure from motion; return the refined model of the largest consistent component."""
+) -> Reconstruction:
+    """Run structure from motion; return the largest model, refined by bundle adjustment."""
     camera = initial_camera(frames, config)
     database = work_dir / "database.db"
     pairs = matched_database(frames, features, camera, config, database, progress)
@@ -135,48 +135,45 @@ def _reconstruct(
 def _locate_held_out(
     frames: FrameSet,
     features: list[Features],
-    model: object,
+    model: Reconstruction,
     registered: list[int],
     known: dict[int, np.ndarray],
     config: PosesConfig,
     progress: Progress,
 ) -> list[tuple[int, np.ndarray]]:
-    """Return (held-out row, world_from_camera) of those that could be located."""
+    """Localize held-out frames whose pose is not `known`: (held-out row, world_from_camera) of all with a pose."""
     total = len(frames.held_out_images)
     rows = [row for row in range(total) if int(frames.held_out_indices[row]) not in known]
     progress.start(len(rows), "held-out frames")
-    queries = extract_features(
-        frames.held_out_images[rows], config.max_features, config.contrast_threshold, NO_PROGRESS
-    )
+    images = frames.held_out_images[rows]
+    queries = extract_features(images, config.max_features, config.contrast_threshold, NO_PROGRESS)
     if frames.ordered:
-        candidates = [
-            candidates_in_time(frames.times_s, registered, frames.held_out_times_s[row]) for row in rows
-        ]
+        times_s = frames.held_out_times_s[rows]
+        candidates = [candidates_in_time(frames.times_s, registered, time_s) for time_s in times_s]
     else:
         candidates = [_most_alike(query, features, registered) for query in queries]
     located = dict(zip(rows, locate_frames(queries, candidates, features, model, config, progress)))
-    for row in range(total):
-        if row not in located:
-            located[row] = known[int(frames.held_out_indices[row])]
+    located |= {row: known[int(frames.held_out_indices[row])] for row in range(total) if row not in located}
     failed = [row for row in range(total) if located[row] is None]
     if failed:
         progress.note(
             f"poses: {len(failed)} of {total} held-out frames could not be located and are not evaluated: "
             f"frames {diagnose.describe_frames(frames.held_out_indices[failed])}"
         )
-    return [(row, located[row]) for row in range(total) if located[row] is not None]
+    return [(row, pose) for row in range(total) if (pose := located[row]) is not None]
 
 
 def _most_alike(query: Features, features: list[Features], registered: list[int]) -> list[int]:
+    """Rank registered rows by the number of mutual matches of strong features with the query."""
     strong = query.descriptors[:512]
     counts = np.array([len(match(strong, features[row].descriptors[:512])) for row in registered])
     return [registered[i] for i in np.argsort(-counts, kind="stable")]
 
 
 def _package(
-    frames: FrameSet, model: object, registered: list[int], held_out: list[tuple[int, np.ndarray]]
+    frames: FrameSet, model: Reconstruction, registered: list[int], held_out: list[tuple[int, np.ndarray]]
 ) -> PosedFrames:
-    """Undistort and put everything into the artifact."""
+    """Undistort the images and collect poses, points and observations."""
     poses = mapping.poses_of(model)
     point_ids = sorted(model.point3D_ids())
     frame_row = {row + 1: new for new, row in enumerate(registered)}
@@ -190,11 +187,9 @@ def _package(
     points = np.array([model.point3D(i).xyz for i in point_ids], np.float64).reshape(-1, 3)
     errors = np.array([model.point3D(i).error for i in point_ids], np.float32)
     colors = _point_colors(model, point_ids, frames.images)
-    camera, (images, held_out_images) = undistort(
-        model.cameras[min(model.cameras)],
-        [frames.images[registered], frames.held_out_images[[row for row, _ in held_out]]],
-    )
     held_rows = [row for row, _ in held_out]
+    distorted = [frames.images[registered], frames.held_out_images[held_rows]]
+    camera, (images, held_out_images) = undistort(model.cameras[min(model.cameras)], distorted)
     return PosedFrames(
         source=frames.source,
         camera=camera,
@@ -217,8 +212,8 @@ def _package(
     )
 
 
-def _point_colors(model: object, point_ids: list[int], images: np.ndarray) -> np.ndarray:
-    """Return the mean color (p, 3) of each point over the frames that see it."""
+def _point_colors(model: Reconstruction, point_ids: list[int], images: np.ndarray) -> np.ndarray:
+    """Return the mean color uint8 (p, 3) of each point over its observations."""
     height, width = images.shape[1:3]
     out = np.zeros((len(point_ids), 3), np.uint8)
     keypoints = {i: np.array([p.xy for p in model.image(i).points2D]) for i in model.reg_image_ids()}

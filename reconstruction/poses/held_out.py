@@ -1,31 +1,32 @@
-"""Cameras of frames that took no part in the reconstruction, against the finished model."""
+"""Localize held-out frames against the finished model: absolute pose from 2D-3D matches."""
 
 import numpy as np
 
 from reconstruction.core.progress import Progress
+from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
 from reconstruction.poses.parallel import ordered_map
 
-_NEIGHBORS = 8
-_MAX_ERROR_PX = 3.0
+_NEIGHBORS = 8  # keyframes that each query is matched to
+_MAX_ERROR_PX = 3.0  # inlier threshold of RANSAC
 
 
 def locate_frames(
     queries: list[Features],
     candidates: list[list[int]],
     features: list[Features],
-    model: object,
+    model: Reconstruction,
     config: PosesConfig,
     progress: Progress,
 ) -> list[np.ndarray | None]:
-    """Locate each query frame: world_from_camera (4, 4), or None where too few 2D-3D matches agree.
+    """Return the pose world_from_camera (4, 4) of each query frame; None where inliers are too few.
 
     Args:
-        queries: features of the frames to locate.
-        candidates: for each query, registered frame rows that probably show the same, best first.
+        queries: features of the frames to localize.
+        candidates: for each query, rows of registered keyframes that probably overlap it, best first.
         features: features of all keyframes, in the order of the model's 2D points.
-        model: pycolmap.Reconstruction; neither it nor its camera is changed.
+        model: stays unchanged.
         config: seed and thresholds.
         progress: advanced by one per query.
     """
@@ -51,13 +52,13 @@ def locate_frames(
 
 
 def candidates_in_time(times_s: np.ndarray, registered: list[int], query_time_s: float) -> list[int]:
-    """Return registered rows, nearest in time first."""
+    """Return the registered rows nearest in time, nearest first."""
     gaps = np.abs(np.asarray(times_s)[registered] - query_time_s)
     return [registered[i] for i in np.argsort(gaps, kind="stable")[:_NEIGHBORS]]
 
 
-def _tracked_features(model: object, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of a frame's features that have a 3D point, and the ids of those points."""
+def _tracked_features(model: Reconstruction, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the feature rows int64 (k,) of a keyframe that have a 3D point, and the point ids (k,)."""
     found = [(i, p.point3D_id) for i, p in enumerate(model.image(row + 1).points2D) if p.has_point3D()]
     return np.array([f[0] for f in found], np.int64), np.array([f[1] for f in found], np.int64)
 
@@ -66,10 +67,10 @@ def _solve(
     query: Features,
     votes: dict[tuple[int, int], int],
     positions: dict[int, np.ndarray],
-    camera: object,
+    camera: ColmapCamera,
     config: PosesConfig,
 ) -> np.ndarray | None:
-    """Absolute pose from one 3D point for each 2D feature: the one that most neighbors agree on."""
+    """Estimate the absolute pose by RANSAC, each feature matched to the 3D point with most votes."""
     import pycolmap
 
     best: dict[int, tuple[int, int]] = {}

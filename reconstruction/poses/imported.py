@@ -1,4 +1,4 @@
-"""A model from poses that are known already, exactly or roughly: points from our own matches, cameras adjusted."""
+"""Build a model from known poses, exact or approximate: triangulate our own matches, refine the cameras."""
 
 import shutil
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 from reconstruction.core.progress import Progress
 from reconstruction.core.types import FrameSet
 from reconstruction.poses import diagnose, importers, mapping
+from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
 from reconstruction.poses.importers import ImportedPoses
@@ -17,9 +18,9 @@ from reconstruction.poses.refine import bundle_adjust, filter_points, refine_mod
 from registry.errors import UsageError
 from registry.geometry import split_similarity, umeyama
 
-_JUDGED_PAIRS = 60
-_MIN_ROLL_GAIN = 2.0  # another roll must fit this many times better
-# How far cameras may be off, step by step: angle of rays in degrees, pixels, scale of the robust loss in pixels.
+_JUDGED_PAIRS = 60  # sampled for the epipolar error of each roll
+_MIN_ROLL_GAIN = 2.0  # least ratio of epipolar errors at which the roll is changed
+# Tolerances of the rounds of refinement: ray angle in degrees, reprojection error and loss scale in pixels.
 _ROUGH_STEPS = ((8.0, 40.0, 8.0), (4.0, 16.0, 3.0), (2.0, 6.0, 1.0))
 
 
@@ -30,11 +31,11 @@ def use_imported(
     config: PosesConfig,
     work_dir: Path,
     progress: Progress,
-) -> tuple[object, dict[int, np.ndarray]]:
-    """Return a model in the space of the imported cameras, and the cameras that stay as they were, by video frame.
+) -> tuple[Reconstruction, dict[int, np.ndarray]]:
+    """Triangulate into the imported cameras: the model in their space, and the unrefined poses by video frame.
 
     Raises:
-        UsageError: the poses do not fit the pictures.
+        UsageError: the poses do not fit the images.
     """
     database = work_dir / "database.db"
     pairs = matched_database(frames, features, imported.camera, config, database, progress)
@@ -54,8 +55,10 @@ def use_imported(
     return model, {} if refine else imported.world_from_camera
 
 
-def refine_rough(model: object, database: Path, work_dir: Path, config: PosesConfig) -> object:
-    """Triangulate and adjust in turns, ever more strictly: cameras may be off by 3 degrees and 10 cm at first."""
+def refine_rough(
+    model: Reconstruction, database: Path, work_dir: Path, config: PosesConfig
+) -> Reconstruction:
+    """Alternate triangulation and bundle adjustment with shrinking tolerances; initial errors may be 3 deg, 10 cm."""
     for angle_deg, error_px, loss_px in _ROUGH_STEPS:
         model = _triangulate(model, database, work_dir, config, angle_deg, error_px)
         if model.num_points3D() < 50:
@@ -69,9 +72,14 @@ def refine_rough(model: object, database: Path, work_dir: Path, config: PosesCon
 
 
 def _triangulate(
-    model: object, database: Path, work_dir: Path, config: PosesConfig, angle_deg: float, error_px: float
-) -> object:
-    """Return the model with all points made anew from the matches, its cameras fixed."""
+    model: Reconstruction,
+    database: Path,
+    work_dir: Path,
+    config: PosesConfig,
+    angle_deg: float,
+    error_px: float,
+) -> Reconstruction:
+    """Triangulate all points anew from the matches, with fixed cameras."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -92,8 +100,8 @@ def _triangulate(
     return model
 
 
-def _keep_place(model: object, imported: ImportedPoses, frames: FrameSet) -> None:
-    """Move the adjusted model back onto the imported camera centers: their scale is the truth."""
+def _keep_place(model: Reconstruction, imported: ImportedPoses, frames: FrameSet) -> None:
+    """Align the refined model in place to the imported camera centers by a similarity; their scale is trusted."""
     import pycolmap
 
     poses = mapping.poses_of(model)
@@ -110,13 +118,15 @@ def _with_best_roll(
     pairs: list[VerifiedPair],
     progress: Progress,
 ) -> ImportedPoses:
-    """Turn all cameras about their optical axis by the quarter that fits the matches best."""
+    """Turn all cameras about their optical axes by the multiple of 90 degrees with the least epipolar error."""
     quarters = [importers.turned_camera(k) for k in range(4)]
     errors = [_epipolar_error(imported, turn, frames, features, pairs) for turn in quarters]
     best = int(np.argmin(errors))
     if best == 0 or errors[0] < _MIN_ROLL_GAIN * errors[best]:
         return imported
-    progress.note(f"poses: cameras turned by {90 * best} degrees about their axis, as the pictures ask for")
+    progress.note(
+        f"poses: cameras turned by {90 * best} degrees about their optical axes, to fit the matches"
+    )
     turned = {number: pose @ quarters[best] for number, pose in imported.world_from_camera.items()}
     return ImportedPoses(imported.camera, turned, imported.metric, False, imported.notes)
 
@@ -128,20 +138,16 @@ def _epipolar_error(
     features: list[Features],
     pairs: list[VerifiedPair],
 ) -> float:
-    """Return the median distance of matches from their epipolar lines, in focal lengths."""
+    """Return the median distance of matches to their epipolar lines, in normalized image coordinates."""
     errors = []
-    known = [
-        p for p in pairs if all(int(frames.indices[row]) in imported.world_from_camera for row in p.rows)
-    ]
+    poses = imported.world_from_camera
+    known = [pair for pair in pairs if all(int(frames.indices[row]) in poses for row in pair.rows)]
     for pair in known[:: max(1, len(known) // _JUDGED_PAIRS)]:
-        a, b = (imported.world_from_camera[int(frames.indices[row])] @ turn for row in pair.rows)
+        a, b = (poses[int(frames.indices[row])] @ turn for row in pair.rows)
         b_from_a = np.linalg.inv(b) @ a
-        x, y = (
-            np.column_stack(
-                [imported.camera.cam_from_img(features[row].keypoints[k].astype(np.float64)), np.ones(len(k))]
-            )
-            for row, k in zip(pair.rows, pair.matches.T)
-        )
+        pixels = [features[row].keypoints[k].astype(np.float64) for row, k in zip(pair.rows, pair.matches.T)]
+        rays = (np.asarray(imported.camera.cam_from_img(p)) for p in pixels)
+        x, y = (np.column_stack([r, np.ones(len(r))]) for r in rays)
         lines = np.cross(b_from_a[:3, 3], x @ b_from_a[:3, :3].T)
         errors.append(np.median(np.abs((y * lines).sum(1)) / np.maximum(np.hypot(*lines.T[:2]), 1e-12)))
     return float(np.median(errors)) if errors else 0.0

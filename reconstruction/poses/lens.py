@@ -1,39 +1,39 @@
-"""Where a pixel of the film as recorded lies in the straightened frames: measured on the frames themselves.
+"""Map pixels between the video as recorded and its undistorted frames.
 
-The poses stage hands on frames without lens distortion. A user clicks in the film as it is, so a click has to be
-taken across. Both pictures of each keyframe are at hand: corners followed from one to the other give the map.
+The poses stage returns undistorted frames, without the distorted camera, but users click in the video. The distortion
+is therefore fitted to corners tracked from keyframes as recorded to their undistorted versions.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from reconstruction.core.types import FrameSet, PosedFrames
+from reconstruction.core.types import Camera, FrameSet, PosedFrames
 from registry.errors import InputError
 
-_FRAMES, _CORNERS, _FEWEST = 10, 400, 60
-_ROUNDS = 30  # of the fixed-point iteration that undoes the distortion
+_FRAMES, _CORNERS = 10, 400  # most frames, most corners in each
+_FEWEST = 60  # tracked corners that the fit needs
+_ROUNDS = 30  # fixed-point iterations that invert the distortion
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The map from pixels of the frames as filmed to pixels of the straightened frames, at working size."""
+    """The map between pixels of the frames as recorded and of the undistorted frames, at working size."""
 
     width: int
     height: int
-    model: np.ndarray | None = (
-        None  # float64 (8,) fx, fy, cx, cy, k1, k2, p1, p2 of the film's camera, seen from a
-    )
-    # straightened one with a focal length of its longer side and a central principal point; None: frames are as filmed
+    # float64 (8,) fx, fy, cx, cy, k1, k2, p1, p2 of the recording camera, for rays of `_pinhole`; None: not distorted
+    model: np.ndarray | None = None
 
     @classmethod
     def measure(cls, filmed: FrameSet, posed: PosedFrames) -> "Lens":
-        """Measure it on up to ten keyframes.
+        """Fit the distortion to corners tracked in up to ten keyframes, by robust least squares.
 
         Raises:
-            InputError: the frames show too little to follow from one picture to the other.
+            InputError: too few corners can be tracked.
         """
         rows = {int(index): row for row, index in enumerate(filmed.indices)}
         pairs = [(rows[int(index)], k) for k, index in enumerate(posed.indices) if int(index) in rows]
@@ -41,35 +41,37 @@ class Lens:
         chosen = [pairs[int(i)] for i in np.linspace(0, len(pairs) - 1, min(_FRAMES, len(pairs)))]
         if all(np.array_equal(filmed.images[a], posed.images[b]) for a, b in chosen):
             return cls(width, height)
-        found = [_followed(np.asarray(filmed.images[a]), np.asarray(posed.images[b])) for a, b in chosen]
+        found = [_tracked_corners(filmed.images[a], posed.images[b]) for a, b in chosen]
         before, after = (np.concatenate([f[k] for f in found]) for k in range(2))
         if len(before) < _FEWEST:
             raise InputError(
-                f"the lens cannot be measured: only {len(before)} corners of the film are found again in its "
-                "straightened frames. Address things by `id` or `at` instead of `pixel`."
+                f"the lens distortion cannot be measured: only {len(before)} corners can be tracked from the video to "
+                "its undistorted frames. Address objects by `id` or `at` instead of `pixel`."
             )
-        rays = _rays(after, width, height)
-        start = np.array([*_unit(width, height)[[0, 1, 0, 1], [0, 1, 2, 2]], 0, 0, 0, 0])
-        fit = least_squares(
-            lambda m: (_distorted(rays, m) - before).ravel(), start, loss="soft_l1", f_scale=0.2
-        )
-        return cls(width, height, fit.x)
+        pinhole = _pinhole(width, height)
+        rays = pinhole.unproject(after[:, 0], after[:, 1], np.ones(len(after)))[:, :2]
+        start = np.array([*pinhole.intrinsics, 0, 0, 0, 0])
+
+        def residuals(model: np.ndarray) -> np.ndarray:
+            return (_distorted(rays, model) - before).ravel()
+
+        return cls(width, height, least_squares(residuals, start, loss="soft_l1", f_scale=0.2).x)
 
     def straightened(self, pixels: np.ndarray) -> np.ndarray:
-        """Return where pixels (n, 2) of a frame as filmed lie in the straightened frame; both at working size."""
+        """Map pixels (n, 2) of a frame as recorded to the undistorted frame; both at working size."""
         pixels = np.asarray(pixels, np.float64)
         if self.model is None:
             return pixels
         goal = (pixels - self.model[2:4]) / self.model[:2]
-        pinhole = np.array([1, 1, 0, 0, *self.model[4:]])
+        normalized = np.array([1, 1, 0, 0, *self.model[4:]])
         rays = goal.copy()
         for _ in range(_ROUNDS):
-            rays += goal - _distorted(rays, pinhole)
-        unit = _unit(self.width, self.height)
-        return rays * unit[[0, 1], [0, 1]] + unit[:2, 2]
+            rays += goal - _distorted(rays, normalized)
+        points = np.column_stack([rays, np.ones(len(rays))])
+        return np.stack(_pinhole(self.width, self.height).project(points), axis=1)
 
     def as_filmed(self, picture: np.ndarray) -> np.ndarray:
-        """Return an id image (h, w) of a straightened frame, of any size, as the frame as filmed would show it."""
+        """Resample an id image (h, w) of an undistorted frame, of any size, to the frame as recorded; 0 outside."""
         if self.model is None:
             return np.asarray(picture)
         height, width = picture.shape
@@ -83,32 +85,27 @@ class Lens:
         return out.reshape(height, width)
 
 
-def _followed(filmed: np.ndarray, straight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners of one picture (n, 2) and where they are in the other; pixel centers at 0.5."""
-    before, after = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (filmed, straight))
+def _tracked_corners(filmed: np.ndarray, straight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Track corners by optical flow, checked backwards: pixels (n, 2) in both images, pixel centers at 0.5."""
+    before, after = (cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2GRAY) for image in (filmed, straight))
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 8)
     if corners is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    options = {"winSize": (21, 21), "maxLevel": 4}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, **options)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **options)
-    good = (found & again)[:, 0].astype(bool) & (np.linalg.norm(back - corners, axis=2)[:, 0] < 0.3)
+    options: Any = {"winSize": (21, 21), "maxLevel": 4, "nextPts": None}
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, **options)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, there, **options)
+    good = (found[:, 0] != 0) & (again[:, 0] != 0) & (np.linalg.norm(back - corners, axis=2)[:, 0] < 0.3)
     return corners[good, 0].astype(np.float64) + 0.5, there[good, 0].astype(np.float64) + 0.5
 
 
-def _unit(width: int, height: int) -> np.ndarray:
-    """Return the matrix K of the straightened camera that the model is seen from."""
+def _pinhole(width: int, height: int) -> Camera:
+    """Return the nominal camera of the undistorted frames: centered, its focal length the longer side."""
     side = float(max(width, height))
-    return np.array([[side, 0, width / 2], [0, side, height / 2], [0, 0, 1]])
-
-
-def _rays(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    unit = _unit(width, height)
-    return (pixels - unit[:2, 2]) / unit[[0, 1], [0, 1]]
+    return Camera(width, height, side, side, width / 2, height / 2)
 
 
 def _distorted(rays: np.ndarray, model: np.ndarray) -> np.ndarray:
-    """Return the pixels (n, 2) in which the film's camera sees rays (n, 2): OpenCV's model with four coefficients."""
+    """Project rays (n, 2) at z = 1 to pixels (n, 2) by OpenCV's camera model with k1, k2, p1, p2."""
     fx, fy, cx, cy, k1, k2, p1, p2 = model
     x, y = rays.T
     square = x * x + y * y

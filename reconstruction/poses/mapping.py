@@ -1,28 +1,30 @@
-"""Structure from motion by COLMAP: a database of verified pairs in, the largest consistent model out."""
+"""Structure from motion by COLMAP: a database of verified pairs in, models out."""
 
 import contextlib
 import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from reconstruction.core.progress import Progress
+from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
 
-# With more threads Ceres adds in an order that changes from run to run, and the last bits of poses with it.
+# With more threads, Ceres sums in an order that changes from run to run, and so do the last bits of poses.
 MAPPER_THREADS = 1
 
 
 @contextlib.contextmanager
 def colmap_log(folder: Path) -> Iterator[None]:
-    """Send what COLMAP logs to files in `folder` instead of the terminal while the block runs."""
+    """Redirect COLMAP's log from the terminal to files in `folder` while the block runs."""
     import pycolmap
 
-    # On import pycolmap makes SIGTERM print a stack trace; killing a run is no crash.
+    # Importing pycolmap installs a SIGTERM handler that prints a stack trace; killing a run is no crash.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     log = pycolmap.logging
@@ -42,12 +44,14 @@ def colmap_log(folder: Path) -> Iterator[None]:
 
 
 def frame_name(row: int) -> str:
-    """Name of a keyframe inside COLMAP; sorts by row."""
+    """Return the name of a keyframe inside COLMAP; names sort by row."""
     return f"{row:05d}.png"
 
 
-def write_database(path: Path, camera: object, features: list[Features], pairs: list[VerifiedPair]) -> None:
-    """Write what the mapper reads. Image ids are row + 1, so that every run numbers them alike."""
+def write_database(
+    path: Path, camera: ColmapCamera, features: list[Features], pairs: list[VerifiedPair]
+) -> None:
+    """Write the database that the mapper reads; image and frame ids are row + 1."""
     import pycolmap
 
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
@@ -73,7 +77,7 @@ def write_database(path: Path, camera: object, features: list[Features], pairs: 
 
 def incremental_models(
     database: Path, work_dir: Path, config: PosesConfig, total: int, progress: Progress
-) -> list[object]:
+) -> list[Reconstruction]:
     """Run the incremental mapper; return its models, largest first."""
     import pycolmap
 
@@ -85,7 +89,7 @@ def incremental_models(
     options.max_num_models = 6
     options.max_model_overlap = 20
     options.min_model_size = 5
-    # Rough while the model grows: `refine_model` has the last word (measured: the same cameras, half the time).
+    # Coarse bundle adjustment while the model grows: `refine_model` follows (measured: same cameras, half the time).
     options.ba_global_frames_ratio = 2.0
     options.ba_global_points_ratio = 2.0
     options.ba_global_max_num_iterations = 12
@@ -106,19 +110,13 @@ def incremental_models(
         one_more()
         one_more()
 
-    models = pycolmap.incremental_mapping(
-        database,
-        work_dir,
-        output,
-        options,
-        initial_image_pair_callback=first_two,
-        next_image_callback=one_more,
-    )
+    callbacks: Any = {"initial_image_pair_callback": first_two, "next_image_callback": one_more}
+    models = pycolmap.incremental_mapping(database, work_dir, output, options, **callbacks)
     progress.advance(total - done[0])
     return _by_size(models)
 
 
-def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[object]:
+def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[Reconstruction]:
     """Run the global mapper; return its models, largest first."""
     import pycolmap
 
@@ -131,12 +129,12 @@ def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[o
     return _by_size(pycolmap.global_mapping(database, work_dir, output, options))
 
 
-def _by_size(models: dict[int, object]) -> list[object]:
+def _by_size(models: dict[int, Reconstruction]) -> list[Reconstruction]:
     return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
-def poses_of(model: object) -> dict[int, np.ndarray]:
-    """Return world_from_camera (4, 4) by frame row."""
+def poses_of(model: Reconstruction) -> dict[int, np.ndarray]:
+    """Return world_from_camera float64 (4, 4) of the registered images, by frame row."""
     out = {}
     for image_id in sorted(model.reg_image_ids()):
         camera_from_world = np.eye(4)

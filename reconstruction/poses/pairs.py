@@ -1,4 +1,4 @@
-"""Which frames to match with which, and what geometry each pair agrees on."""
+"""Choose pairs of frames to match, and verify each pair by two-view geometry."""
 
 from dataclasses import dataclass
 
@@ -6,32 +6,31 @@ import cv2
 import numpy as np
 
 from reconstruction.core.progress import Progress
+from reconstruction.poses.colmap_types import ColmapCamera, TwoViewGeometry
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
 from reconstruction.poses.parallel import ordered_map
 
-_MIN_OVERLAP_SCORE = (
-    6  # mutual matches among the largest features; below it full matching finds next to nothing
-)
-_EXHAUSTIVE_BELOW = 40  # frames: all pairs are then cheaper than being clever
-_MAX_EPIPOLAR_ERROR_PX = 3.0
+_MIN_OVERLAP_SCORE = 6  # mutual matches; with fewer, full matching finds next to nothing
+_EXHAUSTIVE_BELOW = 40  # frames; up to this many, nearly all pairs are candidates
+_MAX_EPIPOLAR_ERROR_PX = 3.0  # inlier threshold
 
 
 @dataclass(frozen=True)
 class VerifiedPair:
-    """Two frames that see the same things from two places."""
+    """Two frames whose matches are inliers of one two-view geometry."""
 
     rows: tuple[int, int]
-    matches: np.ndarray  # uint32 (k, 2) rows of both frames' features, all agree with `geometry`
-    geometry: object  # pycolmap.TwoViewGeometry
+    matches: np.ndarray  # uint32 (k, 2) rows of both frames' features, inliers of `geometry`
+    geometry: TwoViewGeometry
 
 
 def choose_pairs(scores: np.ndarray, ordered: bool, config: PosesConfig) -> list[tuple[int, int, bool]]:
-    """Choose pairs (row, later row, near): neighbors in time, and each frame's partners that look most alike.
+    """Choose pairs (row, later row, near in time): neighbors in time and the partners with the highest overlap.
 
     Args:
-        scores: int (n, n) symmetric, from `overlap_scores`.
-        ordered: rows follow each other in time.
+        scores: int (n, n), symmetric, from `overlap_scores`.
+        ordered: rows are in time order.
         config: overlap and number of partners.
     """
     n = len(scores)
@@ -46,7 +45,7 @@ def choose_pairs(scores: np.ndarray, ordered: bool, config: PosesConfig) -> list
     if ordered:
         near = (gap > 0) & (gap <= max(1, config.sequential_overlap // 2))
         wanted |= (gap > 0) & (gap <= config.sequential_overlap)
-        # Powers of two further on tie the chain together at every time scale (as COLMAP's quadratic overlap).
+        # Doubling distances connect the sequence at all time scales, as COLMAP's quadratic overlap.
         power = 2 * config.sequential_overlap
         while power < n:
             wanted |= (gap == power) & likely
@@ -58,14 +57,14 @@ def choose_pairs(scores: np.ndarray, ordered: bool, config: PosesConfig) -> list
 def verify_pairs(
     pairs: list[tuple[int, int, bool]],
     features: list[Features],
-    camera: object,
+    camera: ColmapCamera,
     config: PosesConfig,
     progress: Progress,
 ) -> list[VerifiedPair]:
-    """Match the features of each pair and keep the pairs whose matches agree with one two-view geometry.
+    """Match the features of each pair; return the pairs whose two-view geometry has enough inliers.
 
-    Pairs far apart in time are matched by the stronger half of the features only: a quarter of the cost, and
-    weak features rarely survive a large change of view.
+    Pairs not near in time are matched by the stronger half of the features only: a quarter of the cost, and weak
+    features rarely match across a large change of viewpoint.
     """
     import pycolmap
 
@@ -84,14 +83,9 @@ def verify_pairs(
         matches = _epipolar_inliers(a.keypoints, b.keypoints, matches, config.min_inliers)
         if len(matches) < config.min_inliers:
             return None
-        geometry = pycolmap.estimate_two_view_geometry(
-            camera,
-            a.keypoints.astype(np.float64),
-            camera,
-            b.keypoints.astype(np.float64),
-            matches.astype(np.uint32),
-            options,
-        )
+        first, second = a.keypoints.astype(np.float64), b.keypoints.astype(np.float64)
+        rows = matches.astype(np.uint32)
+        geometry = pycolmap.estimate_two_view_geometry(camera, first, camera, second, rows, options)
         if len(geometry.inlier_matches) < config.min_inliers:
             return None
         return VerifiedPair((i, j), np.asarray(geometry.inlier_matches), geometry)
@@ -104,7 +98,7 @@ def verify_pairs(
 
 
 def _epipolar_inliers(a: np.ndarray, b: np.ndarray, matches: np.ndarray, least: int) -> np.ndarray:
-    """Keep the matches that agree with one fundamental matrix (OpenCV's sampler rejects quickly)."""
+    """Return the matches (k, 2) that are inliers of one fundamental matrix, by OpenCV's USAC."""
     if len(matches) < least:
         return matches[:0]
     try:

@@ -1,11 +1,11 @@
-"""The same function on many items, over all cores, with the results in the order of the items.
+"""Map a function over items on a pool of threads, results in the order of the items.
 
-Plain threads: OpenCV, COLMAP, BLAS all release the interpreter lock. Inside, BLAS and OpenCV use one thread
-each, since their own threads would wait for each other (measured: three times the CPU time on a busy machine).
+OpenCV, COLMAP and BLAS release the interpreter lock. Inside the pool, BLAS and OpenCV use one thread each: with their
+own threads they wait for each other (measured: three times the CPU time on a busy machine).
 """
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -20,8 +20,8 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def ordered_map(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
-    """Yield function(item) for each item, in order; the first exception is raised and ends the work."""
+def ordered_map(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Yield function(item) for each item, in order; the first exception is raised and cancels the rest."""
     from threadpoolctl import threadpool_limits
 
     cv2_threads = cv2.getNumThreads()

@@ -1,19 +1,20 @@
-"""From a camera with lens distortion to a pinhole camera, and images resampled to it."""
+"""Undistort images: find a pinhole camera that the distorted images cover, and resample them to it."""
 
 import cv2
 import numpy as np
 
 from reconstruction.core.types import Camera
+from reconstruction.poses.colmap_types import ColmapCamera
 
-_NEGLIGIBLE_PX = 0.3  # a smaller displacement everywhere is not worth the blur of resampling
+_NEGLIGIBLE_PX = 0.3  # displacement up to which images are left as they are, as resampling blurs
 
 
-def undistort(camera: object, image_sets: list[np.ndarray]) -> tuple[Camera, list[np.ndarray]]:
-    """Return a pinhole camera of the same size that sees only what the images cover, and the images in it.
+def undistort(camera: ColmapCamera, image_sets: list[np.ndarray]) -> tuple[Camera, list[np.ndarray]]:
+    """Return a pinhole camera of the same size whose view the images cover, and the images resampled to it.
 
     Args:
-        camera: pycolmap.Camera of the images.
-        image_sets: uint8 arrays (n, h, w, 3), any number of them.
+        camera: distorted camera of the images.
+        image_sets: uint8 arrays (n, h, w, 3); returned as they are where the distortion is negligible.
     """
     width, height = camera.width, camera.height
     fx, fy = camera.focal_length_x, camera.focal_length_y
@@ -22,18 +23,16 @@ def undistort(camera: object, image_sets: list[np.ndarray]) -> tuple[Camera, lis
     if np.abs(_source_pixels(camera, pinhole, pixels) - pixels).max() <= _NEGLIGIBLE_PX:
         return pinhole, image_sets
     pinhole = _covering_pinhole(camera)
-    source = _source_pixels(camera, pinhole, pixels).reshape(height, width, 2).astype(
-        np.float32
-    ) - np.float32(0.5)
+    source = _source_pixels(camera, pinhole, pixels).reshape(height, width, 2).astype(np.float32)
+    source -= np.float32(0.5)
     return pinhole, [_resample(images, source) for images in image_sets]
 
 
 def _resample(images: np.ndarray, source: np.ndarray) -> np.ndarray:
     out = np.empty_like(images)
     for row, image in enumerate(images):
-        out[row] = cv2.remap(
-            np.ascontiguousarray(image), source, None, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
-        )
+        pixels, mode = np.ascontiguousarray(image), cv2.BORDER_REPLICATE
+        out[row] = cv2.remap(pixels, source, None, cv2.INTER_LANCZOS4, borderMode=mode)  # pyright: ignore[reportCallIssue, reportArgumentType]
     return out
 
 
@@ -42,35 +41,30 @@ def _pixel_grid(width: int, height: int) -> np.ndarray:
     return np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
-def _source_pixels(camera: object, pinhole: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return where each pixel (n, 2) of the pinhole image lies in the distorted one."""
-    x = (pixels[:, 0] - pinhole.cx) / pinhole.fx
-    y = (pixels[:, 1] - pinhole.cy) / pinhole.fy
-    return np.asarray(camera.img_from_cam(np.stack([x, y, np.ones_like(x)], axis=1)))
+def _source_pixels(camera: ColmapCamera, pinhole: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the position (n, 2) in the distorted image of each pixel (n, 2) of the pinhole image."""
+    rays = pinhole.unproject(pixels[:, 0], pixels[:, 1], np.ones(len(pixels)))
+    return np.asarray(camera.img_from_cam(rays))
 
 
-def _covering_pinhole(camera: object) -> Camera:
-    """Find the widest centered pinhole camera of the same size that sees only what the lens recorded."""
+def _covering_pinhole(camera: ColmapCamera) -> Camera:
+    """Find the widest centered pinhole camera of the same size whose view the distorted image covers, by bisection."""
     width, height = camera.width, camera.height
-    edge_u = np.concatenate(
-        [np.linspace(0.5, width - 0.5, 100)] * 2 + [np.full(100, 0.5), np.full(100, width - 0.5)]
-    )
-    edge_v = np.concatenate(
-        [np.full(100, 0.5), np.full(100, height - 0.5)] + [np.linspace(0.5, height - 0.5, 100)] * 2
-    )
-    edge = np.stack([edge_u, edge_v], axis=1)
+    u, v = (np.linspace(0.5, side - 0.5, 100) for side in (width, height))
+    first, last_u, last_v = np.full(100, 0.5), np.full(100, width - 0.5), np.full(100, height - 0.5)
+    border = np.stack([np.concatenate([u, u, first, last_u]), np.concatenate([first, last_v, v, v])], axis=1)
     focal = (camera.focal_length_x + camera.focal_length_y) / 2
 
     def at_zoom(zoom: float) -> Camera:
         return Camera(width, height, zoom * focal, zoom * focal, width / 2, height / 2)
 
     def covered(zoom: float) -> bool:
-        source = _source_pixels(camera, at_zoom(zoom), edge)
+        source = _source_pixels(camera, at_zoom(zoom), border)
         inside = (source >= 0.5) & (source <= np.array([width, height]) - 0.5)
         return bool(np.isfinite(source).all() and inside.all())
 
     low, high = 0.5, 3.0
-    # Above 1 there is always a zoom that is covered (unless the principal point is outside the image).
+    # Some zoom above 1 is always covered, unless the principal point is outside of the image.
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (low, middle) if covered(middle) else (middle, high)

@@ -1,4 +1,4 @@
-"""The last step: a finished run -> a scene bundle in the registry."""
+"""Write a finished run as a scene bundle and publish it in the registry."""
 
 from reconstruction.publish.write import publish_scene
 

@@ -1,4 +1,4 @@
-"""The frames that show the things of a scene best, and a point on each to click on: what a bundle keeps of them.
+"""Select keyframes that cover all objects well, and an anchor pixel per object; write both into the bundle.
 
 `simrecon show SCENE --instances` draws its contact sheets from these files alone.
 """
@@ -12,66 +12,67 @@ import numpy as np
 from reconstruction.core.types import FrameSet, InstanceSet, PosedFrames
 from reconstruction.poses.lens import Lens
 
-_SEEN_WELL = 0.6  # of the best view's pixels
-_CUT_OFF = 0.35  # what a view counts in which the picture's border cuts the thing
-_FEWEST_PX = 12
-_SIDE_PX, _QUALITY = 960, 82  # of the frames that a bundle keeps
+_COVERED_SHARE = 0.6  # of the best view's score, from which a view covers an object
+_TRUNCATED_WEIGHT = 0.35  # of a view in which the image border truncates the object
+_MIN_PX = 12  # pixels of an object, below which it is not visible
+_SIDE_PX, _QUALITY = 960, 82  # longer side and JPEG quality of the stored frames
 
 
 @dataclass(frozen=True)
 class InstanceViews:
-    """The chosen frames, and where in them each thing is best pointed at."""
+    """The selected frames and an anchor per object."""
 
-    rows: tuple[int, ...]  # of the keyframes, in time order
-    anchors: dict[
-        int, tuple[int, float, float]
-    ]  # id -> row, x, y as shares of width and height, in the film as it is
+    rows: tuple[int, ...]  # rows of the keyframes, in time order
+    # id -> (row, x, y): x and y in the distorted video frame, divided by its width and height
+    anchors: dict[int, tuple[int, float, float]]
 
 
 def choose_views(id_maps: np.ndarray, ids: list[int], lens: Lens) -> InstanceViews:
-    """Choose few keyframes so that each thing is seen well in at least one.
+    """Select few keyframes that cover every visible object, by greedy set cover.
 
     Args:
-        id_maps: uint16 (n, h, w) ids per straightened keyframe.
-        ids: the things that count.
-        lens: from the film to straightened frames.
+        id_maps: uint16 (n, h, w) instance ids per undistorted keyframe.
+        ids: objects to cover.
+        lens: distortion between the video and the undistorted frames.
 
     Returns:
-        The views. A thing that shows in no keyframe has no anchor.
+        The views; objects that no keyframe shows have no anchor.
     """
     quality = _quality(id_maps, ids)
     best = quality.max(axis=0, initial=0)
     visible = best > 0
-    well = (quality >= _SEEN_WELL * best) & (quality > 0)
+    covers = (quality >= _COVERED_SHARE * best) & (quality > 0)
     share = quality / np.maximum(best, 1e-9)
     missing, chosen = visible.copy(), []
     while missing.any():
-        gain = (well & missing).sum(axis=1) + 0.3 * (share * missing).mean(axis=1) + 0.1 * share.mean(axis=1)
+        gain = (
+            (covers & missing).sum(axis=1) + 0.3 * (share * missing).mean(axis=1) + 0.1 * share.mean(axis=1)
+        )
         chosen.append(int(np.argmax(gain)))
-        missing &= ~well[chosen[-1]]
+        missing &= ~covers[chosen[-1]]
     anchors = {}
     for k, number in enumerate(ids):
         if visible[k]:
             row = max(chosen, key=lambda r: (quality[r, k], -r))
-            anchors[number] = (row, *_inmost(lens.as_filmed(id_maps[row]) == number))
+            anchors[number] = (row, *_innermost_pixel(lens.as_filmed(id_maps[row]) == number))
     return InstanceViews(tuple(sorted(chosen)), anchors)
 
 
 def _quality(id_maps: np.ndarray, ids: list[int]) -> np.ndarray:
-    """Return (n, k) how well each keyframe shows each thing: its pixels, fewer if the border cuts it."""
+    """Score each keyframe for each object (n, k): its pixel count, down-weighted where the border truncates it."""
     out = np.zeros((len(id_maps), len(ids)))
     top = max(ids, default=0) + 1
     for row, picture in enumerate(id_maps):
         picture = np.asarray(picture)
         pixels = np.bincount(picture.ravel(), minlength=top)[ids]
-        rim = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
-        at_rim = np.bincount(rim, minlength=top)[ids]
-        out[row] = np.where(pixels >= _FEWEST_PX, pixels * np.where(at_rim > 2, _CUT_OFF, 1.0), 0.0)
+        border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+        at_border = np.bincount(border, minlength=top)[ids]
+        out[row] = np.where(pixels >= _MIN_PX, pixels * np.where(at_border > 2, _TRUNCATED_WEIGHT, 1.0), 0.0)
     return out
 
 
-def _inmost(mask: np.ndarray) -> tuple[float, float]:
-    """Return the pixel of a mask that is farthest from its border, as shares of width and height."""
+def _innermost_pixel(mask: np.ndarray) -> tuple[float, float]:
+    """Return x / width and y / height of the maximum of the mask's distance transform."""
     inner = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(inner)), inner.shape)
     return (float(column) + 0.5) / mask.shape[1], (float(row) + 0.5) / mask.shape[0]
@@ -80,19 +81,19 @@ def _inmost(mask: np.ndarray) -> tuple[float, float]:
 def write_views(
     found: InstanceSet, ids: list[int], frames: FrameSet, posed: PosedFrames, lens: Lens, folder: Path
 ) -> tuple[dict, dict[int, dict]]:
-    """Write the chosen frames as they were filmed, and beside each which thing its pixels show.
+    """Write the selected video frames with an id map each: `instances/NNNNN.jpg` and `.png` (16-bit ids).
 
     Args:
-        found: the cut.
-        ids: the things that are in the scene.
-        frames: the film's keyframes as they were filmed.
-        posed: the straightened ones, whose rows the id maps have.
-        lens: from the film to straightened frames.
-        folder: of the bundle; `instances/NNNNN.jpg` and `.png` (16-bit ids) are written.
+        found: instances, with id maps of the undistorted keyframes.
+        ids: objects of the scene.
+        frames: keyframes as decoded, with lens distortion.
+        posed: undistorted keyframes, in the order of the id maps.
+        lens: distortion between the two.
+        folder: of the bundle.
 
     Returns:
-        The `instances` section of scene.json, and for each thing that shows in a keyframe its `anchor`: the video
-        frame and the pixel in it, in the video's own size.
+        The `instances` section of scene.json, and the `anchor` of each visible object: video frame and pixel, in
+        pixels of the video.
     """
     views = choose_views(found.id_maps, ids, lens)
     row_of = {int(index): row for row, index in enumerate(frames.indices)}
@@ -101,7 +102,7 @@ def write_views(
     for row in views.rows:
         index = int(posed.indices[row])
         name = f"instances/{index:05d}"
-        picture = _fitted(np.asarray(frames.images[row_of[index]]))
+        picture = _downscaled(np.asarray(frames.images[row_of[index]]))
         flags = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
         cv2.imwrite(str(folder / f"{name}.jpg"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), flags)
         shown = lens.as_filmed(found.id_maps[row])
@@ -116,7 +117,7 @@ def write_views(
     return {"frames": entries}, anchors
 
 
-def _fitted(image: np.ndarray) -> np.ndarray:
+def _downscaled(image: np.ndarray) -> np.ndarray:
     scale = min(1.0, _SIDE_PX / max(image.shape[:2]))
     if scale == 1.0:
         return np.ascontiguousarray(image)

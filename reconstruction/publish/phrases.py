@@ -1,8 +1,8 @@
-"""Referring expressions: objects of a scene -> noun phrases that tell them apart, such as "small red box on the shelf".
+"""Generate referring expressions: a unique noun phrase per object, such as "small red box on the shelf".
 
-The incremental algorithm (Dale & Reiter, Cognitive Science 1995): attributes are tried in a fixed order, and one is
-taken where it rules out another object. Color is taken wherever it is sure, as people do. Phrases say what was
-measured: the label where there is one, else the shape.
+The incremental algorithm (Dale and Reiter, Cognitive Science 1995): attributes are tried in a fixed order; one is
+used if it excludes another object. Color is used whenever it is certain. The noun is the label, or the shape of
+objects without one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,28 +23,34 @@ _HUES = (  # upper end of the CIELAB hue angle in degrees, light name, dark name
     (335.0, "purple", "purple"),
     (360.0, "pink", "purple"),
 )
-_LIGHT_FROM = 58.0  # lightness that parts the light from the dark name of a hue
-_VIVID, _DULL = 50.0, 25.0  # chroma from which a light red is no pink, and below which a dark red is brown
-_COLORED_SHARE, _COLORED_LOW, _COLORED_HIGH = 0.25, 7.0, 12.0  # chroma over lightness, and its bounds
-_BLACK_BELOW, _WHITE_FROM = 22.0, 68.0  # lightness of surfaces without chroma
-_SURE_SHARE = 0.5  # of the area must have the color's name
-_BOX_FILL, _ROUND_FILL = (
-    0.88,
-    (0.74, 0.84),
-)  # hull over box volume; hull over box area of the outline from above
-_FLAT, _TALL, _LONG = 0.22, 1.8, 3.0  # height over the smaller side, height over the larger, side over side
-_LARGER = 1.4  # ratio of volumes from which sizes differ visibly
-_BESIDE_M = 0.4
+_LIGHT_FROM = 58.0  # CIELAB lightness from which the light name of a hue applies
+_VIVID, _DULL = (
+    50.0,
+    25.0,
+)  # chroma: light reds from the first are not pink, dark reds below the second are brown
+# Least chroma of a color that is not black, gray or white: a share of the lightness, clipped to two bounds.
+_COLORED_SHARE, _COLORED_LOW, _COLORED_HIGH = 0.25, 7.0, 12.0
+_BLACK_BELOW, _WHITE_FROM = 22.0, 68.0  # lightness of achromatic surfaces
+_SURE_SHARE = 0.5  # least share of the area with one color name
+_BOX_FILL = 0.88  # least volume of the convex hull over that of the bounding box
+_ROUND_FILL = (0.74, 0.84)  # footprint: area of the convex hull over that of the bounding box
+_FLAT, _TALL, _LONG = (
+    0.22,
+    1.8,
+    3.0,
+)  # height / shorter side, height / longer side, longer side / shorter side
+_LARGER = 1.4  # ratio of volumes from which sizes count as different
+_BESIDE_M = 0.4  # largest distance of centers for "beside"
 
 
 @dataclass(frozen=True)
 class Described:
-    """The facts of one object that a phrase may use."""
+    """The attributes of one object that a phrase may use."""
 
     id: int
     noun: str  # its label, or its shape
-    color: str  # "" where it is not sure
-    volume: float  # of its box, m3
+    color: str  # "" if uncertain
+    volume: float  # of its bounding box, m3
     center: np.ndarray  # float64 (3,) world, metres
     parent: int
 
@@ -52,7 +58,7 @@ class Described:
     def of(
         cls, key: int, label: str, mesh: TexturedMesh, world_from_object: np.ndarray, parent: int
     ) -> "Described":
-        """Measure an object."""
+        """Measure the attributes of an object; `parent` is the id of its support."""
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         center = world_from_object[:3, :3] @ (0.5 * (low + high)) + world_from_object[:3, 3]
         noun = label.replace("_", " ") if label != UNKNOWN[0] else shape_noun(mesh.vertices)
@@ -60,30 +66,30 @@ class Described:
 
 
 def phrases(objects: Sequence[Described], base_labels: Mapping[int, str]) -> dict[int, str]:
-    """Return a noun phrase for each object by id, without article, no two alike.
+    """Return a unique noun phrase per object id, without article.
 
     Args:
-        objects: All objects of a scene.
-        base_labels: "floor", "wall" or "ceiling" by id.
+        objects: all objects of a scene.
+        base_labels: id -> "floor", "wall" or "ceiling".
     """
     every = {item.id: item for item in objects}
     short = {item.id: _short(item, objects) for item in objects}
     out = {}
     for item in objects:
-        alike = [other for other in objects if other.id != item.id and short[other.id] == short[item.id]]
         text = short[item.id]
+        alike = [other for other in objects if other.id != item.id and short[other.id] == text]
         if alike:
-            text = _placed(item, alike, every, short, base_labels) or f"{text} {item.id}"
+            text = _with_place(item, alike, every, short, base_labels) or f"{text} {item.id}"
         out[item.id] = text
     taken: dict[str, int] = {}
-    for key, text in sorted(out.items()):  # labels are free words: one may read like another thing's place
+    for key, text in sorted(out.items()):  # labels are free text: one may equal the phrase of another object
         out[key] = text if text not in taken else f"{text} {key}"
         taken.setdefault(text, key)
     return out
 
 
 def _short(item: Described, objects: Sequence[Described]) -> str:
-    """Return color and noun, with the size where others share both and all of them are visibly smaller or larger."""
+    """Return color and noun, with the size if all objects of that color and noun are clearly smaller or larger."""
     shape, _, noun = item.noun.rpartition(" ") if item.noun.endswith(" thing") else ("", "", item.noun)
     words = [word for word in (shape, item.color, noun) if word]
     alike = [o for o in objects if o.id != item.id and (o.color, o.noun) == (item.color, item.noun)]
@@ -94,33 +100,33 @@ def _short(item: Described, objects: Sequence[Described]) -> str:
     return " ".join(words)
 
 
-def _placed(
+def _with_place(
     item: Described, alike: Sequence[Described], every: Mapping[int, Described], short: Mapping[int, str],
     base_labels: Mapping[int, str],
 ) -> str:  # fmt: skip
-    """Return the phrase with a place that none of those that read alike has, "" where there is none."""
+    """Append a support or a landmark that excludes all of `alike`; "" if there is none."""
     counts: dict[str, int] = {}
     for text in short.values():
         counts[text] = counts.get(text, 0) + 1
-    carriers = {o.id: base_labels.get(o.parent) or short.get(o.parent, "") for o in (item, *alike)}
-    carrier = carriers.pop(item.id)
-    if carrier and carrier not in carriers.values() and counts.get(carrier, 1) == 1:
-        return f"{short[item.id]} on the {carrier}"
+    supports = {o.id: base_labels.get(o.parent) or short.get(o.parent, "") for o in (item, *alike)}
+    support = supports.pop(item.id)
+    if support and support not in supports.values() and counts.get(support, 1) == 1:
+        return f"{short[item.id]} on the {support}"
     landmarks = [o for o in every.values() if counts[short[o.id]] == 1 and o.id not in (item.id, item.parent)]
-    for mark in sorted(landmarks, key=lambda o: (_apart(item, o), o.id)):
-        if _apart(item, mark) > _BESIDE_M:
+    for mark in sorted(landmarks, key=lambda o: (_distance(item, o), o.id)):
+        if _distance(item, mark) > _BESIDE_M:
             break
-        if mark.parent != item.id and all(_apart(o, mark) > 1.5 * _apart(item, mark) for o in alike):
+        if mark.parent != item.id and all(_distance(o, mark) > 1.5 * _distance(item, mark) for o in alike):
             return f"{short[item.id]} beside the {short[mark.id]}"
     return ""
 
 
-def _apart(a: Described, b: Described) -> float:
+def _distance(a: Described, b: Described) -> float:
     return float(np.linalg.norm(a.center - b.center))
 
 
 def shape_noun(vertices: np.ndarray) -> str:
-    """Return "box", "round thing", "flat thing", "tall thing", "long thing" or "thing" for vertices (v, 3), +z up."""
+    """Classify vertices (v, 3), +z up, as "box", "round", "flat", "tall" or "long thing", or "thing"."""
     from scipy.spatial import ConvexHull, QhullError
 
     size = np.ptp(vertices, axis=0).astype(np.float64)
@@ -143,7 +149,7 @@ def shape_noun(vertices: np.ndarray) -> str:
 
 
 def color_name(mesh: TexturedMesh) -> str:
-    """Return the color of most of a mesh's area, "" where no color has most of it."""
+    """Return the color name of most of a mesh's textured area, "" if none covers half of it."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     uv = mesh.uvs[mesh.faces].mean(axis=1)
@@ -158,7 +164,7 @@ def color_name(mesh: TexturedMesh) -> str:
 
 
 def _names_of(lab: np.ndarray) -> np.ndarray:
-    """Return the basic color term (n,) of CIELAB colors (n, 3)."""
+    """Map CIELAB colors (n, 3) to basic color terms (n,)."""
     light, chroma = lab[:, 0], np.hypot(lab[:, 1], lab[:, 2])
     hue = np.degrees(np.arctan2(lab[:, 2], lab[:, 1])) % 360.0
     row = np.searchsorted([end for end, _, _ in _HUES], hue, side="right").clip(max=len(_HUES) - 1)

@@ -1,4 +1,4 @@
-"""A picture of the assembled scene, drawn on the CPU without any graphics driver."""
+"""Render the assembled scene on the CPU, without a graphics driver."""
 
 import cv2
 import numpy as np
@@ -16,10 +16,10 @@ def render_textured(
     world_from_camera: np.ndarray,
     supersample: int = 2,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw textured meshes, each with its `world_from_mesh`, unshaded.
+    """Rasterize textured meshes, each with its `world_from_mesh`, without shading.
 
     Returns:
-        The picture uint8 (h, w, 3), and float32 (h, w) z-depth with 0 where there is nothing.
+        The image uint8 (h, w, 3), and the z-depth float32 (h, w), 0 = background.
     """
     big = camera.resized(camera.width * supersample, camera.height * supersample)
     color = np.broadcast_to(_BACKGROUND, (big.height, big.width, 3)).copy()
@@ -42,7 +42,7 @@ def render_textured(
 
 
 def scene_meshes(assets: AssetSet, assembled: AssembledScene) -> list[tuple[TexturedMesh, np.ndarray]]:
-    """Return every mesh of the assembled scene with its world pose."""
+    """Return all visual meshes of the assembled scene with their `world_from_mesh`, base first."""
     pose = {item.id: item.world_from_object for item in assembled.placed}
     return [(item.visual, np.eye(4)) for item in assets.base] + [
         (o.visual, pose[o.id]) for o in assets.objects
@@ -50,7 +50,7 @@ def scene_meshes(assets: AssetSet, assembled: AssembledScene) -> list[tuple[Text
 
 
 def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFrames) -> np.ndarray:
-    """Draw the scene from the keyframe that sees the most of its objects, beside that frame: uint8 (h, 2w, 3)."""
+    """Render the scene at the keyframe that shows most objects, to the right of that frame: uint8 (h, 2w, 3)."""
     camera = posed.camera.resized(640, round(640 * posed.camera.height / posed.camera.width))
     best = best_view(assembled, posed, camera)
     picture, _ = render_textured(scene_meshes(assets, assembled), camera, posed.world_from_camera[best])
@@ -61,22 +61,15 @@ def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFram
 
 
 def best_view(assembled: AssembledScene, posed: PosedFrames, camera: Camera) -> int:
-    """Return the row of the frame whose image holds the most object centers, the nearest of equals."""
+    """Return the row of the frame with the most object centers in view; ties go to the nearest."""
     centers = np.array([item.world_from_object[:3, 3] for item in assembled.placed]).reshape(-1, 3)
     scores = []
     for pose in posed.world_from_camera:
         local = (centers - pose[:3, 3]) @ pose[:3, :3]
-        z = np.maximum(local[:, 2], 1e-6)
-        u = camera.fx * local[:, 0] / z + camera.cx
-        v = camera.fy * local[:, 1] / z + camera.cy
+        u, v = camera.project(np.column_stack([local[:, :2], np.maximum(local[:, 2], 1e-6)]))
         margin = 0.05 * camera.width
-        inside = (
-            (local[:, 2] > 0.1)
-            & (u > margin)
-            & (u < camera.width - margin)
-            & (v > margin)
-            & (v < camera.height - margin)
-        )
+        inside = (local[:, 2] > 0.1) & (u > margin) & (u < camera.width - margin)
+        inside &= (v > margin) & (v < camera.height - margin)
         distance = float(np.linalg.norm(local, axis=1).mean()) if len(local) else 0.0
         scores.append(inside.sum() - 0.1 * distance)
     return int(np.argmax(scores)) if scores else 0

@@ -1,10 +1,11 @@
-"""The last step: write the scene bundle (`docs/bundle_format.md`) and publish it in the registry."""
+"""Write the scene bundle of a run (`docs/bundle_format.md`) and publish it in the registry."""
 
 import dataclasses
 import json
 import platform
 import subprocess
 import time
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,32 +45,25 @@ if TYPE_CHECKING:
     from reconstruction.runner import Run
 
 SCHEMA = "simrecon.scene/1"
+_WORLD_FIELDS = ("gravity_method", "gravity_sigma_deg", "floor_observed", "yaw_snapped")
 _RECORDED_PACKAGES = (
-    "simrecon",
-    "numpy",
-    "pycolmap",
-    "numba",
-    "sapien",
-    "mani-skill",
-    "coacd",
-    "trimesh",
-    "torch",
-)
+    "simrecon", "numpy", "pycolmap", "numba", "sapien", "mani-skill", "coacd", "trimesh", "torch",
+)  # fmt: skip
 
 
 def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require_stable: bool) -> SceneRecord:
-    """Write the bundle of a finished run in the work folder, then publish it atomically.
+    """Write the bundle of a finished run into the work folder, then publish it atomically.
 
     Raises:
-        SimReconError: `require_stable`, and an object does not stay put or the report card falls short of something.
+        SimReconError: `require_stable` is set and the physics report has failures.
         EnvironmentMissing: the registry cannot be written.
     """
     report = run.results["assembly"].physics_report
     faults = failures(report)
     if require_stable and faults:
         raise SimReconError(
-            f"{scene_id}: not published, because it does not rest: {'; '.join(faults)}. Drop or fix these objects with "
-            f"--overrides, or leave out --require-stable."
+            f"{scene_id}: not published, because it is not stable: {'; '.join(faults)}. Drop or fix these objects with "
+            "--overrides, or leave out --require-stable."
         )
     staging = run.store.scratch("publish")
     try:
@@ -81,16 +75,16 @@ def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require
     except OSError as error:
         raise EnvironmentMissing(
             f"{scene_id}: cannot write its bundle to {registry.root}: {error.strerror or error}. "
-            f"The registry is unchanged and finished stages are kept; free some space and run the same command "
-            f"again."
+            "The registry is unchanged and finished stages are kept; free some space and run the same command again."
         ) from error
     finally:
         run.store.discard(staging)
 
 
 def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
-    """Write all files of the bundle but scene.json, and return what goes into that."""
+    """Write all files of the bundle except scene.json; return the content of scene.json."""
     assets: AssetSet = run.results["assets"]
+    world: WorldFrame = run.results["world"]
     posed, _ = run.in_world()
     assembled = run.results["assembly"]
     placed = {item.id: item for item in assembled.placed}
@@ -99,8 +93,8 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "schema": SCHEMA,
         "id": scene_id,
         "source": {**dataclasses.asdict(posed.source), "file": Path(posed.source.file).name},
-        "scale": _scale(run.results["world"]),
-        "world": _world(run.results["world"]),
+        "scale": dataclasses.asdict(world.scale),
+        "world": {name: getattr(world, name) for name in _WORLD_FIELDS},
         "cameras": _cameras(posed),
         "base": [_base(item, folder) for item in assets.base],
         "objects": [_object(item, placed[item.id], item.id in attached, folder) for item in assets.objects],
@@ -108,13 +102,9 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "gaussians": _gaussians(run, folder),
         "report": _report(run),
     }
+    ids = [o["id"] for o in scene["objects"]]
     scene["instances"], anchors = write_views(
-        run.results["instances"],
-        [o["id"] for o in scene["objects"]],
-        run.results["frames"],
-        posed,
-        run.lens(),
-        folder,
+        run.results["instances"], ids, run.results["frames"], posed, run.lens(), folder
     )
     names = _names(assets, assembled)
     for item in scene["objects"]:
@@ -127,30 +117,13 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
 
 
 def _names(assets: AssetSet, assembled: AssembledScene) -> dict[int, str]:
-    """Return a unique noun phrase for each object, by id."""
+    """Return a unique noun phrase per object id."""
     parents = {edge.child: edge.parent for edge in assembled.graph.edges}
     poses = {item.id: item.world_from_object for item in assembled.placed}
     described = [
         Described.of(o.id, o.label, o.visual, np.asarray(poses[o.id]), parents[o.id]) for o in assets.objects
     ]
     return phrases(described, {item.id: item.label for item in assets.base})
-
-
-def _scale(world: WorldFrame) -> dict:
-    return {
-        "method": world.scale.method,
-        "uncertainty": world.scale.uncertainty,
-        "detail": world.scale.detail,
-    }
-
-
-def _world(world: WorldFrame) -> dict:
-    return {
-        "gravity_method": world.gravity_method,
-        "gravity_sigma_deg": world.gravity_sigma_deg,
-        "floor_observed": world.floor_observed,
-        "yaw_snapped": world.yaw_snapped,
-    }
 
 
 def _cameras(posed: PosedFrames) -> dict:
@@ -172,7 +145,7 @@ def _cameras(posed: PosedFrames) -> dict:
         "model": "PINHOLE",
         "width": camera.width,
         "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "params": camera.intrinsics.tolist(),
         "frames": frames,
     }
 
@@ -216,7 +189,7 @@ def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Pat
         write_obj(part, folder / collision[-1])
         primitive = primitive_of(part.vertices)
         primitives.append(None if primitive is None else primitive.as_json())
-    extents = item.visual.vertices.max(axis=0) - item.visual.vertices.min(axis=0)
+    extents = np.ptp(item.visual.vertices, axis=0)
     physics = item.physics
     return {
         "id": item.id,
@@ -249,7 +222,7 @@ def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Pat
 
 
 def _add_costs(report: dict, run: "Run", publishing: Usage) -> None:
-    """Add what is spent outside the stages, so that the times of an uncached run sum up to its wall time."""
+    """Add the cost outside of the stages, so that the timings of an uncached run sum to its wall time."""
     in_stages = sum(run.usage[name].wall_s for name in run.computed if name in run.usage)
     elapsed = time.perf_counter() - run.started
     report["timings_s"] |= {
@@ -264,21 +237,18 @@ def _add_costs(report: dict, run: "Run", publishing: Usage) -> None:
 
 
 def _report(run: "Run") -> dict:
-    timings = {name: round(usage.wall_s, 3) for name, usage in run.usage.items()}
     posed: PosedFrames = run.results["poses"]
     return {
         "physics": run.results["assembly"].physics_report,
-        "timings_s": timings,
+        "timings_s": {name: round(usage.wall_s, 3) for name, usage in run.usage.items()},
         "peak_memory_mb": round(max(usage.peak_memory_mb for usage in run.usage.values()), 1),
         "volatile": {
             "cpu_s": {name: round(usage.cpu_s, 3) for name, usage in run.usage.items()},
-            "stage_peak_memory_mb": {
-                name: round(usage.peak_memory_mb, 1) for name, usage in run.usage.items()
-            },
+            "stage_peak_memory_mb": {n: round(usage.peak_memory_mb, 1) for n, usage in run.usage.items()},
             "machine": f"{platform.machine()} {platform.system()}",
             "versions": _versions(),
             "commit": _commit(),
-            # Where `simrecon evaluate` and `report` find what the stages made, while the work folder is kept.
+            # With these `simrecon evaluate` and `report` find the stage results in the work folder.
             "work": {"input_digest": run.input_digest, "stage_keys": dict(run.keys)},
         },
         "backends": _backends(run),
@@ -294,7 +264,7 @@ def _report(run: "Run") -> dict:
 
 
 def _backends(run: "Run") -> dict[str, str]:
-    """Say what computed each stage; a stage that the truth stood in for says so."""
+    """Return the backend of each stage; `ground-truth` for stages that were replaced by the truth."""
     backends = {
         "poses": "pycolmap",
         "depth": "plane-sweep",
@@ -310,6 +280,9 @@ def _backends(run: "Run") -> dict[str, str]:
         if "instances" in run.oracle.stages:
             del backends["masks"], backends["labels"]
         backends |= dict.fromkeys(run.oracle.stages, "ground-truth")
+    plugins = [str(plugin) for plugin in run.config.plugins()]
+    if plugins:
+        backends["plugins"] = ", ".join(plugins)
     return backends
 
 
@@ -320,16 +293,14 @@ def _completion(generator: str) -> str:
 def _versions() -> dict[str, str]:
     found = {}
     for name in _RECORDED_PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 
 def _commit() -> str:
-    """Return the commit of a source checkout, or an empty string for an installed wheel."""
-    root = Path(__file__).resolve().parent.parent
+    """Return the git commit of a source checkout, "" for an installed wheel."""
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return ""
     done = subprocess.run(

@@ -1,7 +1,7 @@
-"""Stage 9: assets -> scene graph. Every object gets exactly one parent; floor and walls are the roots.
+"""Stage 9, scene graph: assets in, one parent per object out; floor, walls and ceiling are the roots.
 
-Regions by clustering, relations per region from a backend (geometry by default, or a vision-language model that is
-shown a view of the region), merged into one graph with conflict resolution: the paper's Scene Graph Synthesizer.
+Objects are clustered into regions. A backend infers the relations of each region: from geometry, or by a
+vision-language model that sees a view of it. Conflicts are resolved while merging: the paper's Scene Graph Synthesizer.
 """
 
 from collections.abc import Callable
@@ -38,19 +38,19 @@ def infer_scene_graph(
     records: Path | None = None,
     progress: Progress = NO_PROGRESS,
 ) -> MergedGraph:
-    """Find the parent of every object: what carries it, or what it hangs on.
+    """Infer the parent of every object: its support, or what it is attached to.
 
     Args:
-        assets: what relations are between.
-        config: how.
-        backend: in place of the one that the config names.
-        make_scene: the Gaussians to look at, for backends that look; not called by others.
-        records: where exchanges with a model are kept.
-        progress: told of questions and conflicts.
+        assets: base surfaces and objects.
+        config: settings.
+        backend: overrides the one that the config names.
+        make_scene: makes the Gaussians to render; called only by backends that use views.
+        records: folder of recorded exchanges with a model.
+        progress: receives steps and notes.
 
     Raises:
-        InputError: the assets hold no floor, so the graph has no root.
-        EnvironmentMissing: the backend needs something that is not there.
+        InputError: there is no floor, so the graph has no root.
+        EnvironmentMissing: something that the backend needs is missing.
     """
     base_ids = [b.id for b in sorted(assets.base, key=lambda b: (b.label != "floor", b.id))]
     if not any(b.label == "floor" for b in assets.base):
@@ -72,10 +72,9 @@ def infer_scene_graph(
 
 
 def region_questions(assets: AssetSet, config: SceneGraphConfig) -> list[Question]:
-    """Return one question a region."""
-    regions = find_regions(
-        assets.objects, config.region_radius_m, config.region_min_objects, config.view_margin_m
-    )
+    """Return one question per region."""
+    radius_m, least, margin_m = config.region_radius_m, config.region_min_objects, config.view_margin_m
+    regions = find_regions(assets.objects, radius_m, least, margin_m)
     return [Question.of(members, visible) for members, visible in regions]
 
 

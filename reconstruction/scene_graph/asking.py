@@ -1,4 +1,4 @@
-"""Relations by a vision-language model that is shown a numbered view of each region."""
+"""Relations by a vision-language model that sees a view of each region with numbered objects (Set-of-Mark)."""
 
 from pathlib import Path
 from typing import Literal, Protocol
@@ -8,14 +8,15 @@ from pydantic import BaseModel, ConfigDict
 from reconstruction.core.types import AssetSet
 from reconstruction.learned.conversation import Conversation, VlmError, VlmUnavailable
 from reconstruction.scene_graph.base import LocalGraph, Question, SaidEdge
-from reconstruction.scene_graph.checking import Findings, Triple, examine
+from reconstruction.scene_graph.checking import Findings, Triple, examine, listed
 from reconstruction.scene_graph.looking import RegionPicture
 from reconstruction.scene_graph.relations import GeometryRelations
 
-# How sure an edge of a model is, by what geometry says of it.
+# Confidence of a model's edge: it is the best candidate of geometry, another candidate, or none.
 _AGREED, _POSSIBLE, _UNLIKELY = 0.9, 0.6, 0.4
 
 
+# The docstrings of these two classes are part of the schema that the model is sent and that records are found by.
 class Relation(BaseModel):
     """One edge of an answer."""
 
@@ -36,15 +37,15 @@ class Relations(BaseModel):
 
 
 class Viewer(Protocol):
-    """Shows what a question is about."""
+    """Renders what a question is about."""
 
     def look(self, question: Question) -> RegionPicture | None:
-        """Return a picture; None where nothing of it can be seen."""
+        """Return a picture; None if no object can be seen."""
         ...
 
 
 class PictureRelations:
-    """A `RelationBackend` that asks a model. Where its answer is of no use geometry decides, and the edge says so."""
+    """A `RelationBackend` that asks a model; geometry decides where its answer is unusable, and the edge says so."""
 
     def __init__(
         self,
@@ -57,18 +58,18 @@ class PictureRelations:
         """Wrap a model.
 
         Args:
-            model: is asked.
-            viewer: draws what it is shown.
-            assets: with the labels that it is told.
-            geometry: decides on edges that the model gets wrong three times.
-            reach_m: parents farther away are refused.
+            model: answers questions.
+            viewer: renders the views for it.
+            assets: base surfaces and objects, whose labels are in the prompt.
+            geometry: fallback for edges that stay invalid after all attempts.
+            reach_m: largest distance between an object and its parent.
         """
         self._model, self._viewer, self._geometry, self._reach_m = model, viewer, geometry, reach_m
         self._labels = {item.id: item.label for item in (*assets.base, *assets.objects)}
         self._base = tuple(item.id for item in assets.base)
         self._walls = tuple(item.id for item in assets.base if item.label != "floor")
         self._prompt = (Path(__file__).parent / "prompt.txt").read_text()
-        self._away = ""  # why the model is asked no more
+        self._away = ""  # why the model cannot be used any more
         self.name = model.name
 
     def infer(self, question: Question) -> LocalGraph:
@@ -77,7 +78,7 @@ class PictureRelations:
             return self._by_geometry(question, ())
         view = self._viewer.look(question)
         if view is None:
-            why = f"objects {_listed(question.about)} can be seen from nowhere; geometry decides"
+            why = f"objects {listed(question.about)} can be seen from nowhere; geometry decides"
             return self._by_geometry(question, (why,))
         try:
             answer, problem = self._ask(view), ""
@@ -85,8 +86,8 @@ class PictureRelations:
             self._away = str(error)
             return self._by_geometry(question, (f"{error}; geometry decides from here on",))
         except VlmError as error:
-            if error.answer is None:
-                why = f"{error}; geometry decides on {_listed(view.visible)}"
+            if not isinstance(error.answer, Relations):
+                why = f"{error}; geometry decides on {listed(view.visible)}"
                 return self._by_geometry(question, (why,), view)
             answer, problem = error.answer, str(error)
         return self._graph(answer, problem, question, view)
@@ -111,12 +112,12 @@ class PictureRelations:
         return examine(triples, view.visible, self._base, silent, self._walls, near, self._reach_m)
 
     def _graph(self, answer: Relations, problem: str, question: Question, view: RegionPicture) -> LocalGraph:
-        """Take what can be used; geometry decides on the rest, among what the view shows."""
+        """Take the valid edges of an answer; geometry decides on the other visible objects."""
         triples = _triples(answer)
         bad = self._examine(triples, view, answer.unclear).children
         said = {t[0]: t for t in triples if t[0] in view.visible and t[0] not in bad}
         edges = {child: self._edge(said[child], view.visible) for child in sorted(said)}
-        # What geometry adds must not close a circle with what the model said.
+        # Edges by geometry must not close cycles with edges by the model.
         for edge in self._geometry.infer(Question.of(view.visible)).edges if bad else ():
             if edge.child in bad:
                 edges[edge.child] = _instead(edge, self.name)
@@ -124,12 +125,12 @@ class PictureRelations:
         for child in sorted(bad & set(edges)):
             if _loops(child, parents):
                 del edges[child], parents[child]
-        left = f"geometry decides on {_listed(bad)}" if bad else "the rest of it is used"
+        left = f"geometry decides on {listed(bad)}" if bad else "the rest of it is used"
         notes = (f"{problem}; {left}",) if problem else ()
         return LocalGraph(tuple(edges.values()), view.visible, view.picture, notes)
 
     def _edge(self, triple: Triple, visible: tuple[int, ...]) -> SaidEdge:
-        """Return the edge of an answer; its confidence is what geometry makes of it."""
+        """Make the edge of an answer, with the confidence by its rank among the candidates of geometry."""
         child, relation, parent = triple
         ranked = self._geometry.candidates(child, visible)
         rank = next((k for k, c in enumerate(ranked) if (c.relation, c.parent) == (relation, parent)), None)
@@ -138,16 +139,14 @@ class PictureRelations:
         elif rank == 0:
             confidence, words = _AGREED, f"geometry agrees: {ranked[0].evidence}"
         else:
-            confidence, words = (
-                _POSSIBLE,
-                f"geometry thinks of {ranked[0].parent} first; {ranked[rank].evidence}",
-            )
+            confidence = _POSSIBLE
+            words = f"geometry thinks of {ranked[0].parent} first; {ranked[rank].evidence}"
         return SaidEdge(child, relation, parent, confidence, f"{self.name} says so; {words}", self.name)
 
     def _by_geometry(
         self, question: Question, notes: tuple[str, ...], view: RegionPicture | None = None
     ) -> LocalGraph:
-        """Answer without the model, on what the view shows if there is one."""
+        """Answer by geometry, on the objects that the view shows if there is one."""
         visible = question.visible if view is None else view.visible
         graph = self._geometry.infer(Question.of(visible))
         edges = tuple(_instead(edge, self.name) for edge in graph.edges)
@@ -164,14 +163,9 @@ def _triples(answer: Relations) -> list[Triple]:
 
 
 def _loops(child: int, parents: dict[int, int]) -> bool:
-    node, seen = parents[child], {child}
-    while node in parents:
-        if node in seen:
-            return True
+    """Tell whether the chain of parents of a child ends in a cycle."""
+    node, seen = child, set()
+    while node in parents and node not in seen:
         seen.add(node)
         node = parents[node]
     return node in seen
-
-
-def _listed(ids) -> str:
-    return ", ".join(map(str, sorted(ids)))

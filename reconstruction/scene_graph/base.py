@@ -1,4 +1,4 @@
-"""The seam to whoever says what carries what: a question about a view, a local graph as the answer."""
+"""Interface of relation backends (a question in, a local graph out) and the records of merging."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -13,44 +13,41 @@ RELATIONS = ("supported_by", "attached_to")
 
 @dataclass(frozen=True)
 class SaidEdge(Edge):
-    """An edge, and who said so: "geometry", or the name of a model."""
+    """An edge and its source: "geometry", or the name of a model."""
 
     said_by: str = "geometry"
 
 
 @dataclass(frozen=True)
 class Question:
-    """What a backend is asked: which of the objects in a view rest on or hang from what?"""
+    """A question to a backend: the parents of the objects in a view."""
 
-    about: tuple[int, ...]  # objects that the view is chosen for: a region, or those of a conflict
-    visible: tuple[
-        int, ...
-    ]  # all objects that may be named, those of `about` included; floor and walls always may
-    attempt: int = 0  # how often the same was asked before: backends that look choose another view each time
+    about: tuple[int, ...]  # ids of the objects that the view is chosen for: a region, or a conflict
+    visible: tuple[int, ...]  # ids of all objects to answer for, those of `about` included
+    attempt: int = 0  # number of earlier questions about the same; each gets another view
 
     @classmethod
     def of(cls, about: Iterable[int], visible: Iterable[int] = (), attempt: int = 0) -> "Question":
-        """Make a question with its ids in order."""
+        """Make a question with sorted ids."""
         about = set(about)
         return cls(tuple(sorted(about)), tuple(sorted(about | set(visible))), attempt)
 
 
 @dataclass(frozen=True)
 class LocalGraph:
-    """What a view says: at most one parent for each object that it shows; no cycle."""
+    """The answer for a view: at most one parent for each visible object, no cycles."""
 
     edges: tuple[SaidEdge, ...]
     visible: tuple[int, ...]  # objects that the backend could see
-    picture: np.ndarray | None = None  # uint8 (h, w, 3) what it was shown, if it was shown a picture
-    notes: tuple[str, ...] = ()  # what went wrong, for people
+    picture: np.ndarray | None = None  # uint8 (h, w, 3), if the backend was shown one
+    notes: tuple[str, ...] = ()  # problems, for the user
 
 
 class RelationBackend(Protocol):
-    """Proposes parents for the objects of a view: geometry, a vision-language model, ...
+    """Infers parents of the objects of a view: from geometry, by a vision-language model, ...
 
-    All of an answer's ids are among `Question.visible` and the base, children are objects, no object has two parents
-    or is its own ancestor. An object without an edge is one of which the view says nothing. The same question gets the
-    same answer.
+    Ids of an answer are in `Question.visible` or base, children are objects, no object has two parents or is its own
+    ancestor. No edge means that nothing is known. Answers are deterministic.
     """
 
     name: str
@@ -62,7 +59,7 @@ class RelationBackend(Protocol):
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of one edge that a view said."""
+    """What merging did with an edge of a view, and why."""
 
     child: int
     relation: str
@@ -73,7 +70,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class MergeStep:
-    """One view, what it said, and the graph after it."""
+    """One step of merging: a view, its edges, and the graph after it."""
 
     kind: str  # "region", "adjudication", "rest", "fallback"
     about: tuple[int, ...]
@@ -87,12 +84,12 @@ class MergeStep:
 
 @dataclass(frozen=True)
 class MergedGraph(SceneGraph):
-    """What the stage makes: the scene graph with who said each edge, and how it came about."""
+    """The result of the stage: the scene graph with the source of each edge, and the steps of merging."""
 
     edges: tuple[SaidEdge, ...]
     steps: tuple[MergeStep, ...] = ()
 
     def plain(self) -> SceneGraph:
-        """Return the edges alone."""
+        """Return the graph without sources and steps."""
         names = [field.name for field in fields(Edge)]
         return SceneGraph(tuple(Edge(**{name: getattr(e, name) for name in names}) for e in self.edges))

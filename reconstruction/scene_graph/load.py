@@ -1,4 +1,4 @@
-"""Which backend says what carries what: what the config asks for, loaded."""
+"""Load the relation backend that the config names."""
 
 import os
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from reconstruction.core.plugins import load_plugin
 from reconstruction.core.types import AssetSet
 from reconstruction.learned.conversation import Conversation
 from reconstruction.learned.models import ModelRequest
@@ -30,20 +31,24 @@ def load_relations(
     """Return the backend that `config.backend` asks for.
 
     Args:
-        config: of the stage.
-        assets: what relations are between.
-        make_scene: the Gaussians to look at; only called where a backend looks.
-        records: where exchanges with a model are kept, unless SIMRECON_VLM_RECORDS says otherwise.
+        config: settings of the stage.
+        assets: base surfaces and objects.
+        make_scene: makes the Gaussians to render; called only by backends that use views.
+        records: folder of recorded exchanges with a model; SIMRECON_VLM_RECORDS overrides it.
 
     Raises:
-        EnvironmentMissing: no endpoint or no model is named, transformers or weights are missing.
-        UsageError: a backend that looks, but nothing to look at.
+        EnvironmentMissing: no endpoint or no model is named, or transformers or weights are missing.
+        UsageError: the backend needs views, but `make_scene` is None.
     """
     geometry = GeometryRelations(assets, config.relations)
     if config.backend == "geometry":
         return geometry
     if make_scene is None:
         raise UsageError(f"scene_graph.backend={config.backend} looks at views; that needs the Gaussians")
+    if config.backend not in ("vlm", "qwen2.5-vl"):
+        return load_plugin("scene_graph.backend", config.backend, SceneGraphConfig)(
+            config, assets, make_scene
+        )
     from reconstruction.scene_graph.asking import PictureRelations
     from reconstruction.scene_graph.looking import RegionViewer
 
@@ -52,11 +57,7 @@ def load_relations(
 
 
 def load_model(config: SceneGraphConfig, records: Path | None = None) -> Conversation:
-    """Return the model that is asked.
-
-    Raises:
-        EnvironmentMissing: no endpoint or no model is named, transformers or weights are missing.
-    """
+    """Return the model that `config.backend` and `config.model` name; raises as `load_relations`."""
     named = os.environ.get("SIMRECON_VLM_RECORDS", "")
     records = Path(named) if named else records
     if config.backend == "vlm":
@@ -66,18 +67,12 @@ def load_model(config: SceneGraphConfig, records: Path | None = None) -> Convers
         return VlmClient(replace(endpoint, records=records))
     from reconstruction.learned.qwen import QwenModel
 
-    request = ModelRequest(
-        config.model or DEFAULT_QWEN, "scene_graph.backend", "scene_graph.model", config.device
-    )
-    return QwenModel(request, records)
+    model = config.model or DEFAULT_QWEN
+    return QwenModel(ModelRequest(model, "scene_graph.backend", "scene_graph.model", config.device), records)
 
 
 def check_backend(config: SceneGraphConfig) -> None:
-    """Say before the run what the backend lacks; whether weights are there shows when they are loaded.
-
-    Raises:
-        EnvironmentMissing: no endpoint or no model is named, transformers is missing or too old.
-    """
+    """Raise `EnvironmentMissing` before a run if the backend lacks an endpoint, a model name or transformers."""
     if config.backend == "qwen2.5-vl":
         from reconstruction.learned.models import transformers_class
 
@@ -87,18 +82,18 @@ def check_backend(config: SceneGraphConfig) -> None:
 
 
 def backend_name(config: SceneGraphConfig) -> str:
-    """Say who decides, for the bundle."""
-    if config.backend == "geometry":
-        return "geometry"
+    """Return the backend and its model, for the bundle."""
+    if config.backend not in ("vlm", "qwen2.5-vl"):
+        return config.backend
     default = os.environ.get("SIMRECON_VLM_MODEL", "") if config.backend == "vlm" else DEFAULT_QWEN
     return f"{config.backend} ({config.model or default})"
 
 
 def wants_views(config: SceneGraphConfig) -> bool:
-    """Tell whether the backend looks at views of the scene."""
+    """Tell whether the backend uses views of the scene."""
     return config.backend != "geometry"
 
 
 def outside_inputs(config: SceneGraphConfig) -> tuple[str, ...]:
-    """Return what stands behind the names in the config: another model must not reuse a result."""
-    return () if config.backend == "geometry" else (f"relations {backend_name(config)}",)
+    """Return the model behind the config, which is part of the cache key."""
+    return () if config.backend not in ("vlm", "qwen2.5-vl") else (f"relations {backend_name(config)}",)

@@ -1,16 +1,18 @@
-"""Merge the views' graphs into one (the paper, section 3.3): add, drop the implied, settle conflicts by another view.
+"""Merge local graphs into a global one (the paper, section 3.3): add edges, drop implied ones, resolve conflicts.
 
-Each view's edges are walked breadth first from floor and walls. A new object is added; where both ends are known, a
-path that says the same makes the edge redundant; no path, other relations on it, or the reverse order are a conflict:
-the objects on the path are looked at again, and what that view says replaces what the graph said. Where the views then
-name different parents, the one that most of them name counts (of equals, the one named last), and they are looked at
-again until one is named twice. A view that does not show a candidate says nothing against it.
+The edges of a view are processed breadth first from the base. An edge of a new object is added. An edge between known
+objects is redundant if the graph has a path with the same relation between them. No path, another relation on it, or
+the reverse order are a conflict. The objects on the path of a conflict are viewed again, and each gets the parent that
+most views name (of equals, the one named last), until one parent has two votes. Only views that show all named
+candidates count.
 """
 
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
+from reconstruction.core.types import Edge
 from reconstruction.scene_graph.base import (
     Decision,
     LocalGraph,
@@ -20,30 +22,32 @@ from reconstruction.scene_graph.base import (
     SaidEdge,
 )
 
+AnyEdge = TypeVar("AnyEdge", bound=Edge)
+
 
 @dataclass(frozen=True)
 class _Claim:
     edge: SaidEdge
-    visible: frozenset[int]  # in the view that says so
+    visible: frozenset[int]  # objects in the view that the edge is from
 
 
 class GraphMerge:
-    """The global graph while it grows: at most one parent per object, rooted in the base, never a cycle."""
+    """The global graph during merging: at most one parent per object, rooted in the base, without cycles."""
 
     def __init__(
         self, base_ids: Sequence[int], backend: RelationBackend | None, adjudications: int = 3
     ) -> None:
-        """Start from the base, floor first; without a backend what came first stays (the `naive` baseline)."""
+        """Start from the base, floor first; without a backend conflicts keep the first edge (the `naive` baseline)."""
         self.base_ids, self.floor = frozenset(base_ids), base_ids[0]
         self.backend, self.adjudications = backend, adjudications
         self.parent_edge: dict[int, SaidEdge] = {}
         self.steps: list[MergeStep] = []
-        self.loose: dict[int, SaidEdge] = {}  # edges to parents that nothing is known of yet
+        self.loose: dict[int, SaidEdge] = {}  # edges to parents that are not in the graph yet
         self._claims: dict[int, list[_Claim]] = {}
         self._looked_at: Counter[tuple[int, ...]] = Counter()
 
     def add_view(self, about: Iterable[int], graph: LocalGraph, kind: str = "region") -> None:
-        """Merge one view's edges, then settle the conflicts that it brought."""
+        """Merge the edges of a view, then resolve its conflicts."""
         self._looked_at[tuple(sorted(about))] += 1
         self._note_claims(graph)
         conflicts: list[SaidEdge] = []
@@ -59,11 +63,11 @@ class GraphMerge:
         self._record(kind, about, graph, decisions)
         if self.backend is not None:
             for edge in conflicts:
-                if self._against(edge):  # settling another one may have settled it
+                if self._against(edge):  # may be resolved with another one
                     self._settle(edge)
 
     def another_look(self, about: Iterable[int], visible: Iterable[int] = ()) -> Question:
-        """Return a question about objects that was not asked before."""
+        """Return the next question about objects, which gets another view than earlier ones."""
         return Question.of(about, visible, self._looked_at[tuple(sorted(about))])
 
     def ancestors(self, node: int) -> list[int]:
@@ -79,7 +83,7 @@ class GraphMerge:
         return tuple(breadth_first(list(self.parent_edge.values()), self.base_ids))
 
     def put(self, edges: Iterable[SaidEdge], why: str) -> None:
-        """Add edges of objects that no view spoke of, as a step of its own."""
+        """Add edges of objects that no view connects to the base, as a step of its own."""
         said = tuple(edges)
         if not said:
             return
@@ -93,7 +97,7 @@ class GraphMerge:
         self._record("fallback", about, LocalGraph(said, about), decisions)
 
     def _add(self, edge: SaidEdge) -> tuple[str, str]:
-        """Add an edge where nothing speaks against it; return what became of it and why."""
+        """Add an edge if it is new and consistent; return the verdict and the reason."""
         if edge.child not in self.parent_edge:
             if not self._rooted(edge.parent):
                 self.loose.setdefault(edge.child, edge)
@@ -110,7 +114,7 @@ class GraphMerge:
         return "redundant", "a chain of the graph says so"
 
     def _against(self, edge: SaidEdge) -> str:
-        """Return what in the graph contradicts an edge of a known object; "" where a path says the same."""
+        """Return how the graph contradicts an edge of a known object; "" if a path has the same relation."""
         chain: list[str] = []
         node = edge.child
         while node in self.parent_edge:
@@ -124,27 +128,23 @@ class GraphMerge:
         return f"no path leads from {edge.child} to {edge.parent}"
 
     def _settle(self, edge: SaidEdge) -> None:
-        """Look again at all objects on the path of a conflict, until one parent of each was named twice."""
+        """View the objects on the path of a conflict again, until each has a parent with two votes."""
+        assert self.backend is not None
         nodes = self._path(edge)
         for _ in range(self.adjudications):
             answer = self.backend.infer(self.another_look(nodes))
             self._looked_at[tuple(sorted(nodes))] += 1
             self._note_claims(answer)
-            winners = {}
-            open_ended = False
-            for child in sorted(nodes):
-                edge_of_child, votes, rivals = self._vote(child)
-                if edge_of_child is not None:
-                    winners[child] = edge_of_child
-                open_ended |= votes < 2 and rivals > 1
+            found = {child: self._vote(child) for child in sorted(nodes)}
+            winners = {child: edge for child, (edge, _, _) in found.items() if edge is not None}
             self._record("adjudication", nodes, answer, self._replace(winners))
-            if not open_ended:
+            if not any(votes < 2 and rivals > 1 for _, votes, rivals in found.values()):
                 return
 
     def _vote(self, child: int) -> tuple[SaidEdge | None, int, int]:
-        """Return the parent that most views name, how many do, and how many parents are named at all.
+        """Return the edge with most votes, its votes, and the number of candidates.
 
-        Only views count that show all the parents that were named.
+        Only views that show all named parents vote, if there are any.
         """
         claims = self._claims.get(child, [])
         named = {c.edge.parent for c in claims} - self.base_ids
@@ -157,7 +157,7 @@ class GraphMerge:
         return last[best][1], votes[best], len(votes)
 
     def _replace(self, winners: dict[int, SaidEdge]) -> list[Decision]:
-        """Put edges in place of others, in an order in which none closes a cycle; what would stays as it was."""
+        """Replace edges, in an order in which none closes a cycle; refuse those that would."""
         decisions, waiting = [], dict(winners)
         progress = True
         while progress:
@@ -176,16 +176,12 @@ class GraphMerge:
                 del waiting[child]
                 progress = True
         for child, edge in sorted(waiting.items()):
-            decisions.append(
-                Decision(child, edge.relation, edge.parent, "refused", "it would close a circle")
-            )
+            why = "it would close a circle"
+            decisions.append(Decision(child, edge.relation, edge.parent, "refused", why))
         return decisions
 
     def _path(self, edge: SaidEdge) -> set[int]:
-        """Return the objects between child and parent in the graph, and what each of them rests on.
-
-        Without their carriers in view, the answer could only be worse than what is known.
-        """
+        """Return the objects on the path between child and parent in the graph, and their parents."""
         up = [edge.child, *self.ancestors(edge.child)]
         down = [edge.parent, *self.ancestors(edge.parent)]
         common = next((node for node in up if node in down), None)
@@ -200,7 +196,7 @@ class GraphMerge:
         return node in self.base_ids or node in self.parent_edge
 
     def _tie_loose(self) -> None:
-        """Add edges that waited for their parent to become known."""
+        """Add loose edges whose parents are in the graph now."""
         progress = True
         while progress:
             progress = False
@@ -219,26 +215,17 @@ class GraphMerge:
     def _record(
         self, kind: str, about: Iterable[int], graph: LocalGraph, decisions: Sequence[Decision]
     ) -> None:
-        self.steps.append(
-            MergeStep(
-                kind,
-                tuple(sorted(about)),
-                graph.visible,
-                tuple(sorted(graph.edges, key=_order)),
-                tuple(decisions),
-                self.edges(),
-                graph.picture,
-                graph.notes,
-            )
-        )
+        ids, said = tuple(sorted(about)), tuple(sorted(graph.edges, key=_order))
+        merged, made = self.edges(), tuple(decisions)
+        self.steps.append(MergeStep(kind, ids, graph.visible, said, made, merged, graph.picture, graph.notes))
 
 
-def breadth_first(edges: Sequence[SaidEdge], roots: Iterable[int]) -> list[SaidEdge]:
-    """Order edges breadth first from the roots, by id within a level; what is not reached is left out."""
-    children: dict[int, list[SaidEdge]] = {}
+def breadth_first(edges: Sequence[AnyEdge], roots: Iterable[int]) -> list[AnyEdge]:
+    """Order edges breadth first from the roots, by child id within a level; unreachable edges are left out."""
+    children: dict[int, list[AnyEdge]] = {}
     for edge in edges:
         children.setdefault(edge.parent, []).append(edge)
-    out: list[SaidEdge] = []
+    out: list[AnyEdge] = []
     queue = deque(sorted(roots))
     seen = set(queue)
     while queue:

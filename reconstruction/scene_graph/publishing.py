@@ -1,4 +1,4 @@
-"""The graph as it is written into the bundle: edges and who said them, the steps of the merge, pictures shown."""
+"""Write the graph into a bundle: edges with their sources, steps of merging, pictures that models were shown."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -13,12 +13,12 @@ FOLDER = "graph"
 
 
 def graph_of_bundle(final: Sequence[Edge], graph: MergedGraph, folder: Path) -> dict:
-    """Write the pictures that models were shown into a bundle's folder; return its `graph`.
+    """Write pictures into a bundle's folder; return the `graph` of its JSON.
 
     Args:
-        final: edges after assembly, which may have found other parents.
-        graph: as merged, and perhaps corrected by the user.
-        folder: of the bundle.
+        final: edges after assembly, which may change parents.
+        graph: merged, and perhaps corrected by the user.
+        folder: the bundle.
     """
     before = {edge.child: edge for edge in graph.edges}
     edges = [asdict(edge) | {"said_by": _said_by(edge, before.get(edge.child))} for edge in final]

@@ -1,18 +1,18 @@
-"""Cut the room into regions: DBSCAN on object centers, strays join the nearest (the paper, section 3.3)."""
+"""Cluster objects into regions by DBSCAN on their centers; noise joins the nearest region (the paper, section 3.3)."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.types import ObjectAsset
+from registry.geometry import transform_points
 
 
 def dbscan(points: np.ndarray, radius: float, min_points: int) -> np.ndarray:
-    """Cluster points (n, d); return labels (n,) from 0 on, -1 for noise.
+    """Cluster points (n, d) by DBSCAN; return labels int (n,) from 0, -1 for noise.
 
-    Border points go to the cluster of their nearest core point, so that labels do not depend on the order of
-    points except for their numbering.
+    Border points join the cluster of their nearest core point, so that the order of points affects only the numbering.
     """
     n = len(points)
     labels = np.full(n, -1)
@@ -42,10 +42,10 @@ def dbscan(points: np.ndarray, radius: float, min_points: int) -> np.ndarray:
 def find_regions(
     objects: Sequence[ObjectAsset], radius_m: float, min_points: int, view_margin_m: float
 ) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Return (members, visible) ids per region: visible is what a view of the members shows.
+    """Return the ids (members, visible) of each region; `visible` are all objects near the members' box.
 
-    Regions partition the objects; views overlap, which is what lets the merge find and settle disagreements.
-    The result does not depend on the order of `objects`.
+    Members partition the objects; visible ones overlap, so that merging can detect and resolve conflicts. The result
+    does not depend on the order of `objects`.
     """
     objects = sorted(objects, key=lambda o: o.id)
     if not objects:
@@ -64,17 +64,12 @@ def find_regions(
         low = boxes[inside, 0].min(axis=0) - view_margin_m
         high = boxes[inside, 1].max(axis=0) + view_margin_m
         seen = inside | np.all((boxes[:, 1] > low) & (boxes[:, 0] < high), axis=1)
-        regions.append(
-            (
-                tuple(o.id for o, keep in zip(objects, inside) if keep),
-                tuple(o.id for o, keep in zip(objects, seen) if keep),
-            )
-        )
+        members, visible = (tuple(objects[i].id for i in np.flatnonzero(mask)) for mask in (inside, seen))
+        regions.append((members, visible))
     return regions
 
 
 def world_box(asset: ObjectAsset) -> np.ndarray:
-    """Return the axis-aligned world box (2, 3) of an object's visual mesh."""
-    m = asset.world_from_object
-    points = np.asarray(asset.visual.vertices, np.float64) @ m[:3, :3].T + m[:3, 3]
+    """Return the axis-aligned world box (2, 3), low and high, of an object's visual mesh."""
+    points = transform_points(asset.world_from_object, np.asarray(asset.visual.vertices, np.float64))
     return np.stack([points.min(axis=0), points.max(axis=0)])

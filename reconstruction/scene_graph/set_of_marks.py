@@ -1,4 +1,4 @@
-"""Pictures that can be talked about: every thing outlined in its own color, its number legible and on nothing else."""
+"""Draw Set-of-Mark pictures: each object outlined in its own color, with a label that hides no other object."""
 
 from collections.abc import Mapping
 
@@ -10,18 +10,16 @@ from reconstruction.core.types import AssetSet, Camera
 from registry.geometry import transform_points
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_RINGS = (0.0, 1.0, 1.5, 2.2, 3.0, 4.0, 5.5, 7.5)  # heights of a label away from its thing
-_DIRECTIONS = 16
-_SPECK = 5e-5  # of the picture: smaller parts and holes of a thing get no outline
+_RINGS = (0.0, 1.0, 1.5, 2.2, 3.0, 4.0, 5.5, 7.5)  # distances of a label from its object, in label heights
+_DIRECTIONS = 16  # label positions on each ring
+_SPECK = 5e-5  # share of the picture; smaller parts and holes of an object get no outline
 
 
 def id_map(assets: AssetSet, camera: Camera, world_from_camera: np.ndarray) -> np.ndarray:
-    """Return int32 (h, w): which asset is seen where, floor and walls included; 0 = none."""
+    """Render the ids of the visible assets, base included: int32 (h, w), 0 = none."""
     meshes = [(b.id, np.asarray(b.visual.vertices), b.visual.faces) for b in assets.base]
-    meshes += [
-        (o.id, transform_points(o.world_from_object, o.visual.vertices), o.visual.faces)
-        for o in assets.objects
-    ]
+    for o in assets.objects:
+        meshes += [(o.id, transform_points(o.world_from_object, o.visual.vertices), o.visual.faces)]
     starts = np.cumsum([0] + [len(vertices) for _, vertices, _ in meshes])
     vertices = np.concatenate([vertices for _, vertices, _ in meshes])
     faces = np.concatenate([np.asarray(f) + start for (_, _, f), start in zip(meshes, starts)])
@@ -33,16 +31,16 @@ def id_map(assets: AssetSet, camera: Camera, world_from_camera: np.ndarray) -> n
 def number_things(
     picture: np.ndarray, ids: np.ndarray, things: Mapping[int, str], base: Mapping[int, str]
 ) -> np.ndarray:
-    """Draw outlines and labels.
+    """Draw outlines and labels into a copy of a picture uint8 (h, w, 3) RGB.
+
+    Labels stand on their object if it is large enough, else beside it with a leader line. They do not overlap as long
+    as there is room.
 
     Args:
-        picture: uint8 (h, w, 3) RGB.
-        ids: int (h, w) what is seen where.
-        things: label by id; outlined. A label stands on its thing if that is large enough, else beside it with a line.
-        base: label by id of floor and walls; not outlined.
-
-    Returns:
-        uint8 (h, w, 3); no two labels overlap as long as there is room.
+        picture: the view.
+        ids: its id map, int (h, w).
+        things: label by id of the objects, which are outlined.
+        base: label by id of base surfaces, which are not outlined.
     """
     out = np.ascontiguousarray(picture).copy()
     scale = max(min(picture.shape[:2]) / 768, 0.5)
@@ -54,12 +52,9 @@ def number_things(
         cv2.drawContours(out, contours, -1, color_of(number), max(round(2 * scale), 1), cv2.LINE_AA)
     taken = np.zeros(ids.shape, bool)
     area = {number: int((ids == number).sum()) for number in [*things, *base]}
-    pills = []
-    # The small ones first: a large thing has more places for its number.
-    for number in sorted(things, key=lambda n: (area[n], n)):
-        pills.append(_place(number, things[number], ids, taken, area, scale))
-    for number in sorted(base, key=lambda n: (area[n], n)):
-        pills.append(_place(number, base[number], ids, taken, area, scale))
+    # Small objects first: large ones have more places for their labels.
+    order = [n for labels in (things, base) for n in sorted(labels, key=lambda n: (area[n], n))]
+    pills = [_place(n, (things if n in things else base)[n], ids, taken, area, scale) for n in order]
     for number, anchor, box, _ in pills:
         end = (int(np.clip(anchor[0], box[0], box[2])), int(np.clip(anchor[1], box[1], box[3])))
         if end != anchor:
@@ -73,9 +68,10 @@ def number_things(
 
 
 def color_of(number: int) -> tuple[int, int, int]:
-    """Return a strong color (r, g, b) for an id; neighbors in number are far apart in hue."""
-    hue = np.uint8([[[int(179 * ((0.07 + number * 0.381966) % 1.0)), 190, 250]]])
-    return tuple(int(c) for c in cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0])
+    """Return a saturated color (r, g, b) for an id; consecutive ids are far apart in hue."""
+    hsv = np.array([[[int(179 * ((0.07 + number * 0.381966) % 1.0)), 190, 250]]], np.uint8)
+    r, g, b = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0].tolist()
+    return r, g, b
 
 
 def _text_size(text: str, scale: float) -> tuple[int, int]:
@@ -86,10 +82,10 @@ def _text_size(text: str, scale: float) -> tuple[int, int]:
 def _place(
     number: int, text: str, ids: np.ndarray, taken: np.ndarray, area: Mapping[int, int], scale: float
 ) -> tuple[int, tuple[int, int], tuple[int, int, int, int], str]:
-    """Choose a label's box: near its thing, on no other label, on as little as possible of other things.
+    """Place a label: near its object, on no other label, hiding as little as possible of other objects.
 
     Returns:
-        The id, the pixel (x, y) that the label belongs to, the box (left, top, right, bottom), the text.
+        The id, the anchor pixel (x, y) in the object, the box (left, top, right, bottom), the text.
     """
     mask = ids == number
     inner = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
@@ -106,11 +102,8 @@ def _place(
                 continue
             window = np.s_[top : top + tall, left : left + wide]
             under = ids[window]
-            hidden = sum(
-                np.count_nonzero(under == other) / area[other]
-                for other in np.unique(under)
-                if area.get(int(other))
-            )
+            others = [other for other in np.unique(under) if area.get(int(other))]
+            hidden = sum(np.count_nonzero(under == other) / area[other] for other in others)
             cost = ring + 12 * float(hidden) + 100 * float(taken[window].mean() > 0)
             if cost < best_cost:
                 best, best_cost = (left, top, left + wide, top + tall), cost

@@ -1,4 +1,4 @@
-"""Sampled surfaces of the assets in world space: what relations are measured on."""
+"""Sample the surfaces of assets in world space, to measure relations on."""
 
 from dataclasses import dataclass
 
@@ -6,51 +6,51 @@ import numpy as np
 
 from reconstruction.core.types import AssetSet, BaseAsset, ObjectAsset
 
-_SPACING_M = 0.005
-_MIN_SAMPLES, _MAX_SAMPLES = 2_000, 25_000
-_UP_FACING = 0.5  # cosine: a surface within 60 degrees of level can carry something
-_BOTTOM_PERCENTILE = 0.5
+_SPACING_M = 0.005  # target distance of samples
+_MIN_SAMPLES, _MAX_SAMPLES = 2_000, 25_000  # per object
+_UP_FACING = 0.5  # least z of the normal of a surface that can support something (60 degrees)
+_BOTTOM_PERCENTILE = 0.5  # of the coordinates, that bounds the box
 
 
 @dataclass(frozen=True)
 class SampledObject:
-    """An object as points, and its underside as a grid of heights."""
+    """Surface samples of an object, and its underside as a height map."""
 
     id: int
     name: str
-    points: np.ndarray  # (n, 3) world, even over the surface
-    up: np.ndarray  # (m, 3) world, those that face up
+    points: np.ndarray  # (n, 3) world, uniform over the surface
+    up: np.ndarray  # (m, 3) world, the upward-facing ones
     spacing_m: float  # between neighboring points
-    low: np.ndarray  # (3,) world box, robust against single stray points
+    low: np.ndarray  # (3,) world box, by percentiles
     high: np.ndarray  # (3,)
-    center: np.ndarray  # (3,) mean of the surface
+    center: np.ndarray  # (3,) mean of the points
     footprint_m2: float
-    underside: np.ndarray  # (k, 3) cell centers (x, y) of the lowest part of the object and its height there
+    underside: np.ndarray  # (k, 3) cell centers (x, y) of the lowest part of the object, and their heights
     support_hint: int
     attached_hint: bool
 
 
 @dataclass(frozen=True)
 class SampledBase:
-    """A floor, wall or ceiling as its plane and the box of what was seen of it."""
+    """A floor, wall or ceiling as its plane and the box of its mesh."""
 
     id: int
     label: str
-    normal: np.ndarray  # (3,) into the room
+    normal: np.ndarray  # (3,) unit, into the room
     offset: float
     low: np.ndarray  # (3,) world box
     high: np.ndarray
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return signed distances (n,) of points, positive in the room."""
+        """Return the signed distances (n,) of points (n, 3) to the plane, positive in the room."""
         return points @ self.normal + self.offset
 
 
 def sample_surface(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Spread points evenly over a mesh: (points (n, 3), unit normals (n, 3), spacing). No randomness."""
+    """Sample a mesh uniformly and deterministically: points (n, 3), unit normals (n, 3), spacing."""
     corners = vertices[faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # Outward for a closed mesh: flip everything when the enclosed volume comes out negative.
+    # Outward for a closed mesh: flip all normals if the enclosed volume is negative.
     if np.einsum("ij,ij->", corners[:, 0] - corners[:, 0].mean(0), cross) < 0:
         cross = -cross
     double_area = np.linalg.norm(cross, axis=1)
@@ -61,7 +61,7 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     cumulative = np.cumsum(double_area)
     position = (np.arange(count) + 0.5) / count * cumulative[-1]
     face = np.minimum(np.searchsorted(cumulative, position), len(faces) - 1)
-    # The R2 sequence (Roberts 2018) fills the unit square evenly; folding it fills the triangle.
+    # The R2 sequence (Roberts 2018) covers the unit square uniformly; folding maps it to the triangle.
     u = (np.arange(count) * 0.7548776662466927) % 1.0
     v = (np.arange(count) * 0.5698402909980532) % 1.0
     fold = u + v > 1
@@ -72,11 +72,10 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 
 
 def sample_object(asset: ObjectAsset, world_from_object: np.ndarray | None = None) -> SampledObject:
-    """Sample an object at its reconstructed pose, or at another one."""
+    """Sample an object at its reconstructed pose, or at `world_from_object`."""
     m = asset.world_from_object if world_from_object is None else world_from_object
-    points, normals, spacing = sample_surface(
-        np.asarray(asset.visual.vertices), np.asarray(asset.visual.faces)
-    )
+    mesh = asset.visual
+    points, normals, spacing = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     points, normals = points @ m[:3, :3].T + m[:3, 3], normals @ m[:3, :3].T
     if len(points) == 0:
         raise ValueError(f"scene graph: object {asset.id} ({asset.label}) has a mesh without area")
@@ -89,7 +88,7 @@ def sample_object(asset: ObjectAsset, world_from_object: np.ndarray | None = Non
     np.minimum.at(heights, where, points[:, 2])
     cells = np.zeros((len(heights), 2))
     cells[where] = (index + 0.5) * cell + low[:2]
-    # Only the lowest part can stand on something: legs, feet, a rim. Noise and tilt widen the band.
+    # Only the lowest band can be supported: legs, feet, a rim. Noise and tilt widen it.
     band = low[2] + np.clip(0.15 * (high[2] - low[2]), 0.010, 0.025)
     lowest = heights <= band
     return SampledObject(
@@ -109,20 +108,14 @@ def sample_object(asset: ObjectAsset, world_from_object: np.ndarray | None = Non
 
 
 def sample_base(asset: BaseAsset) -> SampledBase:
-    """Describe a floor, wall or ceiling."""
+    """Return the plane and box of a floor, wall or ceiling."""
     normal = np.asarray(asset.plane[:3], np.float64)
     length = np.linalg.norm(normal)
     vertices = np.asarray(asset.visual.vertices, np.float64)
-    return SampledBase(
-        asset.id,
-        asset.label,
-        normal / length,
-        float(asset.plane[3]) / length,
-        vertices.min(0),
-        vertices.max(0),
-    )
+    low, high, offset = vertices.min(0), vertices.max(0), float(asset.plane[3]) / length
+    return SampledBase(asset.id, asset.label, normal / length, offset, low, high)
 
 
 def sample_assets(assets: AssetSet) -> tuple[dict[int, SampledBase], dict[int, SampledObject]]:
-    """Sample everything once; keys are ids."""
+    """Sample all assets, by id."""
     return {b.id: sample_base(b) for b in assets.base}, {o.id: sample_object(o) for o in assets.objects}

@@ -1,4 +1,4 @@
-"""Views in, one graph out: the paper's online merging, and what it is compared with."""
+"""Synthesize the scene graph from the views of all regions: the paper's online merging, and its baselines."""
 
 from collections.abc import Callable, Sequence
 
@@ -25,20 +25,20 @@ def synthesize(
     last_resort: Callable[[], RelationBackend] | None = None,
     progress: Progress = NO_PROGRESS,
 ) -> MergedGraph:
-    """Ask about every region, and merge the answers; the result does not depend on the order of the regions.
+    """Ask about every region and merge the answers; the result does not depend on the order of `questions`.
 
     Args:
-        questions: one a region; they should name every object between them.
-        base_ids: ids of floor, walls and ceiling, the floor that nothing-is-known-of stands on first.
+        questions: one per region; together they should cover all objects.
+        base_ids: ids of floor, walls and ceiling, the floor first.
         object_ids: ids of all objects.
-        backend: is asked.
-        merging: "online"; "naive": what came first stays, nothing is asked again; "global": one question.
-        adjudications: how often the objects of a conflict are looked at, at most.
-        last_resort: makes what decides on objects that the backend says nothing of; without it the floor carries them.
-        progress: told of questions, conflicts, and of what was not answered.
+        backend: answers questions.
+        merging: "online"; "naive": conflicts keep the first edge; "global": one question about all objects.
+        adjudications: largest number of further views of the objects of a conflict.
+        last_resort: makes the backend for objects without an edge; None: the floor supports them.
+        progress: receives steps, conflicts and problems.
 
     Returns:
-        A forest rooted in the base, every object with one parent, and the steps that led to it.
+        A forest rooted in the base, in which every object has one parent, and the steps of merging.
     """
     everything = Question.of(object_ids)
     if merging == "global":
@@ -73,7 +73,7 @@ def _ask_for_the_rest(
     backend: RelationBackend,
     attempts: int,
 ) -> None:
-    """Look again, region by region, for the objects that no view connects to the base."""
+    """Ask again, region by region, about objects that are not connected to the base."""
     for _ in range(attempts):
         for question in sorted(questions, key=lambda q: (q.about, q.visible)):
             missing = {i for i in question.about if i not in merge.parent_edge}
@@ -92,7 +92,7 @@ def _decide_the_rest(
     everything: Question,
     last_resort: Callable[[], RelationBackend] | None,
 ) -> None:
-    """Give parents to objects that no view connects to the base; those that wait for one of them keep their edge."""
+    """Give parents to objects that are not connected to the base; loose edges to one of them are kept."""
     if last_resort is None:
         floor = merge.floor
         known = [SaidEdge(i, "supported_by", floor, 0.05, "no relation was found", "nobody") for i in missing]
@@ -103,7 +103,7 @@ def _decide_the_rest(
 
 
 def _tell(steps: Sequence[MergeStep], missing: Sequence[int], progress: Progress) -> None:
-    """Say what was not plain: conflicts, problems of the backend, objects that nothing was said of."""
+    """Note conflicts, problems of the backend, and objects without an edge."""
     for step in steps:
         for line in step.notes:
             progress.note(line)

@@ -1,4 +1,4 @@
-"""Stage 5: depth maps -> one fused surface, its planes, and what is known of free space."""
+"""Stage 5: fuse depth maps into one surface mesh, its planes and an occupancy grid."""
 
 from reconstruction.surface.config import SURFACE_PRESETS, SurfaceConfig
 from reconstruction.surface.fuse import fuse_surface

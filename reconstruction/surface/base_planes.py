@@ -1,4 +1,4 @@
-"""Floor, walls and ceiling: the planes that bound the room, and which vertices lie on them."""
+"""Fit the base planes of the room (floor, walls, ceiling) to the surface mesh and assign vertices to them."""
 
 from dataclasses import dataclass
 
@@ -13,25 +13,26 @@ _MAX_WALLS = 8
 
 @dataclass(frozen=True)
 class FittedPlane:
-    """A plane of the room and the vertices on it."""
+    """A base plane and its vertices."""
 
-    label: str
-    plane: np.ndarray  # float64 (4,) n . x + d = 0, n into the room
-    band_m: float  # vertices within this distance are on it
+    label: str  # "floor" | "wall" | "ceiling"
+    plane: np.ndarray  # float64 (4,) n . x + d = 0 in metres, n unit and into the room
+    band_m: float  # largest distance of vertices that belong to the plane
     members: np.ndarray  # bool (v,)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return signed distances (n,), positive in the room."""
+        """Return signed distances (n,) of points (n, 3), metres, positive in the room."""
         return points @ self.plane[:3] + self.plane[3]
 
 
 def _band(residuals: np.ndarray, low: float, high: float) -> float:
+    """Return three robust standard deviations (by the median absolute deviation) of residuals, within [low, high]."""
     sigma = 1.4826 * float(np.median(np.abs(residuals - np.median(residuals)))) if len(residuals) else low
     return float(np.clip(3.0 * sigma, low, high))
 
 
 def fit_floor(graph: MeshGraph, config: SurfaceConfig) -> FittedPlane | None:
-    """Fit the floor near z = 0; None where too little of it was seen."""
+    """Fit the floor near z = 0 by a height histogram and trimmed least squares; None if too little was seen."""
     z = graph.points[:, 2]
     flat = (graph.normals[:, 2] > 0.8) & (np.abs(z) < 0.06)
     if graph.areas[flat].sum() < config.min_floor_area_m2:
@@ -40,14 +41,13 @@ def fit_floor(graph: MeshGraph, config: SurfaceConfig) -> FittedPlane | None:
     peak = int(np.argmax(np.convolve(histogram, [1, 2, 1], "same")))
     height = 0.5 * (bounds[peak] + bounds[peak + 1])
     slope = np.zeros(2)
-    for _ in range(3):  # trimmed least squares of z = slope . xy + height
+    for _ in range(3):  # z = slope . xy + height
         residual = z - graph.points[:, :2] @ slope - height
         near = flat & (np.abs(residual) < 0.02)
-        design = np.column_stack([graph.points[near, :2], np.ones(near.sum())]) * np.sqrt(
-            graph.areas[near, None]
-        )
-        solution = np.linalg.lstsq(design, z[near] * np.sqrt(graph.areas[near]), rcond=None)[0]
-        if np.linalg.norm(solution[:2]) > 0.03:  # 1.7 degrees: objects have tilted the fit
+        weights = np.sqrt(graph.areas[near])
+        design = np.column_stack([graph.points[near, :2], np.ones(near.sum())]) * weights[:, None]
+        solution = np.linalg.lstsq(design, z[near] * weights, rcond=None)[0]
+        if np.linalg.norm(solution[:2]) > 0.03:  # 1.7 degrees: objects tilted the fit
             break
         slope, height = solution[:2], float(solution[2])
     normal = np.array([-slope[0], -slope[1], 1.0])
@@ -62,7 +62,7 @@ def fit_floor(graph: MeshGraph, config: SurfaceConfig) -> FittedPlane | None:
 
 
 def fit_walls(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> list[FittedPlane]:
-    """Find the large vertical planes with nothing of the room behind them."""
+    """Find walls: large vertical planes without surface behind them. Vertices in the mask `taken` (v,) are excluded."""
     upright = (np.abs(graph.normals[:, 2]) < 0.35) & ~taken
     candidates: list[tuple[np.ndarray, np.ndarray, float]] = []
     free = upright.copy()
@@ -89,7 +89,10 @@ def fit_walls(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> lis
 def _strongest_upright_plane(
     graph: MeshGraph, free: np.ndarray, config: SurfaceConfig
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return (plane, inliers, area) of the vertical plane with most free area; None when none is wall-sized."""
+    """Return (plane, inliers, area) of the vertical plane with the largest free area; None if none is wall-sized.
+
+    Histograms of azimuth and then of offset give the start; `_refined` fits it.
+    """
     index = np.flatnonzero(free)
     if graph.areas[index].sum() < config.min_wall_area_m2:
         return None
@@ -121,6 +124,7 @@ def _strongest_upright_plane(
 def _refined(
     graph: MeshGraph, free: np.ndarray, plane: np.ndarray, config: SurfaceConfig
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Refit a vertical plane to its inliers in shrinking bands; None if too little area is left."""
     for width in (0.06, 0.04, 0.03):
         distance = graph.points @ plane[:3] + plane[3]
         inliers = free & (np.abs(distance) < width) & (graph.normals @ plane[:3] > 0.8)
@@ -133,7 +137,7 @@ def _refined(
         normal = np.linalg.eigh(spread)[1][:, 0]
         if normal @ plane[:2] < 0:
             normal = -normal
-        if normal @ plane[:2] < 0.97:  # a short piece cannot tell its own direction
+        if normal @ plane[:2] < 0.97:  # a short patch does not determine its direction: keep the former one
             normal = plane[:2]
         plane = np.array([normal[0], normal[1], 0.0, -normal @ center])
     distance = graph.points @ plane[:3] + plane[3]
@@ -143,6 +147,7 @@ def _refined(
 
 
 def _along(graph: MeshGraph, plane: np.ndarray) -> np.ndarray:
+    """Return the horizontal coordinates (v,) of all vertices along a wall."""
     return graph.points[:, :2] @ np.array([-plane[1], plane[0]])
 
 
@@ -153,7 +158,7 @@ def _within_extent(graph: MeshGraph, plane: np.ndarray, inliers: np.ndarray) -> 
 
 
 def _bounds_the_room(graph, plane, inliers, area, candidates, config: SurfaceConfig) -> bool:
-    """Tell a wall from the side of a piece of furniture."""
+    """Tell a wall from the side of furniture by its size, the surface behind it and parallel candidates."""
     if area < config.min_wall_area_m2:
         return False
     along = _along(graph, plane)
@@ -166,18 +171,18 @@ def _bounds_the_room(graph, plane, inliers, area, candidates, config: SurfaceCon
     if graph.areas[behind].sum() > 0.10 * area:
         return False
     for other, other_inliers, other_area in candidates:
-        # A parallel plane of wall size not far behind is the wall; this one is a front of furniture before it.
+        # With a wall-sized parallel plane up to 1 m behind, this one is a furniture front.
         if other @ np.append(plane[:3], 0) < 0.95 or other_area < 0.7 * area:
             continue
         gap = -float(np.median(distance[other_inliers]))
-        # A smaller one just before it is a board, a panel or a row of frames on the wall.
+        # With a larger parallel plane 3 to 8 cm behind, it is a board, a panel or frames on the wall.
         if 0.08 < gap < 1.0 or (0.03 < gap <= 0.08 and other_area > area):
             return False
     return True
 
 
 def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> FittedPlane | None:
-    """Find a ceiling: a large down-facing plane above 1.8 m."""
+    """Find a ceiling: a large down-facing level plane above 1.8 m with nearly no vertices above it."""
     down = (graph.normals[:, 2] < -0.85) & (graph.points[:, 2] > 1.8) & ~taken
     if graph.areas[down].sum() < config.min_wall_area_m2:
         return None
@@ -193,7 +198,7 @@ def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> F
 
 
 def fit_base(graph: MeshGraph, config: SurfaceConfig) -> list[FittedPlane]:
-    """Return floor (if enough of it was seen), walls and ceiling; no vertex is on two of them."""
+    """Fit floor, walls and ceiling, those that were seen; a plane does not claim vertices of an earlier one."""
     floor = fit_floor(graph, config)
     planes = [] if floor is None else [floor]
     planes += fit_walls(graph, base_owner(planes, len(graph.points)) > 0, config)
@@ -202,7 +207,7 @@ def fit_base(graph: MeshGraph, config: SurfaceConfig) -> list[FittedPlane]:
 
 
 def base_owner(planes: list[FittedPlane], count: int) -> np.ndarray:
-    """Return which plane each of `count` vertices is on, int32: 0 none, 1 floor, the others from 2 in their order."""
+    """Return the plane of each of `count` vertices, int32: 0 none, 1 floor, 2 and up the others in their order."""
     owner = np.zeros(count, np.int32)
     number = 2
     for plane in planes:
@@ -212,14 +217,13 @@ def base_owner(planes: list[FittedPlane], count: int) -> np.ndarray:
 
 
 def behind_base(graph: MeshGraph, planes: list[FittedPlane]) -> np.ndarray:
-    """Mark vertices below the floor or behind a wall: reflections, what a window shows, and noise."""
+    """Return the mask (v,) of vertices below the floor or behind a wall: reflections, views out of windows, noise."""
     out = np.zeros(len(graph.points), bool)
     for plane in planes:
         distance = plane.distance(graph.points)
         beyond = distance < -plane.band_m
         if plane.label == "wall":
-            axis = np.array([-plane.plane[1], plane.plane[0]])
-            along = graph.points[:, :2] @ axis
+            along = _along(graph, plane.plane)
             low, high = np.percentile(along[plane.members], [0.5, 99.5])
             beyond &= (along > low - 0.05) & (along < high + 0.05)
         out |= beyond
@@ -227,7 +231,7 @@ def behind_base(graph: MeshGraph, planes: list[FittedPlane]) -> np.ndarray:
 
 
 def base_outline(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Return the convex outline (k, 3) of points projected onto a plane, trimmed of strays."""
+    """Return the convex hull (k, 3) of points (n, 3) projected onto a plane (4,), clipped to the 0.1-99.9 % range."""
     axis_u, axis_v = plane_axes(plane)
     uv = np.column_stack([points @ axis_u, points @ axis_v])
     low, high = np.percentile(uv, [0.1, 99.9], axis=0)
@@ -236,7 +240,7 @@ def base_outline(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
 
 
 def plane_axes(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit vectors (u, v) in a plane, u x v = n; for upright planes v is up and u is horizontal."""
+    """Return orthonormal in-plane axes u, v (3,) with u x v = n; for upright planes v is up and u horizontal."""
     normal = plane[:3]
     reference = np.array([0, 0, 1.0]) if abs(normal[2]) < 0.7 else np.array([0, 1.0, 0])
     axis_u = np.cross(reference, normal)
@@ -245,6 +249,6 @@ def plane_axes(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def on_plane(uv: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Return the world points (n, 3) at coordinates (n, 2) along the axes of a plane."""
+    """Return the world points (n, 3) at in-plane coordinates (n, 2), see `plane_axes`."""
     axis_u, axis_v = plane_axes(plane)
     return uv[:, :1] * axis_u + uv[:, 1:] * axis_v - plane[3] * plane[:3]

@@ -1,11 +1,11 @@
-"""The zero level of a block volume as a mesh: one vertex per crossed cell (surface nets), one quad per crossed edge.
+"""Extract the zero level set of a block TSDF as a triangle mesh by surface nets.
 
-Surface nets need no case table, share vertices across blocks by construction and give evenly spaced vertices with
-half the triangles of marching cubes. A cell counts only if all its eight corners were observed, so the mesh ends
-where knowledge ends instead of closing over it.
+Surface nets put one vertex into each crossed cell and one quad around each crossed edge. They need no case table, share
+vertices across blocks, and give half the triangles of marching cubes. A cell counts only if all eight corners were
+observed, so the mesh has borders at unobserved space.
 
-A volume may be one slab of a larger one. Its last layer of blocks (the halo) is then the first layer of the next slab:
-the cells that touch the slab make vertices in both, and every face belongs to one slab only.
+A volume may be one slab of a larger one, followed by a halo: the first layer of blocks of the next slab. Cells of the
+halo that touch the slab make vertices in both slabs. Each face belongs to one slab only.
 """
 
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ from reconstruction.surface.tsdf import BLOCK, BlockVolume, block_visible
 
 @dataclass(frozen=True)
 class RawMesh:
-    """A mesh in world space with what the volume knows of each vertex."""
+    """A triangle mesh in world space with per-vertex attributes of the fusion."""
 
-    vertices: np.ndarray  # float32 (v, 3)
+    vertices: np.ndarray  # float32 (v, 3) metres
     faces: np.ndarray  # int32 (f, 3), counter-clockwise seen from free space
-    normals: np.ndarray  # float32 (v, 3), towards free space
-    colors: np.ndarray  # uint8 (v, 3)
-    weights: np.ndarray  # float32 (v,) views
-    cells: np.ndarray  # int32 (v, 3) cell of the vertex, in voxels
-    pixels: np.ndarray  # float32 (v,) size there of a pixel of the nearest view that sees it, in voxels
+    normals: np.ndarray  # float32 (v, 3) unit, towards free space
+    colors: np.ndarray  # uint8 (v, 3) RGB
+    weights: np.ndarray  # float32 (v,) number of views
+    cells: np.ndarray  # int32 (v, 3) cell of the vertex in the voxel grid
+    pixels: np.ndarray  # float32 (v,) pixel footprint of the nearest view that sees the vertex, in voxels
 
     def subset(self, keep_vertex: np.ndarray, faces: np.ndarray) -> "RawMesh":
-        """Return the mesh with only the marked vertices and the given faces (of old indices) among them."""
+        """Return the mesh of the vertices in a mask (v,) and of those `faces` (f, 3), in old indices, among them."""
         new = np.cumsum(keep_vertex) - 1
         inside = keep_vertex[faces].all(1)
         pick = np.flatnonzero(keep_vertex)
@@ -42,7 +42,7 @@ class RawMesh:
 
 @numba.njit(cache=True)
 def _corner(blocks, index, b, i, j, l):  # pragma: no cover - compiled
-    """Return block row and local index of voxel (i, j, l) relative to block b; indices reach one block further."""
+    """Return block row (-1: none) and local index of voxel (i, j, l) of block b; indices may reach the next block."""
     di, dj, dl, row = 0, 0, 0, np.int64(b)
     if i >= BLOCK:
         di, i = 1, i - BLOCK
@@ -62,12 +62,12 @@ def _corner(blocks, index, b, i, j, l):  # pragma: no cover - compiled
 def _cells(
     blocks, index, distance, weight, views, min_weight, min_views, own, axis, out_code
 ):  # pragma: no cover - compiled
-    """Per cell: the sign bits of its corners if it is crossed and observed all around, else 0."""
+    """Fill out_code with the sign bits of each cell's corners if it is crossed and fully observed, else 0."""
     for b in numba.prange(blocks.shape[0]):
         for i in range(BLOCK):
             for j in range(BLOCK):
                 for l in range(BLOCK):
-                    # Of the halo only the cells that touch the slab are known whole.
+                    # In the halo only the cells that touch the slab have all corners.
                     if b >= own and (i if axis == 0 else (j if axis == 1 else l)) > 0:
                         continue
                     code, valid, support = 0, True, 0
@@ -89,7 +89,7 @@ def _cells(
 def _vertices(
     blocks, index, distance, views, code, first, origin, shift, voxel, out_v, out_n, out_w, out_cell
 ):  # pragma: no cover - compiled
-    """Fill in one vertex per crossed cell: the mean of its edge crossings, the gradient there, and views."""
+    """Fill one vertex per crossed cell: the mean of its edge crossings, the normal, the views, and the cell."""
     for b in numba.prange(blocks.shape[0]):
         row = first[b]
         d = np.empty(8)
@@ -143,7 +143,7 @@ def _vertices(
 def _paint(
     first, voxel, trunc, poses, k, depth, weight, slope, reach, color, vertices, normals, out, out_pixels
 ):  # pragma: no cover - compiled
-    """Color vertices by the views that see them, best those that look at their front; and find the nearest one."""
+    """Average the color of each vertex over the views that see it, mainly at its front; find the nearest view."""
     n, h, w = depth.shape
     fx, fy, cx, cy = k
     for b in numba.prange(len(first) - 1):
@@ -197,7 +197,7 @@ def _paint(
 def _quads(
     blocks, index, code, vertex_row, own, first, fill, out_count, out_faces
 ):  # pragma: no cover - compiled
-    """Join the four cells around every crossed edge by two triangles; count them, or write them from `first` on."""
+    """Count, or with `fill` write from `first` on, two triangles between the four cells around each crossed edge."""
     for b in numba.prange(own):
         count = first[b] if fill else 0
         ring = np.empty(4, np.int64)
@@ -207,7 +207,7 @@ def _quads(
                     bits = code[b, i, j, l]
                     if bits == 0:
                         continue
-                    # Edges that meet at the far corner (7) of this cell: the other three cells lie in + direction.
+                    # Edges at the far corner (7) of this cell; the other three cells lie in + direction.
                     for axis in range(3):
                         inside = (bits >> 7 & 1) == 1
                         other = (bits >> (7 ^ (1 << axis)) & 1) == 1
@@ -228,7 +228,7 @@ def _quads(
                         if not complete:
                             continue
                         if fill:
-                            # Inside ahead on the axis: free space is behind.
+                            # Choose the winding that faces free space.
                             second, fourth = (ring[1], ring[3]) if other else (ring[3], ring[1])
                             out_faces[count, 0], out_faces[count, 1], out_faces[count, 2] = (
                                 ring[0],
@@ -245,19 +245,19 @@ def extract_mesh(
     volume: BlockVolume, views: FusionViews, reach: np.ndarray, *, own: int, axis: int, min_views: int,
     min_weight: float,
 ) -> tuple[RawMesh, int]:  # fmt: skip
-    """Return the zero level where every corner of a cell has more than `min_weight` and one `min_views` views.
+    """Extract the zero level set of a slab and its halo.
 
     Args:
-        volume: the blocks, the first `own` of them the slab's own, the others its halo.
-        views: what the vertices are colored from.
-        reach: what `tile_reach` gave for the views.
-        own: how many blocks are the slab's own.
-        axis: along which the slabs follow each other.
-        min_views: fewer views make no surface.
-        min_weight: nor does less weight.
+        volume: the blocks of the slab, then those of its halo.
+        views: color the vertices.
+        reach: of `tile_reach`, for the views.
+        own: number of blocks of the slab.
+        axis: along which slabs follow each other, 0 to 2.
+        min_views: smallest number of views, at one corner of a cell at least.
+        min_weight: each corner of a cell must have more weight.
 
     Returns:
-        The mesh, and how many of its vertices (the first ones) are the slab's own; those of the halo follow.
+        The mesh, and the number of vertices of the slab; they come first, those of the halo follow.
     """
     low = volume.blocks.min(0)
     blocks = (volume.blocks - low).astype(np.int32)
@@ -267,9 +267,8 @@ def extract_mesh(
     _cells(
         blocks, index, volume.distance, volume.weight, volume.views, min_weight, min_views, own, axis, code
     )
-    first = np.concatenate([[0], np.cumsum(np.count_nonzero(code.reshape(len(code), -1), axis=1))]).astype(
-        np.int64
-    )
+    crossed = np.count_nonzero(code.reshape(len(code), -1), axis=1)
+    first = np.concatenate([[0], np.cumsum(crossed)]).astype(np.int64)
     total = int(first[-1])
     vertices, normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
     weights, cells = np.empty(total, np.float32), np.empty((total, 3), np.int32)
@@ -279,10 +278,10 @@ def extract_mesh(
     )  # fmt: skip
     colors, pixels = np.zeros((total, 3), np.uint8), np.zeros(total, np.float32)
     _paint(
-        first, volume.voxel_size, volume.truncation, views.camera_from_world, views.intrinsics, views.depth,
+        first, volume.voxel_size, volume.truncation, views.camera_from_world, views.camera.intrinsics, views.depth,
         views.weight, views.slope, reach, views.color, vertices, normals, colors, pixels,
     )  # fmt: skip
-    # Rows were numbered block by block in memory order, which is what a running count over `code` gives.
+    # Vertices are numbered in the memory order of `code`.
     vertex_row = (np.cumsum(code.reshape(-1) != 0, dtype=np.int32) - 1).reshape(code.shape)
     counts, none = np.zeros(own, np.int64), np.empty((0, 3), np.int32)
     _quads(blocks, index, code, vertex_row, own, counts, False, counts, none)

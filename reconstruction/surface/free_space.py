@@ -1,4 +1,4 @@
-"""What is known of space: free where rays passed, surface where the mesh lies, unknown elsewhere."""
+"""Occupancy grid by space carving: free where rays passed, surface where the mesh lies, unknown elsewhere."""
 
 import math
 
@@ -9,15 +9,15 @@ from reconstruction.core.types import SpaceGrid
 from reconstruction.surface.pixels import FusionViews
 from reconstruction.surface.tsdf import block_visible
 
-_CHUNK = 8
+_CHUNK = 8  # voxels a side of a chunk, the unit of parallel work
 UNKNOWN, FREE, SURFACE = 0, 1, 2
 
 
 @numba.njit(cache=True, parallel=True)
 def _free(
     origin, voxel, poses, order, k, depth, carve, tiles, margin, completed_margin, min_rays, state
-):  # pragma: no cover
-    """Mark voxels that `min_rays` views looked through. Chunks of 8x8x8 voxels skip views that cannot see them."""
+):  # pragma: no cover - compiled
+    """Mark voxels that at least `min_rays` views see through. Chunks skip views that cannot see them."""
     n, h, w = depth.shape
     fx, fy, cx, cy = k
     sx, sy, sz = state.shape
@@ -58,7 +58,7 @@ def _free(
                         kind = carve[v, iy, ix]
                         if kind == 0:
                             continue
-                        # The whole voxel must lie before the surface, not only its centre.
+                        # The whole voxel must lie before the surface, hence `half`.
                         if z + half + (margin if kind == 2 else completed_margin) < depth[v, iy, ix]:
                             votes[i - x0, j - y0, l - z0] += 1
                             if votes[i - x0, j - y0, l - z0] >= min_rays:
@@ -72,21 +72,31 @@ def carve_space(
     views: FusionViews, origin: np.ndarray, shape: tuple[int, int, int], voxel_size: float, *, margin: float,
     completed_margin: float, min_rays: int,
 ) -> SpaceGrid:  # fmt: skip
-    """Return the grid with free voxels marked; surface is entered by `mark_surface`."""
+    """Carve free space by depth rays; `mark_surface` enters the surface afterwards.
+
+    Args:
+        views: of `prepare_views`, metres.
+        origin: (3,) corner of the grid in world space.
+        shape: number of voxels along x, y, z.
+        voxel_size: metres.
+        margin: distance before a measured depth that stays unknown, metres.
+        completed_margin: the same for completed pixels.
+        min_rays: a voxel is free if this many views see through it.
+    """
     state = np.zeros(shape, np.uint8)
-    # Views far apart in time first: voxels get their votes early, and finished chunks are left early.
+    # Views far apart in time first, so that chunks are finished after few views.
     n = len(views.depth)
     step = next(s for s in range(max(1, int(0.38 * n)), n + 2) if math.gcd(s, n) == 1)
     order = (np.arange(n) * step) % n
     _free(
-        np.asarray(origin, np.float64), voxel_size, views.camera_from_world, order, views.intrinsics, views.depth,
-        views.carve, views.tile_max, margin, completed_margin, min_rays, state,
+        np.asarray(origin, np.float64), voxel_size, views.camera_from_world, order, views.camera.intrinsics,
+        views.depth, views.carve, views.tile_max, margin, completed_margin, min_rays, state,
     )  # fmt: skip
     return SpaceGrid(np.asarray(origin, np.float64), float(voxel_size), state)
 
 
 def mark_surface(space: SpaceGrid, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Enter the voxels that a mesh crosses as surface, in place: at its vertices, and between them on wide faces."""
+    """Mark the voxels that a mesh (v, 3), (f, 3) crosses as surface, in place; wide faces are subdivided."""
     corners = vertices[faces]
     span = np.sqrt(((corners - np.roll(corners, 1, axis=1)) ** 2).sum(-1).max(1))
     points = [vertices]

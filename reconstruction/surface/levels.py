@@ -1,4 +1,4 @@
-"""Horizontal up-facing pieces of a surface, cut where they form steps."""
+"""Segment the horizontal up-facing parts of a surface into patches of one height."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,9 +9,12 @@ from reconstruction.core.mesh_graph import MeshGraph, pieces
 
 
 def horizontal_levels(graph: MeshGraph, chosen: np.ndarray, min_area_m2: float) -> list[np.ndarray]:
-    """Return the level up-facing pieces among vertices `chosen` (sorted), each the indices of its vertices."""
+    """Return the connected level up-facing patches among vertices `chosen` (sorted indices), as vertex indices.
+
+    Patches are split by height; those below `min_area_m2` are dropped.
+    """
     flat = chosen[graph.normals[chosen, 2] > 0.85]
-    graph = replace(graph, edges=graph.edges_within(flat))  # each look at all edges costs milliseconds
+    graph = replace(graph, edges=graph.edges_within(flat))  # filtering all edges for each patch would be slow
     levels: list[np.ndarray] = []
     for piece in pieces(graph, flat):
         if graph.areas[piece].sum() >= min_area_m2:
@@ -20,7 +23,7 @@ def horizontal_levels(graph: MeshGraph, chosen: np.ndarray, min_area_m2: float) 
 
 
 def joined_levels(levels: list[np.ndarray], of_one: Callable[[int, int], bool]) -> list[np.ndarray]:
-    """Join levels i < j wherever `of_one(i, j)`, also by way of others; return sorted vertices of each group."""
+    """Union-find: merge levels i < j where `of_one(i, j)`, transitively; return the sorted vertices of each group."""
     parent = list(range(len(levels)))
 
     def root(i: int) -> int:
@@ -39,7 +42,7 @@ def joined_levels(levels: list[np.ndarray], of_one: Callable[[int, int], bool]) 
 
 
 def _split_by_height(graph: MeshGraph, piece: np.ndarray) -> list[np.ndarray]:
-    """Cut a connected up-facing piece where its heights form separate levels."""
+    """Split a connected up-facing patch at the peaks of its height histogram."""
     z = graph.points[piece, 2]
     if np.percentile(z, 98) - np.percentile(z, 2) < 0.02:
         return [piece]

@@ -1,4 +1,4 @@
-"""What each depth pixel is worth to the fusion: its weight, its slope, and whether it may free space."""
+"""Per-pixel inputs of TSDF fusion: weight, slope of the surface, and permission to carve free space."""
 
 import math
 from dataclasses import dataclass
@@ -9,36 +9,30 @@ import numpy as np
 from reconstruction.core.types import Camera, DepthMaps
 from registry.geometry import invert_rigid
 
-TILE_PX = 8
-CARVES_NOT, CARVES_COMPLETED, CARVES_MEASURED = 0, 1, 2
+TILE_PX = 8  # pixels a side of a tile, for visibility tests
 
 
 @dataclass(frozen=True)
 class FusionViews:
-    """Depth maps prepared for the fusion kernels."""
+    """Depth maps prepared for the fusion kernels; metres, world space."""
 
     camera: Camera
-    camera_from_world: np.ndarray  # float64 (n, 4, 4)
-    depth: np.ndarray  # float32 (n, h, w)
-    weight: np.ndarray  # float32 (n, h, w), 0 = makes no surface
-    slope: np.ndarray  # uint8 (n, h, w), 255 * cosine that turns a distance along z into one along the normal
-    carve: np.ndarray  # uint8 (n, h, w): CARVES_*
-    tile_max: np.ndarray  # float32 (n, th, tw) largest depth in each tile of TILE_PX pixels
-    color: np.ndarray  # uint8 (n, h, w, 3)
-
-    @property
-    def intrinsics(self) -> np.ndarray:
-        """Return fx, fy, cx, cy."""
-        return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy])
+    camera_from_world: np.ndarray  # float64 (n, 4, 4) rigid
+    depth: np.ndarray  # float32 (n, h, w) z-depth, 0 = unknown
+    weight: np.ndarray  # float32 (n, h, w) 0 = makes no surface
+    slope: np.ndarray  # uint8 (n, h, w) 255 * factor from a distance along z to one along the surface normal
+    carve: np.ndarray  # uint8 (n, h, w) 0 the ray carves nothing, 1 completed pixel, 2 measured pixel
+    tile_max: np.ndarray  # float32 (n, th, tw) largest depth in each tile of TILE_PX x TILE_PX pixels
+    color: np.ndarray  # uint8 (n, h, w, 3) RGB
 
 
 @numba.njit(cache=True)
 def _derivative(depth, y, x, dy, dx, jump):  # pragma: no cover - compiled
-    """Return the change of inverse depth per pixel along (dy, dx), and which sides are continuous."""
+    """Return the change of inverse depth per pixel along (dy, dx), and the state of the two neighbours."""
     h, w = depth.shape
     z = depth[y, x]
     total, span = 0.0, 0
-    before, after = 0, 0  # 0 continuous, +1 the neighbour is farther, -1 nearer, 2 unknown
+    before, after = 0, 0  # 0 continuous, +1 farther, -1 nearer, 2 unknown
     for side in (-1, 1):
         state = 2
         for reach in (1, 2):
@@ -65,6 +59,7 @@ def _derivative(depth, y, x, dy, dx, jump):  # pragma: no cover - compiled
 def _weigh(
     depth, confidence, k, reference, max_depth, completed_weight, weight, slope, carve
 ):  # pragma: no cover
+    """Fill weight, slope and carve (n, h, w) of every known pixel; flying pixels keep zeros."""
     n, h, w = depth.shape
     fx, fy, cx, cy = k
     for row in numba.prange(n * h):
@@ -76,7 +71,7 @@ def _weigh(
                 continue
             gx, left, right = _derivative(depth[v], y, x, 0, 1, 0.03)
             gy, up, down = _derivative(depth[v], y, x, 1, 0, 0.03)
-            # A pixel between a near and a far neighbour lies on neither: depth flies across the edge there.
+            # Flying pixel: between a nearer and a farther neighbour, on neither surface.
             if left * right == -1 or up * down == -1:
                 continue
             carve[v, y, x] = 2 if c == 2 else 1
@@ -116,15 +111,23 @@ def prepare_views(
     max_depth: float,
     completed_weight: float,
 ) -> FusionViews:
-    """Weigh every pixel of `depth`; images (n, H, W, 3) are resampled to the depth resolution."""
+    """Compute the fusion inputs of every pixel.
+
+    Args:
+        depth: depth maps, metres.
+        world_from_camera: (n, 4, 4) rigid.
+        images: uint8 (n, H, W, 3) RGB; resampled to depth resolution.
+        reference_depth: as `SurfaceConfig.reference_depth_m`.
+        max_depth: pixels beyond it get weight 0, metres.
+        completed_weight: factor on the weight of completed pixels.
+    """
     import cv2
 
     d = np.ascontiguousarray(depth.depth, np.float32)
     n, h, w = d.shape
     weight, slope = np.zeros((n, h, w), np.float32), np.zeros((n, h, w), np.uint8)
     carve = np.zeros((n, h, w), np.uint8)
-    k = (depth.camera.fx, depth.camera.fy, depth.camera.cx, depth.camera.cy)
-    confidence = np.ascontiguousarray(depth.confidence)
+    confidence, k = np.ascontiguousarray(depth.confidence), depth.camera.intrinsics
     _weigh(d, confidence, k, reference_depth, max_depth, completed_weight, weight, slope, carve)
     tiles = np.zeros((n, -(-h // TILE_PX), -(-w // TILE_PX)), np.float32)
     _tile_maximum(d, tiles)

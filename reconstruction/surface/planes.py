@@ -1,4 +1,4 @@
-"""The planes of a surface: floor, walls and ceiling, and the level tops that can carry things."""
+"""Detect the planes of a surface: floor, walls, ceiling, and support planes."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from reconstruction.surface.support_planes import find_support_planes
 
 
 def find_planes(surface: Surface, config: SurfaceConfig) -> tuple[SurfacePlane, ...]:
-    """Find the floor (where enough of it was seen), walls, a ceiling, and supports from the lowest up.
+    """Detect the observed floor, walls and ceiling, then support planes by ascending height.
 
     Args:
-        surface: in world space, floor at z = 0; its own planes are not read.
+        surface: in world space, floor at z = 0; its field `planes` is ignored.
         config: thresholds.
     """
     graph = MeshGraph.from_surface(surface)

@@ -1,4 +1,4 @@
-"""Make a fused mesh smaller: drop scattered pieces, merge vertices where the surface is flat."""
+"""Simplify a fused mesh: drop small connected components, decimate flat parts by vertex clustering."""
 
 import numba
 import numpy as np
@@ -6,9 +6,10 @@ import numpy as np
 from reconstruction.surface.extract import RawMesh
 from reconstruction.surface.tsdf import BLOCK
 
-# A block and its neighbours are flat where their vertices lie on a plane within the first number (metres, RMS). There 4
-# cells a side are merged, or 2 where the colors of the block differ by more than the second (8-bit steps). Elsewhere 2
-# or 4 are merged where a pixel covers more than the third, or twice that: no view saw finer things.
+# Rows: (planarity, color spread, pixel footprint), from weak to strong decimation. A block is flat if its vertices and
+# those of its neighbours lie on a plane within `planarity` metres RMS. Clusters of a flat block have 4 cells a side, or
+# 2 if its colors spread by more than `color spread` (8-bit steps). Clusters of other blocks have 2 or 4 cells a side if
+# a pixel covers more than `pixel footprint` cells, or twice that.
 _STRENGTHS = (
     (0.001, 20, 1.5),
     (0.0015, 20, 1.0),
@@ -20,13 +21,13 @@ _STRENGTHS = (
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the area (f,) of each triangle."""
+    """Return the area (f,) of each triangle, in squared units of `vertices`."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 def drop_small_components(mesh: RawMesh, min_area: float) -> tuple[RawMesh, int]:
-    """Return the mesh without connected pieces of less area, and how many were dropped."""
+    """Return the mesh without connected components below `min_area`, and the number of dropped components."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -42,7 +43,7 @@ def drop_small_components(mesh: RawMesh, min_area: float) -> tuple[RawMesh, int]
 
 @numba.njit(cache=True)
 def _block_sums(block, points, colors, sums):  # pragma: no cover - compiled
-    """Per block: count, sums of the coordinates, of their six products, of the colors and of their squares."""
+    """Accumulate per block (16,): count, coordinates (3), their products (6), colors (3), squared colors (3)."""
     for i in range(len(block)):
         b = block[i]
         sums[b, 0] += 1.0
@@ -58,7 +59,7 @@ def _block_sums(block, points, colors, sums):  # pragma: no cover - compiled
 
 @numba.njit(cache=True)
 def _with_neighbors(blocks, row, sums, out):  # pragma: no cover - compiled
-    """Add up the first ten sums over each block and the 26 around it."""
+    """Sum the first ten columns over each block and its 26 neighbours."""
     for n in range(len(blocks)):
         for x in range(max(0, blocks[n, 0] - 1), min(row.shape[0], blocks[n, 0] + 2)):
             for y in range(max(0, blocks[n, 1] - 1), min(row.shape[1], blocks[n, 1] + 2)):
@@ -69,7 +70,7 @@ def _with_neighbors(blocks, row, sums, out):  # pragma: no cover - compiled
 
 
 def _roughness(sums: np.ndarray) -> np.ndarray:
-    """Return the RMS distance of points from their plane (n,), given their sums (n, 10)."""
+    """Return the RMS distance (n,) of the points of each block from their least-squares plane, from sums (n, 10)."""
     mean = sums[:, 1:4] / sums[:, :1]
     products = sums[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(-1, 3, 3) / sums[:, :1, None]
     spread = products - mean[:, :, None] * mean[:, None, :]
@@ -84,22 +85,22 @@ def thinning_level(
     asked: np.ndarray,
     strength: int,
 ) -> np.ndarray:
-    """Return how many cells (1, 2 or 4) a side may be merged: more where a block and its neighbours are flat.
+    """Return the cluster size (m,) at cells: 1, 2 or 4 cells a side, larger in flat blocks.
 
     Args:
-        cells: (n, 3) cells of the vertices that tell how flat a block is.
-        points: (n, 3) the vertices in metres.
-        colors: (n, 3) theirs.
-        pixels: (n,) how many cells a pixel covers there.
-        asked: (m, 3) cells whose level is asked for, in blocks that hold some of them.
-        strength: row of _STRENGTHS; the later the fewer vertices are left.
+        cells: (n, 3) cells of the vertices that measure flatness.
+        points: (n, 3) these vertices, metres.
+        colors: (n, 3) their colors, 0 to 255.
+        pixels: (n,) pixel footprint at each, in cells.
+        asked: (m, 3) cells to answer for; their blocks must hold some of `cells`.
+        strength: row of _STRENGTHS; later rows leave fewer vertices.
     """
     home, query = cells // BLOCK, asked // BLOCK
     low = home.min(0)
     shape = tuple(home.max(0) - low + 1)
     used, block = np.unique(np.ravel_multi_index(tuple((home - low).T), shape), return_inverse=True)
     sums, wide = np.zeros((len(used), 16)), np.zeros((len(used), 10))
-    # About a point of their own: the spread of millimetres must not drown in the squares of metres.
+    # Relative to one of the points, to avoid cancellation in the second moments.
     _block_sums(block.reshape(-1), points.astype(np.float64) - points[0], colors, sums)
     row = np.full(shape, -1, np.int32)
     row.reshape(-1)[used] = np.arange(len(used), dtype=np.int32)
@@ -114,14 +115,17 @@ def thinning_level(
 
 
 def cluster_keys(cells: np.ndarray, level: np.ndarray, axis: int, span: np.ndarray) -> np.ndarray:
-    """Return one number per cluster of level^3 cells; they grow along `axis` first. `span` bounds the cells."""
+    """Return a key (n,) for the cluster of level^3 cells of each cell (n, 3), ordered along `axis` first.
+
+    `span` (3,) bounds the cells.
+    """
     corner = cells.astype(np.int64) // level[:, None] * level[:, None]
     second, third = (a for a in range(3) if a != axis)
     return (corner[:, axis] * int(span[second]) + corner[:, second]) * int(span[third]) + corner[:, third]
 
 
 def merge_vertices(mesh: RawMesh, keys: np.ndarray) -> tuple[RawMesh, np.ndarray]:
-    """Merge the first len(keys) vertices that share a key; return them without faces, and their keys, sorted."""
+    """Average the first len(keys) vertices by key (n,); return a mesh without faces, and the sorted unique keys."""
     unique, first, group, count = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     group, n = group.reshape(-1), len(keys)
 
@@ -141,7 +145,7 @@ def merge_vertices(mesh: RawMesh, keys: np.ndarray) -> tuple[RawMesh, np.ndarray
 
 
 def _merge(mesh: RawMesh, level: np.ndarray) -> RawMesh:
-    """Merge vertices of one cluster of level^3 cells; faces that collapse vanish, so no crack can open."""
+    """Merge the vertices of each cluster and drop the faces that collapse; this opens no cracks."""
     cells = mesh.cells - mesh.cells.min(0) // BLOCK * BLOCK
     keys = cluster_keys(cells, level, 0, cells.max(0) + 1)
     merged, unique = merge_vertices(mesh, keys)
@@ -154,7 +158,7 @@ def _merge(mesh: RawMesh, level: np.ndarray) -> RawMesh:
 
 
 def thin(mesh: RawMesh, max_vertices: int) -> RawMesh:
-    """Merge vertices, flat parts first, until there are at most `max_vertices` where that is possible."""
+    """Decimate by vertex clustering, flat parts first, towards at most `max_vertices`; this may not be reached."""
     if len(mesh.vertices) <= max_vertices:
         return mesh
     result = mesh

@@ -1,8 +1,8 @@
-"""Fusion in slabs: memory holds two slabs of the volume whatever the scene, and of the mesh what thinning leaves.
+"""Fuse a volume slab by slab, so that memory holds two slabs of the TSDF and the decimated mesh only.
 
-Blocks are taken in layers along the axis whose fullest layer is smallest. Each slab is fused, meshed and thinned, and
-forgotten but for its last layer, which the next one begins with. Clusters of thinning never leave a block and have one
-key in both slabs, so the pieces join without a seam.
+Slabs are runs of block layers along the axis whose fullest layer is smallest. Each slab is fused, meshed and decimated,
+then freed except for its halo, with which the next slab begins. Clusters of the decimation never cross a block
+and have the same key in both slabs, so the meshes join without a seam.
 """
 
 from collections.abc import Iterator
@@ -21,18 +21,18 @@ from reconstruction.surface.tsdf import BLOCK, BlockVolume, integrate, tile_reac
 
 @dataclass(frozen=True)
 class _Slab:
-    """The mesh of one slab, not yet thinned."""
+    """The mesh of one slab before decimation."""
 
-    mesh: RawMesh  # the slab's own vertices, then those of the halo
-    own: int  # how many vertices are its own
-    layers: tuple[int, int]  # first and last layer of its own blocks
+    mesh: RawMesh  # vertices of the slab, then those of the halo
+    own: int  # number of vertices of the slab
+    layers: tuple[int, int]  # first and last layer of the slab's blocks
 
 
 def fuse_slabs(
     views: FusionViews, blocks: np.ndarray, origin: np.ndarray, voxel_size: float, config: SurfaceConfig,
     progress: Progress,
 ) -> RawMesh:  # fmt: skip
-    """Fuse all views into blocks (m, 3) and return the zero level, its flat parts thinned once."""
+    """Fuse all views into blocks (m, 3) and return the zero level set, decimated once at its flat parts."""
     axis = _best_axis(blocks)
     kept: list[tuple[RawMesh, np.ndarray, np.ndarray]] = []
     before = waiting = None
@@ -52,6 +52,7 @@ def _slabs(
     views: FusionViews, blocks: np.ndarray, axis: int, origin: np.ndarray, voxel_size: float, config: SurfaceConfig,
     progress: Progress,
 ) -> Iterator[_Slab]:  # fmt: skip
+    """Fuse and mesh one slab after the other; the halo of a slab is reused as the first layer of the next."""
     truncation = config.truncation_voxels * voxel_size
     reach = tile_reach(views, truncation)
     blocks = blocks[np.argsort(blocks[:, axis], kind="stable")]
@@ -79,7 +80,7 @@ def _slabs(
 
 
 def _layer_bounds(layer: np.ndarray, slab_blocks: int) -> list[tuple[int, int]]:
-    """Cut the layers into runs of about `slab_blocks` blocks, each of at least two layers (but for the last)."""
+    """Return (first, last) layers of runs of about `slab_blocks` blocks, each of two layers or more except the last."""
     counts = np.bincount(layer)
     bounds, low, held = [], int(layer.min()), 0
     for number in range(low, len(counts)):
@@ -93,10 +94,10 @@ def _layer_bounds(layer: np.ndarray, slab_blocks: int) -> list[tuple[int, int]]:
 def _thinned(
     before: _Slab | None, slab: _Slab, after: _Slab | None, axis: int, span: np.ndarray
 ) -> tuple[RawMesh, np.ndarray, np.ndarray]:
-    """Return the slab's own vertices merged, their keys (sorted), and its faces (f, 3) as keys."""
+    """Return the slab's clustered vertices, their sorted keys, and its faces (f, 3) as keys."""
     mesh, own = slab.mesh, slab.own
     parts = [(mesh, np.arange(own)), (mesh, np.arange(own, len(mesh.vertices)))]
-    # How rough a block is depends on its neighbours; the halo's own vertices are in the next slab.
+    # Flatness of a block depends on its neighbours in other slabs; the halo's vertices belong to the next slab.
     for other, low, high in (
         (before, slab.layers[0] - 1, slab.layers[0] - 1),
         (after, slab.layers[1] + 1, slab.layers[1] + 2),

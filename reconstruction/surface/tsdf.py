@@ -1,8 +1,8 @@
-"""Truncated signed distances in 8x8x8 blocks of voxels, allocated only near the surface.
+"""TSDF fusion (Curless and Levoy 1996) in sparse blocks of 8x8x8 voxels, allocated near the surface only.
 
-Every voxel gathers from the views that see it, so that the loop over blocks is parallel without races and the
-result does not depend on the number of threads. Distances are positive on the side of the camera, in units of the
-truncation; a voxel that no view observed has weight 0.
+Each voxel gathers from the views that see it. The loop over blocks is therefore parallel without races, and the result
+does not depend on the number of threads. Distances are positive on the side of the camera, in units of the truncation.
+Unobserved voxels have weight 0.
 """
 
 import math
@@ -13,33 +13,26 @@ import numpy as np
 
 from reconstruction.surface.pixels import TILE_PX, FusionViews
 
-BLOCK = 8
-_ONE_SURFACE = 0.02  # neighbouring pixels whose depths differ by less (relative) lie on one surface
-_IN_BAND = 0.5  # of the truncation: nearer than that a sample tells where the surface is
-_RAY_WEIGHT = 0.05  # least weight of a ray that crossed a voxel
+BLOCK = 8  # voxels a side of a block
+_ONE_SURFACE = 0.02  # relative depth difference below which neighbouring pixels are on one surface
+_IN_BAND = 0.5  # of the truncation: samples with smaller distances locate the surface
+_RAY_WEIGHT = 0.05  # smallest weight of a free-space observation
 
 
 @dataclass(frozen=True)
 class BlockVolume:
-    """A sparse volume: voxel (i, j, k) of block b has its centre at origin + (8 b + ijk + 0.5) voxel_size."""
+    """A sparse TSDF: voxel (i, j, k) of block b has its centre at origin + (8 b + ijk + 0.5) voxel_size."""
 
-    origin: np.ndarray  # float64 (3,)
-    voxel_size: float
-    truncation: float
-    blocks: np.ndarray  # int32 (m, 3)
+    origin: np.ndarray  # float64 (3,) metres, world space
+    voxel_size: float  # metres
+    truncation: float  # metres
+    blocks: np.ndarray  # int32 (m, 3) block coordinates
     distance: np.ndarray  # float32 (m, 8, 8, 8) in [-1, 1], in units of the truncation
-    weight: np.ndarray  # float32 (m, 8, 8, 8)
-    views: np.ndarray  # uint8 (m, 8, 8, 8) how many views saw the surface near the voxel
-
-    def rows(self, keep: np.ndarray) -> "BlockVolume":
-        """Return only the blocks that `keep` (a mask or slice) picks."""
-        return BlockVolume(
-            self.origin, self.voxel_size, self.truncation, self.blocks[keep], self.distance[keep],
-            self.weight[keep], self.views[keep],
-        )  # fmt: skip
+    weight: np.ndarray  # float32 (m, 8, 8, 8) 0 = not observed
+    views: np.ndarray  # uint8 (m, 8, 8, 8) number of views that saw surface near the voxel
 
     def joined(self, other: "BlockVolume") -> "BlockVolume":
-        """Return this volume with the blocks of another one behind its own."""
+        """Return this volume with the blocks of another one appended."""
         pairs = ((getattr(self, n), getattr(other, n)) for n in ("blocks", "distance", "weight", "views"))
         return BlockVolume(
             self.origin, self.voxel_size, self.truncation, *(np.concatenate(pair) for pair in pairs)
@@ -50,7 +43,7 @@ class BlockVolume:
 def _mark(
     depth, weight, world_from_camera, k, origin, block_size, truncation, stride, marks
 ):  # pragma: no cover
-    """Set marks[bx, by, bz] for every block that a view's surface band touches; all threads write the same value."""
+    """Mark the blocks that the truncation band of any pixel touches; all threads write the same value."""
     n, h, w = depth.shape
     fx, fy, cx, cy = k
     nx, ny, nz = marks.shape
@@ -76,7 +69,7 @@ def _mark(
 
 @numba.njit(cache=True, inline="always")
 def _bilinear(depth, here, pu, pv):  # pragma: no cover - compiled
-    """Sample depth at pixel coordinates: bilinear where the four neighbours are one surface, else `here`."""
+    """Return depth at pixel coordinates: bilinear if the four neighbours are on one surface, else `here`."""
     h, w = depth.shape
     x, y = pu - 0.5, pv - 0.5
     x0, y0 = int(math.floor(x)), int(math.floor(y))
@@ -92,7 +85,7 @@ def _bilinear(depth, here, pu, pv):  # pragma: no cover - compiled
 
 @numba.njit(cache=True)
 def block_visible(center, radius, m, k, shape, reach):  # pragma: no cover - compiled
-    """Tell whether a view may see a ball: in the frustum, and not wholly behind what it reaches there."""
+    """Tell whether a view may see a ball: it meets the frustum and is not wholly behind the tiles' `reach`."""
     h, w = shape
     fx, fy, cx, cy = k
     z = m[2, 0] * center[0] + m[2, 1] * center[1] + m[2, 2] * center[2] + m[2, 3]
@@ -114,21 +107,9 @@ def block_visible(center, radius, m, k, shape, reach):  # pragma: no cover - com
 
 @numba.njit(cache=True, parallel=True)
 def _integrate(
-    blocks,
-    origin,
-    edge,
-    trunc,
-    poses,
-    k,
-    depth,
-    weight,
-    slope,
-    carve,
-    reach,
-    out_distance,
-    out_weight,
-    out_views,
-):  # pragma: no cover - compiled
+    blocks, origin, edge, trunc, poses, k, depth, weight, slope, carve, reach, out_distance, out_weight, out_views
+):  # fmt: skip  # pragma: no cover - compiled
+    """Fuse all views into blocks. One kernel despite its length: the nested loops share their increments."""
     n, h, w = depth.shape
     side = out_distance.shape[1]
     voxel = edge / side
@@ -138,14 +119,14 @@ def _integrate(
     for b in numba.prange(blocks.shape[0]):
         corner = origin + blocks[b] * edge + 0.5 * voxel
         center = origin + (blocks[b] + 0.5) * edge
-        # Sums of weight * distance and of weight, first in place.
+        # Accumulate sums of weight * distance and of weight in the outputs.
         total, amount, seen = out_distance[b], out_weight[b], out_views[b]
         for v in range(n):
             m = poses[v]
             if not block_visible(center, radius, m, k, (h, w), reach[v]):
                 continue
             z_of, weight_of, slope_of, carve_of = depth[v], weight[v], slope[v], carve[v]
-            # Pixel times depth, and depth, are affine along every row of voxels.
+            # Along a row of voxels, depth and pixel times depth are affine.
             sz = m[2, 2] * voxel
             su, sv = (fx * m[0, 2] + cx * m[2, 2]) * voxel, (fy * m[1, 2] + cy * m[2, 2]) * voxel
             for i in range(side):
@@ -170,7 +151,7 @@ def _integrate(
                         d = z_of[iy, ix]
                         cosine = slope_of[iy, ix] * (1.0 / 255.0)
                         s = (d - z) * cosine
-                        # Interpolating moves a depth by less than the span of one surface: far off nothing changes.
+                        # Interpolation changes depth by less than `span`: skip it far from the surface.
                         span = _ONE_SURFACE * d * cosine
                         if s < -trunc - span:
                             continue
@@ -180,7 +161,7 @@ def _integrate(
                                 continue
                         q = weight_of[iy, ix]
                         if s > trunc:
-                            # Space that a ray crossed: it speaks against any surface there.
+                            # Free-space observation: distance +1.
                             if kind == 2:
                                 q = max(q, np.float32(_RAY_WEIGHT))
                                 total[i, j, l] += q
@@ -189,7 +170,7 @@ def _integrate(
                         if q <= 0.0:
                             continue
                         if s < 0.0:
-                            # Behind a surface nothing is measured: trust fades, so that thin things keep two sides.
+                            # Weight fades behind the surface, so that both sides of thin objects survive.
                             q *= 1.0 + s * share
                         total[i, j, l] += q * s * share
                         amount[i, j, l] += q
@@ -204,7 +185,7 @@ def _integrate(
 
 @numba.njit(cache=True, parallel=True)
 def _tile_reach(depth, weight, slope, trunc, reach):  # pragma: no cover - compiled
-    """Per tile, the depth behind which no pixel says anything: its surface and the band behind it."""
+    """Fill per tile the depth beyond which no pixel observes anything: surface depth plus the truncation band."""
     n, h, w = depth.shape
     for v in numba.prange(n):
         for y in range(h):
@@ -217,7 +198,7 @@ def _tile_reach(depth, weight, slope, trunc, reach):  # pragma: no cover - compi
 
 @numba.njit(cache=True)
 def _solve(a, r):  # pragma: no cover - compiled
-    """Solve a symmetric positive 4x4 system in place; a call of LAPACK would take seconds to compile."""
+    """Solve a symmetric positive definite 4x4 system in place; calling LAPACK would take seconds to compile."""
     for p in range(4):
         for q in range(p + 1, 4):
             f = a[q, p] / a[p, p]
@@ -232,9 +213,9 @@ def _solve(a, r):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, parallel=True)
 def _fit_blocks(distance, weight, out_fit, out_error):  # pragma: no cover - compiled
-    """Fit distance = g . x + c to the samples of each block that lie in the band; x in samples from the block's centre.
+    """Fit distance = g . x + c to the in-band samples of each block, x in samples from the block's centre.
 
-    out_error is the largest deviation; blocks with too few samples in the band to fit get -1.
+    out_fit is (g, c), out_error the largest deviation, -1 for blocks with too few samples.
     """
     side = distance.shape[1]
     half = 0.5 * (side - 1)
@@ -268,7 +249,7 @@ def _fit_blocks(distance, weight, out_fit, out_error):  # pragma: no cover - com
                     if weight[b, i, j, l] <= 0.0:
                         continue
                     e = fit[0] * (i - half) + fit[1] * (j - half) + fit[2] * (l - half) + fit[3]
-                    # Only which side it is on counts for a sample away from the surface.
+                    # Outside of the band only the sign counts.
                     worst = max(
                         worst, abs(min(_IN_BAND, max(-_IN_BAND, e)) - min(_IN_BAND, max(-_IN_BAND, d)))
                     )
@@ -279,7 +260,7 @@ def _fit_blocks(distance, weight, out_fit, out_error):  # pragma: no cover - com
 
 @numba.njit(cache=True, parallel=True)
 def _pixel_sizes(blocks, origin, edge, poses, k, shape, reach, out):  # pragma: no cover - compiled
-    """Per block the least size of a pixel on it, among the views that may see it; infinite where none does."""
+    """Fill per block the smallest pixel footprint among the views that may see it; infinite if none does."""
     radius = 0.5 * math.sqrt(3.0) * edge
     for b in numba.prange(blocks.shape[0]):
         center = origin + (blocks[b] + 0.5) * edge
@@ -294,7 +275,7 @@ def _pixel_sizes(blocks, origin, edge, poses, k, shape, reach, out):  # pragma: 
 
 @numba.njit(cache=True, inline="always")
 def _trilinear(d, w, x, y, z):  # pragma: no cover - compiled
-    """Interpolate samples (s, s, s) at sample coordinates, a little beyond too; the nearest where one is missing."""
+    """Interpolate samples (s, s, s) trilinearly, also slightly outside; the nearest one if any of eight is missing."""
     top = d.shape[0] - 2
     i, j, l = min(max(int(x), 0), top), min(max(int(y), 0), top), min(max(int(z), 0), top)
     u, v, t = x - i, y - j, z - l
@@ -313,7 +294,7 @@ def _trilinear(d, w, x, y, z):  # pragma: no cover - compiled
 def _spread(
     rows, flat, fit, distance, weight, views, out_distance, out_weight, out_views
 ):  # pragma: no cover - compiled
-    """Fill the voxels of blocks from their fitted plane where they are flat, else from the samples around."""
+    """Upsample coarse blocks to all voxels: from the fitted plane of flat blocks, else by interpolation."""
     side, coarse = out_distance.shape[1], weight.shape[1]
     ratio = side // coarse
     half = 0.5 * (coarse - 1)
@@ -327,11 +308,8 @@ def _spread(
                     z = (l + 0.5) / ratio - 0.5
                     if flat[b]:
                         d = (
-                            fit[b, 0] * (x - half)
-                            + fit[b, 1] * (y - half)
-                            + fit[b, 2] * (z - half)
-                            + fit[b, 3]
-                        )
+                            fit[b, 0] * (x - half) + fit[b, 1] * (y - half) + fit[b, 2] * (z - half) + fit[b, 3]
+                        )  # fmt: skip
                     else:
                         d = _trilinear(distance[b], weight[b], x, y, z)
                     out_distance[b, i, j, l] = min(1.0, max(-1.0, d))
@@ -343,18 +321,18 @@ def surface_blocks(
     views: FusionViews, world_from_camera: np.ndarray, origin: np.ndarray, shape: tuple[int, int, int],
     voxel_size: float, truncation: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return the blocks (m, 3) that the surface bands of at least one view touch, in a grid of `shape` blocks."""
+    """Return the blocks, int32 (m, 3), that the truncation band of any view touches, in a grid of `shape` blocks."""
     marks = np.zeros(shape, bool)
-    # Every second pixel is enough for blocks of eight voxels.
+    # Every second pixel suffices for blocks of eight voxels.
     _mark(
-        views.depth, views.weight, np.ascontiguousarray(world_from_camera), views.intrinsics, origin,
+        views.depth, views.weight, np.ascontiguousarray(world_from_camera), views.camera.intrinsics, origin,
         BLOCK * voxel_size, truncation, 2, marks,
     )  # fmt: skip
     return np.argwhere(marks).astype(np.int32)
 
 
 def tile_reach(views: FusionViews, truncation: float) -> np.ndarray:
-    """Return per view and tile of pixels the depth (n, th, tw) behind which nothing is said of space."""
+    """Return per view and tile, float32 (n, th, tw), the depth beyond which no pixel observes anything."""
     reach = np.zeros(views.tile_max.shape, np.float32)
     _tile_reach(views.depth, views.weight, views.slope, truncation, reach)
     return reach
@@ -364,41 +342,50 @@ def _sampled(
     views: FusionViews, reach: np.ndarray, blocks: np.ndarray, origin: np.ndarray, edge: float, truncation: float,
     side: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    cells = (len(blocks), side, side, side)
-    distance, weight, seen = (
-        np.zeros(cells, np.float32),
-        np.zeros(cells, np.float32),
-        np.zeros(cells, np.uint8),
-    )
+    """Return distance, weight and views (m, side, side, side) of blocks sampled at `side` voxels a side."""
+    distance, weight, seen = _empty_volume(len(blocks), side)
     _integrate(
-        blocks, origin, edge, truncation, views.camera_from_world, views.intrinsics, views.depth, views.weight,
+        blocks, origin, edge, truncation, views.camera_from_world, views.camera.intrinsics, views.depth, views.weight,
         views.slope, views.carve, reach, distance, weight, seen,
     )  # fmt: skip
     return distance, weight, seen
+
+
+def _empty_volume(blocks: int, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    cells = (blocks, side, side, side)
+    return np.zeros(cells, np.float32), np.zeros(cells, np.float32), np.zeros(cells, np.uint8)
 
 
 def integrate(
     views: FusionViews, reach: np.ndarray, blocks: np.ndarray, origin: np.ndarray, voxel_size: float,
     truncation: float, flat_error: float,
 ) -> BlockVolume:  # fmt: skip
-    """Fuse all views into the given blocks (m, 3).
+    """Fuse all views into the given blocks.
 
-    Every block is first sampled at every other voxel. That is enough where the samples lie on one plane within
-    `flat_error` metres, where no surface is near, and where no view is so close that its pixels are as small as a
-    voxel; only the rest is sampled at every voxel. On rooms that is a third.
+    Blocks are first sampled at every second voxel. That suffices if the samples are planar within `flat_error`, if no
+    surface is near, or if all pixel footprints exceed a voxel. The other blocks (a third in rooms) are sampled at every
+    voxel.
+
+    Args:
+        views: of `prepare_views`.
+        reach: of `tile_reach`.
+        blocks: int32 (m, 3).
+        origin: (3,) of block (0, 0, 0), world space, metres.
+        voxel_size: metres.
+        truncation: metres.
+        flat_error: metres.
     """
     origin, edge = np.asarray(origin, np.float64), BLOCK * voxel_size
     coarse, weight, seen = _sampled(views, reach, blocks, origin, edge, truncation, BLOCK // 2)
     fit, error, pixel = np.zeros((len(blocks), 4)), np.zeros(len(blocks)), np.zeros(len(blocks))
     _fit_blocks(coarse, weight, fit, error)
     shape = views.depth.shape[1:]
-    _pixel_sizes(blocks, origin, edge, views.camera_from_world, views.intrinsics, shape, reach, pixel)
+    _pixel_sizes(blocks, origin, edge, views.camera_from_world, views.camera.intrinsics, shape, reach, pixel)
     flat = (error >= 0) & (error * truncation <= flat_error)
-    # A voxel of an edge that the surface crosses is at most one voxel from it: farther off only the sign counts.
+    # Voxels of an edge that the surface crosses are within one voxel of it: farther off only the sign counts.
     away = ~((weight > 0) & (np.abs(coarse) < 1.4 * voxel_size / truncation)).any(axis=(1, 2, 3))
     simple = flat | away | (pixel > voxel_size)
-    cells = (len(blocks), BLOCK, BLOCK, BLOCK)
-    out = np.zeros(cells, np.float32), np.zeros(cells, np.float32), np.zeros(cells, np.uint8)
+    out = _empty_volume(len(blocks), BLOCK)
     _spread(np.flatnonzero(simple), flat, fit, coarse, weight, seen, *out)
     rough = np.flatnonzero(~simple)
     for into, fine in zip(out, _sampled(views, reach, blocks[rough], origin, edge, truncation, BLOCK)):

@@ -1,6 +1,6 @@
-"""Active viewpoint optimization: the cameras that show most of a thing, or of a region; docs/avo.md.
+"""Active viewpoint optimization: find the cameras that show most of an object or a region; see docs/avo.md.
 
-`import reconstruction.views` is light; what needs a compiler is imported when it is first used.
+Importing this package does not import Numba; modules with kernels are imported at first use.
 """
 
 from reconstruction.views.config import AVO_PRESETS, AvoConfig

@@ -1,4 +1,4 @@
-"""Upright cameras: looking at a point, stepping around it, and the square camera that views are taken with."""
+"""Poses of upright cameras (no roll): look-at, steps of the optimization, and the square camera of views."""
 
 import math
 
@@ -11,18 +11,18 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def square_camera(side_px: int, fov_deg: float) -> Camera:
-    """Return a square pinhole camera."""
+    """Return a pinhole camera with a square image and a field of view in degrees."""
     focal = 0.5 * side_px / math.tan(math.radians(0.5 * fov_deg))
     return Camera(side_px, side_px, focal, focal, 0.5 * side_px, 0.5 * side_px)
 
 
 def upright(forward: np.ndarray, max_pitch_deg: float, fallback: np.ndarray | None = None) -> np.ndarray:
-    """Return the rotation (3, 3) of a camera that looks along `forward` (3,), without roll.
+    """Return world_from_camera rotation (3, 3) of a camera that looks along `forward`, without roll.
 
     Args:
-        forward: any length; its pitch is limited.
-        max_pitch_deg: of a view up or down.
-        fallback: horizontal direction where `forward` is vertical.
+        forward: (3,) of any length, world space; its pitch is clamped.
+        max_pitch_deg: largest pitch up or down.
+        fallback: (3,) horizontal direction if `forward` is vertical.
     """
     forward = np.asarray(forward, np.float64)
     flat = forward[:2]
@@ -42,20 +42,18 @@ def upright(forward: np.ndarray, max_pitch_deg: float, fallback: np.ndarray | No
 
 
 def look_at(eye: np.ndarray, point: np.ndarray, max_pitch_deg: float) -> np.ndarray:
-    """Return the pose (4, 4) of an upright camera at `eye` (3,) that looks at `point` (3,)."""
+    """Return world_from_camera (4, 4) of an upright camera at `eye` (3,) that looks at `point` (3,)."""
     return rigid(upright(np.asarray(point) - np.asarray(eye), max_pitch_deg), np.asarray(eye, np.float64))
 
 
 def moved(pose: np.ndarray, step: np.ndarray, distance: float, max_pitch_deg: float) -> np.ndarray:
-    """Return the pose after a step in the coordinates of `step_gradient`; the camera stays upright.
-
-    Position and quaternion are what moves; the quaternion is brought back to one without roll.
+    """Return the pose after a step; roll is removed from the new quaternion.
 
     Args:
         pose: (4, 4) world_from_camera.
-        step: (5,) right and down around the point ahead (relative to `distance`), ahead (likewise), then turning right
-            and down (radians).
-        distance: of the point ahead, metres.
+        step: (5,) orbit right and down around the point ahead, and dolly ahead, all three relative to `distance`; then
+            pan right and tilt down (radians).
+        distance: to the point ahead, metres.
         max_pitch_deg: as in `upright`.
     """
     rotation = pose[:3, :3]
@@ -69,18 +67,10 @@ def moved(pose: np.ndarray, step: np.ndarray, distance: float, max_pitch_deg: fl
 
 
 def step_gradient(pose_gradient: np.ndarray, distance: float) -> np.ndarray:
-    """Carry the derivative by world_from_camera exp(xi) (6,) to the steps (5,) of `moved`.
+    """Transform the gradient (6,) by world_from_camera exp(xi) to that (5,) by the step of `moved`.
 
-    Moving sideways turns the camera so that the point ahead stays ahead: without it, a camera that looks along a step
-    loses its target.
+    Sideways steps also rotate the camera, so that the point ahead stays in the center of the view.
     """
-    moving, turning = pose_gradient[:3], pose_gradient[3:]
-    return np.array(
-        [
-            distance * moving[0] - turning[1],
-            distance * moving[1] + turning[0],
-            distance * moving[2],
-            turning[1],
-            -turning[0],
-        ]
-    )
+    (x, y, z), turning = pose_gradient[:3], pose_gradient[3:]
+    orbit = (distance * x - turning[1], distance * y + turning[0], distance * z)
+    return np.array([*orbit, turning[1], -turning[0]])

@@ -1,4 +1,4 @@
-"""Where a camera may be: how far a point lies inside the space that frames looked through."""
+"""Signed distance field of observed free space: how far a camera is from occupied or unobserved space."""
 
 from dataclasses import dataclass
 
@@ -6,27 +6,27 @@ import numpy as np
 
 from reconstruction.core.types import SpaceGrid
 
-_FREE = 1
-_MAX_CELLS = 3_000_000
-_BODY_M = 0.15  # whoever filmed held the camera there: that much around it is free
+_FREE = 1  # state of `SpaceGrid`
+_MAX_CELLS = 3_000_000  # of the distance field; larger grids are coarsened
+_BODY_M = 0.15  # radius around input cameras that is free, since somebody held them there
 
 
 @dataclass(frozen=True)
 class Clearance:
-    """Signed distance to the border of observed free space, on a grid: positive inside, in metres."""
+    """Signed distance to the border of observed free space on a grid, metres, positive inside."""
 
-    origin: np.ndarray  # float64 (3,) center of cell (0, 0, 0)
+    origin: np.ndarray  # float64 (3,) center of cell (0, 0, 0), world space
     cell_m: float
     distance: np.ndarray  # float32 (nx, ny, nz)
 
     def at(self, point: np.ndarray) -> float:
-        """Return the clearance of a point (3,)."""
+        """Return the clearance at a world point (3,), metres."""
         return self.with_gradient(point)[0]
 
     def with_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the clearance of a point (3,), interpolated, and its derivative (3,).
+        """Return the trilinearly interpolated clearance at a world point (3,) and its gradient (3,).
 
-        Outside the grid it is that of the nearest border cell, less the distance to it.
+        Outside of the grid it is the clearance at the nearest grid point minus the distance to it.
         """
         place = (np.asarray(point, np.float64) - self.origin) / self.cell_m
         top = np.array(self.distance.shape) - 1.0
@@ -39,13 +39,8 @@ class Clearance:
         wx, wy, wz = (np.array([1.0 - s, s]) for s in share)
         slope = np.array([-1.0, 1.0]) / self.cell_m
         value = float(np.einsum("ijk,i,j,k->", corner, wx, wy, wz))
-        gradient = np.array(
-            [
-                np.einsum("ijk,i,j,k->", corner, slope, wy, wz),
-                np.einsum("ijk,i,j,k->", corner, wx, slope, wz),
-                np.einsum("ijk,i,j,k->", corner, wx, wy, slope),
-            ]
-        )
+        weights = ((slope, wy, wz), (wx, slope, wz), (wx, wy, slope))
+        gradient = np.array([np.einsum("ijk,i,j,k->", corner, *axes) for axes in weights])
         away = float(np.linalg.norm(beyond))
         if away > 0.0:
             gradient[beyond != 0.0] = 0.0
@@ -54,13 +49,13 @@ class Clearance:
 
 
 def measure_clearance(space: SpaceGrid, cameras: np.ndarray) -> Clearance:
-    """Measure how far every point lies within the observed free space that the cameras moved in.
+    """Compute the signed distance field of the free space that is connected to the input cameras.
 
-    Free space that no way leads to from a camera is not counted: it lies behind a surface.
+    Other free components lie behind surfaces and do not count.
 
     Args:
         space: of the surface stage.
-        cameras: (n, 3) centers of the input cameras, in time order.
+        cameras: (n, 3) centers of the input cameras, world space.
     """
     from scipy import ndimage
 
@@ -71,31 +66,30 @@ def measure_clearance(space: SpaceGrid, cameras: np.ndarray) -> Clearance:
     cell = space.voxel_size_m * step
     origin = np.asarray(space.origin, np.float64) + 0.5 * cell
     free, origin = _with_bodies(free, origin, cell, cameras)
-    parts, _ = ndimage.label(free)
+    parts = np.asarray(ndimage.label(free)[0])  # pyright: ignore[reportIndexIssue]
     rows = np.round((cameras - origin) / cell).astype(int)
     reached = np.unique(parts[tuple(rows.T)])
     free = np.isin(parts, reached[reached > 0])
-    # Borders lie between cells: half a cell less than from center to center, on both sides.
-    inside = ndimage.distance_transform_edt(free).astype(np.float32)
-    outside = ndimage.distance_transform_edt(~free).astype(np.float32)
+    # The border lies half a cell nearer than the center of the next cell, on both sides.
+    inside = np.asarray(ndimage.distance_transform_edt(free), np.float32)
+    outside = np.asarray(ndimage.distance_transform_edt(~free), np.float32)
     distance = np.where(free, inside - 0.5, 0.5 - outside) * np.float32(cell)
     return Clearance(origin, cell, distance)
 
 
 def _coarser(free: np.ndarray, step: int) -> np.ndarray:
-    """Return cells of step^3 voxels that are free as a whole, with a border of cells that are not."""
-    if step > 1:
-        padding = [(0, -size % step) for size in free.shape]
-        free = np.pad(free, padding)
-        x, y, z = (size // step for size in free.shape)
-        free = free.reshape(x, step, y, step, z, step).all(axis=(1, 3, 5))
-    return free
+    """Return the mask of cells of step^3 voxels that are wholly free."""
+    if step == 1:
+        return free
+    free = np.pad(free, [(0, -size % step) for size in free.shape])
+    x, y, z = (size // step for size in free.shape)
+    return np.asarray(free.reshape(x, step, y, step, z, step).all(axis=(1, 3, 5)))
 
 
 def _with_bodies(
     free: np.ndarray, origin: np.ndarray, cell: float, cameras: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Free the places of the input cameras; the grid grows to hold them, and by a border that is not free."""
+    """Mark balls around the input cameras as free; the grid grows to hold them and a border that is not free."""
     radius = int(np.ceil(_BODY_M / cell))
     rows = np.round((cameras - origin) / cell).astype(int)
     below = np.maximum(radius + 1 - rows.min(axis=0), 1)

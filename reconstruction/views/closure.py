@@ -1,9 +1,8 @@
-"""The closed shape that a target probably has, and which of its surface a camera sees.
+"""Estimate the closed shape of a target, and which part of its surface a camera sees.
 
-Gaussians exist where frames saw surface. Of a half hidden thing the best views are those of the other half, of which
-there are none. So each thing is closed as cautiously as can be: the convex hull of what was seen and of its shadow on
-what it stands on, less what rays passed through. The hull of a bowl loses its hollow that way, that of a table
-the space between its legs.
+Gaussians exist only where frames saw surface, but views of unseen sides matter most. The closed shape of an object is a
+conservative guess of it: the convex hull of its seen surface and of that surface projected onto its lowest height,
+minus observed free space. Carving restores the hollow of a bowl and the space between the legs of a table.
 """
 
 from dataclasses import dataclass
@@ -15,65 +14,70 @@ from reconstruction.gaussians.threads import run_over
 from reconstruction.views.scene import Target, ViewScene
 from registry.geometry import matrix_from_quat
 
-_FREE, _SURFACE = 1, 2
-_CELLS, _LEAST_CELL_M = 28, 0.006  # along the longest side
-_OPAQUE = 0.3
-_LEAST_POINTS = 20
-_STRAYS = (0.5, 99.5)  # percentiles
-_SMOOTH = 1.2  # cells
-_LEAST_SIDE = 0.05  # of a cell's side, however steep to the shape it is
-_OWN_CELLS = 2  # cells of the surface so near to the target's are its own, where nothing else has Gaussians
-_NEAR_M, _NEAR_SHARE = 0.12, 0.4  # around the target's box; of a cell of the scene's grid
-_MOST_RINGS = 6  # of points on a disk
-_STANDS_M = 0.01  # what lies lower than this above the bottom carries the target: no camera is below it
+_FREE, _SURFACE = 1, 2  # states of `SpaceGrid`
+_CELLS, _LEAST_CELL_M = 28, 0.006  # cells along the longest side of the target; smallest cell
+_OPAQUE = 0.3  # opacity from which a Gaussian is surface
+_LEAST_POINTS = 20  # surface vertices of an object; with fewer its Gaussians are used
+_OUTLIERS = (0.5, 99.5)  # percentiles outside of which points are dropped
+_SMOOTH = 1.2  # standard deviation of the smoothing for normals, in cells
+_LEAST_SIDE = 0.05  # smallest area of a cell side, relative to that of a side parallel to the surface
+_OWN_CELLS = 2  # surface cells this near to the target are its own if nothing else has Gaussians there
+_NEAR_M, _NEAR_SHARE = (
+    0.12,
+    0.4,
+)  # margin of the fine grid around the target; its cell relative to the scene's grid
+_MOST_RINGS = 6  # of sample points on a disk
+_STANDS_M = 0.01  # surface lower than this above the target's bottom supports it and does not occlude
 
 
 @dataclass(frozen=True)
 class ClosedShape:
-    """Cells that the target probably fills, and points on their border."""
+    """The estimated solid of a target, the occluders around it, and sample points on its surface; world space."""
 
-    solid: np.ndarray  # bool (nx, ny, nz)
+    solid: np.ndarray  # bool (nx, ny, nz) cells of the target
     origin: np.ndarray  # float64 (3,) corner of cell (0, 0, 0)
     cell_m: float
-    near: np.ndarray  # bool, finer cells around the target in which anything else is
-    near_origin: np.ndarray  # float64 (3,)
+    near: np.ndarray  # bool (ax, ay, az) fine grid of occluders near the target
+    near_origin: np.ndarray  # float64 (3,) corner of its cell (0, 0, 0)
     near_cell_m: float
-    occupied: np.ndarray  # bool, cells of the scene's grid in which anything else is
-    space_origin: np.ndarray  # float64 (3,)
+    occupied: np.ndarray  # bool (bx, by, bz) occluders in the scene's occupancy grid
+    space_origin: np.ndarray  # float64 (3,) corner of its cell (0, 0, 0)
     space_cell_m: float
-    points: np.ndarray  # float64 (n, 3), one on every free side of a cell
-    sides: np.ndarray  # float64 (n, 3) to where the cell ends
-    normals: np.ndarray  # float64 (n, 3) of the shape
-    areas: np.ndarray  # float64 (n,) shares of the surface
+    points: np.ndarray  # float64 (n, 3) center of each exposed side of a solid cell
+    sides: np.ndarray  # float64 (n, 3) outward axis direction of the side
+    normals: np.ndarray  # float64 (n, 3) smooth surface normal
+    areas: np.ndarray  # float64 (n,) share of the surface, sum 1
 
     def seen(self, poses: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return how well cameras at these poses (k, 4, 4) see the points, float32 (k, n).
+        """Return the visibility of the points from world_from_camera poses (k, 4, 4), float32 (k, n).
 
-        0 where they do not see them; 1 where they look at them squarely, or up to 60 degrees askew.
+        0 if occluded or out of view; 1 up to 60 degrees from the normal, less beyond.
         """
+        from reconstruction.views.line_of_sight import see_points
+
         out = np.zeros((len(poses), len(self.points)), np.float32)
         run_over(
-            len(poses), _kernel(), np.ascontiguousarray(poses[:, :3, 3]), self.points, self.sides, self.normals,
+            len(poses), see_points, np.ascontiguousarray(poses[:, :3, 3]), self.points, self.sides, self.normals,
             self.solid, self.origin, self.cell_m, self.near, self.near_origin, self.near_cell_m, self.occupied,
             self.space_origin, self.space_cell_m, out,
         )  # fmt: skip
         for row, pose in zip(out, poses):
-            x, y, z = ((self.points - pose[:3, 3]) @ pose[:3, :3]).T
-            z = np.maximum(z, 1e-6)
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            row *= (z > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+            local = (self.points - pose[:3, 3]) @ pose[:3, :3]
+            local[:, 2] = np.maximum(local[:, 2], 1e-6)
+            u, v = camera.project(local)
+            row *= (local[:, 2] > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         return out
 
 
 def close_shape(scene: ViewScene, target: Target) -> ClosedShape:
-    """Return the closed shape of a target; each thing of a region is closed for itself."""
+    """Estimate the closed shape of a target; each object of a region is closed separately."""
     clouds = [cloud for number in target.ids if len(cloud := _cloud(scene, target, number))]
     every = np.concatenate(clouds)
     low, high = every.min(axis=0), every.max(axis=0)
     cell = max(float((high - low).max()) / _CELLS, _LEAST_CELL_M)
     origin = low - 1.5 * cell
     shape = np.ceil((high - origin) / cell).astype(int) + 2
-    centers = origin + (np.stack(np.indices(shape), axis=-1).reshape(-1, 3) + 0.5) * cell
+    centers = origin + (np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3) + 0.5) * cell
     inside = np.zeros(len(centers), bool)
     for cloud in clouds:
         inside |= _in_hull(cloud, centers, 0.25 * cell)
@@ -88,14 +92,8 @@ def close_shape(scene: ViewScene, target: Target) -> ClosedShape:
     )  # fmt: skip
 
 
-def _kernel():
-    from reconstruction.views.line_of_sight import see_points
-
-    return see_points
-
-
 def _cloud(scene: ViewScene, target: Target, number: int) -> np.ndarray:
-    """Return the surface (n, 3) of one thing, without strays; its Gaussians that can be seen, where it has none."""
+    """Return the surface points (n, 3) of one object without outliers; its opaque Gaussians if it has no surface."""
     points = scene.points[scene.point_instance == number]
     if len(points) < _LEAST_POINTS:
         packed = scene.packed[target.rows[scene.instance[target.rows] == number]].astype(np.float64)
@@ -103,25 +101,25 @@ def _cloud(scene: ViewScene, target: Target, number: int) -> np.ndarray:
         points = packed[opaque if opaque.sum() > 3 else slice(None), :3]
     if not len(points):
         return points
-    low, high = np.percentile(points, _STRAYS, axis=0)
+    low, high = np.percentile(points, _OUTLIERS, axis=0)
     near = ((points >= low - 0.01) & (points <= high + 0.01)).all(axis=1)
     return points[near] if near.any() else points
 
 
 def _opaque(packed: np.ndarray) -> np.ndarray:
-    """Tell which Gaussians stop enough light to be surface."""
+    """Return the mask (n,) of packed Gaussians (n, 13) that are opaque enough to be surface."""
     return 1.0 / (1.0 + np.exp(-packed[:, 9])) > _OPAQUE
 
 
 def _in_hull(cloud: np.ndarray, centers: np.ndarray, slack: float) -> np.ndarray:
-    """Tell which centers (k, 3) lie in the hull of a cloud and of its shadow on its lowest height."""
+    """Return the mask of centers (k, 3) in the convex hull of a cloud and its projection onto its lowest height."""
     from scipy.spatial import ConvexHull, QhullError
 
     shadow = np.column_stack([cloud[:, :2], np.full(len(cloud), cloud[:, 2].min())])
     try:
         hull = ConvexHull(np.concatenate([cloud, shadow]))
     except (QhullError, ValueError):
-        return np.zeros(len(centers), bool)  # flat or a few points: nothing to fill
+        return np.zeros(len(centers), bool)  # degenerate: flat, or too few points
     inside = np.ones(len(centers), bool)
     for plane in np.unique(np.round(hull.equations, 6), axis=0):
         inside &= centers @ plane[:3] + plane[3] < slack
@@ -131,10 +129,11 @@ def _in_hull(cloud: np.ndarray, centers: np.ndarray, slack: float) -> np.ndarray
 def _border(
     solid: np.ndarray, origin: np.ndarray, cell: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the middle of every free side of a solid cell, its direction, the shape's normal there, and its share."""
+    """Return points, sides, normals and areas of `ClosedShape`, one per exposed side of a solid cell."""
     from scipy import ndimage
 
-    slope = np.stack(np.gradient(ndimage.gaussian_filter(solid.astype(np.float32), _SMOOTH)), axis=-1)
+    smooth = ndimage.gaussian_filter(solid.astype(np.float32), _SMOOTH)
+    slope = np.moveaxis(np.asarray(np.gradient(smooth)), 0, -1)
     points, sides, normals = [], [], []
     for axis in range(3):
         for way in (1, -1):
@@ -146,7 +145,7 @@ def _border(
             normals.append(-slope[tuple(cells.T)])
     side, normal = np.concatenate(sides), np.concatenate(normals).astype(np.float64)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    # A slope is made of steps, whose sides together are larger than it is. A sheet of one cell has no slope.
+    # The sides of a staircase are larger than the slope: scale them by the cosine. Sheets of one cell have no gradient.
     along = (side * normal).sum(axis=1)
     normal = np.where((along > _LEAST_SIDE)[:, None], normal, side)
     area = np.maximum(along, _LEAST_SIDE)
@@ -156,10 +155,10 @@ def _border(
 def _occupied_near(
     scene: ViewScene, target: Target, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the fine cells around the target's box in which anything but it is, their corner and their size.
+    """Return the fine occluder grid around the target's box, its corner and its cell size.
 
-    The scene's grid closes the gaps between things that stand close together. A Gaussian is the disk of its first
-    standard deviation; what lies below the target carries it.
+    The scene's grid would close gaps between objects that stand close together. A Gaussian occupies the disk of its
+    first standard deviation. Cells below the target are empty.
     """
     cell = _NEAR_SHARE * float(scene.space.voxel_size_m)
     origin = low - _NEAR_M
@@ -188,7 +187,7 @@ def _occupied_near(
 
 
 def _occupied(scene: ViewScene, target: Target, cloud: np.ndarray) -> np.ndarray:
-    """Return the cells of the scene's grid with surface of anything but the target and what carries it."""
+    """Return the occluders in the scene's grid: surface cells except the target and what supports it."""
     space = scene.space
     out = space.state == _SURFACE
     shape = np.array(out.shape)
@@ -210,7 +209,7 @@ def _occupied(scene: ViewScene, target: Target, cloud: np.ndarray) -> np.ndarray
 
 
 def _grown(cells: np.ndarray, by: int) -> np.ndarray:
-    """Return marked cells (nx, ny, nz) and all that are at most `by` cells from one along every axis."""
+    """Dilate a mask (nx, ny, nz) by `by` cells along every axis."""
     from scipy import ndimage
 
     out = cells.copy()

@@ -1,4 +1,4 @@
-"""What views have shown of a target so far: of its Gaussians, and of the closed shape that it probably has."""
+"""Bookkeeping of what views have shown of a target: of its Gaussians, and of its closed shape."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -6,18 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-LEAST_PX = 0.05  # of a Gaussian; less is never a good view of it
-_SEEN_AT, _CLEAR_SHARE = 0.1, 0.2
-_CLOSED = 0.4  # of what is left to see is the closed shape's, the rest the Gaussians'
-_REVISIONS, _LEAST_REVISION = 2, 1e-4
+LEAST_PX = 0.05  # smallest contribution of a Gaussian, in pixels, that counts as a view of it
+_SEEN_AT = 0.1  # share of its largest contribution at which a Gaussian counts as seen
+_CLEAR_SHARE = 0.2  # share of a Gaussian's weight that decays only with its full contribution
+_CLOSED = 0.4  # weight of the closed shape; the rest is that of the Gaussians
+_REVISIONS, _LEAST_REVISION = 2, 1e-4  # passes over the chosen views; smallest improvement of an exchange
 
 
 class Coverage:
-    """What is left of the target's effective opacities: alpha_i decays by what each view shows of it.
+    """Remaining effective opacities of the target's Gaussians, which decay with each view that shows them.
 
-    A Gaussian has a front, which frames saw, and a back, which shows through sides that no frame saw: it stands for
-    what is there, with less weight. What a view shows of a side is its rendered contribution beside the most that any
-    start shows of it. A tenth of that counts as seen; a fifth of the weight waits for a view as good as the best.
+    Each Gaussian has a front, which frames saw, and a back with less weight, which shows through unseen sides. A view
+    shows a side by its rendered contribution relative to the largest contribution at any start. A tenth of it counts as
+    seen; a fifth of the weight remains until a view is as good as the best.
     """
 
     def __init__(self, opacities: np.ndarray, most: np.ndarray, back_weight: float) -> None:
@@ -25,9 +26,9 @@ class Coverage:
 
         Args:
             opacities: (m,) of the target's Gaussians.
-            most: (2, m) the largest contributions of their fronts and backs, sums over pixels of alpha T; what cannot
-                be seen does not count.
-            back_weight: of backs beside fronts.
+            most: (2, m) largest contributions of fronts and backs, sums over pixels of alpha T; sides below LEAST_PX do
+                not count.
+            back_weight: weight of backs relative to fronts.
         """
         sides = np.where(most > LEAST_PX, np.array([[1.0], [back_weight]]), 0.0)
         self._opacities = np.asarray(opacities, np.float64) * sides
@@ -37,86 +38,86 @@ class Coverage:
 
     @property
     def left(self) -> np.ndarray:
-        """What is left of each side (2, m), as a share of its own."""
+        """Remaining share (2, m) of each side."""
         return (1.0 - _CLEAR_SHARE) * self._unseen + _CLEAR_SHARE * self._unclear
 
     @property
     def worth(self) -> np.ndarray:
-        """What is left of the effective opacity of each side (2, m), as a share of a front's."""
+        """Remaining share (2, m) of each side, times the weight of the side."""
         return self._sides * self.left
 
     @property
     def remaining(self) -> float:
-        """Share of the opacity that is left."""
+        """Remaining share of the target's total opacity."""
         return float((self._opacities * self.left).sum()) / self._total
 
     def gain(self, contributions: np.ndarray) -> float:
-        """Return the share of the opacity that a view with these contributions (2, m) shows anew."""
+        """Return the share of the total opacity that a view with these contributions (2, m) newly shows."""
         return self.remaining - self.after(contributions).remaining
 
     def after(self, contributions: np.ndarray) -> "Coverage":
-        """Return what is left after a view with these contributions (2, m)."""
+        """Return the coverage after a view with these contributions (2, m)."""
         out = copy(self)
         unseen, unclear = self.decays(contributions)
         out._unseen, out._unclear = self._unseen * unseen, self._unclear * unclear
         return out
 
     def decays(self, contributions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what views with these contributions (..., 2, m) leave unseen of each side, and unclear."""
+        """Return the factors (..., 2, m) on the unseen and the unclear share after views with these contributions."""
         share = contributions / self._most
         return 1.0 - np.clip(share / _SEEN_AT, 0.0, 1.0), 1.0 - np.clip(share, 0.0, 1.0)
 
     @property
     def shares(self) -> np.ndarray:
-        """What each side (2, m) is of the opacity."""
+        """Share (2, m) of each side in the total opacity."""
         return self._opacities / self._total
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """What is left to see of a target: of its Gaussians, and of the surface of its closed shape.
+    """The unseen part of a target: of its Gaussians, and of the surface of its closed shape.
 
-    Gaussians tell how well a view shows what is there, but most of what no frame saw has none. What no start sees does
-    not count.
+    Gaussians measure how well a view shows seen surface; the closed shape stands for surface that no frame saw. Points
+    that no start sees do not count.
     """
 
     coverage: Coverage
-    points: np.ndarray  # float64 (n,) shares of the closed shape's surface that are left
+    points: np.ndarray  # float64 (n,) remaining shares of the closed shape's surface
 
     @classmethod
     def of(cls, coverage: Coverage, areas: np.ndarray, sights: np.ndarray) -> "Unseen":
-        """Return what is left before the first view.
+        """Return the state before the first view.
 
         Args:
-            coverage: Of the Gaussians.
+            coverage: of the Gaussians.
             areas: (n,) of the closed shape's points.
-            sights: (k, n) how well every start sees them, in [0, 1].
+            sights: (k, n) visibility of the points from every start, in [0, 1].
         """
         points = areas * (sights > 0.0).any(axis=0)
         return cls(coverage, points / max(float(points.sum()), 1e-12))
 
     @property
     def remaining(self) -> float:
-        """Share that is left."""
+        """Remaining share of the target."""
         return (1.0 - _CLOSED) * self.coverage.remaining + _CLOSED * float(self.points.sum())
 
     def gain(self, contributions: np.ndarray, sight: np.ndarray) -> float:
-        """Return the share that a view with these contributions (2, m) and these sights (n,) shows anew."""
+        """Return the share that a view with contributions (2, m) and visibilities (n,) newly shows."""
         return self.remaining - self.after(contributions, sight).remaining
 
     def worth_of(self, shown: np.ndarray, sights: np.ndarray) -> np.ndarray:
-        """Return what each of some views (k,) shows anew, beside the most that any of them does."""
+        """Return the normalized gain (k,) of views with contributions (k, 2, m) and visibilities (k, n)."""
         gains = np.array([self.coverage.gain(contributions) for contributions in shown])
         closed = np.einsum("kn,n->k", sights, self.points)
         return (1.0 - _CLOSED) * gains / max(gains.max(), 1e-9) + _CLOSED * closed / max(closed.max(), 1e-9)
 
     def revised(self, chosen: Sequence[int], shown: np.ndarray, sights: np.ndarray) -> list[int]:
-        """Return views that leave less to see together: one after the other is changed for the best beside the rest.
+        """Improve greedily chosen views by exchange: replace each in turn by the best candidate given the others.
 
         Args:
-            chosen: rows of the views that were found one by one.
-            shown: (k, 2, m) contributions of all that could be chosen.
-            sights: (k, n) of the closed shape's points, alike.
+            chosen: rows of the chosen views.
+            shown: (k, 2, m) contributions of all candidates.
+            sights: (k, n) visibilities of the closed shape's points from all candidates.
         """
         out = list(chosen)
         unseen, unclear = self.coverage.decays(shown)
@@ -137,5 +138,5 @@ class Unseen:
         return out
 
     def after(self, contributions: np.ndarray, sight: np.ndarray) -> "Unseen":
-        """Return what is left after a view."""
+        """Return the state after a view with contributions (2, m) and visibilities (n,)."""
         return replace(self, coverage=self.coverage.after(contributions), points=self.points * (1.0 - sight))

@@ -1,25 +1,23 @@
-"""Views of many targets of one scene."""
+"""Choose and draw views of the targets of a scene."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import dataclass, replace
 
 from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.views.config import AvoConfig
 from reconstruction.views.inpainting import load_inpainter
 from reconstruction.views.pictures import View, draw_view
-from reconstruction.views.scene import ViewScene, make_target
+from reconstruction.views.scene import ViewScene, ids_of, make_target
 from reconstruction.views.strategies import load_strategy
 
 
 @dataclass(frozen=True)
 class TargetViews:
-    """The views of one target, the most informative first; none where nothing of it can be seen."""
+    """The views of one target, the most informative first; empty if it cannot be seen."""
 
     ids: tuple[int, ...]
     views: tuple[View, ...]
-    distance_m: float  # d_target, 0 where nothing belongs to the target
+    distance_m: float  # target distance d, 0 if no Gaussian belongs to the target
 
 
 def find_views(
@@ -33,14 +31,13 @@ def find_views(
 
     Args:
         scene: of `prepare_scene`, shared by all targets.
-        targets: an instance id each, or the ids of a region, such as (7, 12, 15): the information of all of them
-            counts together, one target distance shows them all, and `View.mask` is where any of them is seen. One view
-            of a region: `config` with `views=1`.
-        config: how; the strategy is part of it.
-        progress: told of targets, and of those that cannot be seen.
+        targets: each an instance id, or the ids of a region, such as (7, 12, 15), whose objects are viewed as one. For
+            a single view of a region use `config` with `views=1`.
+        config: settings, including the strategy.
+        progress: receives targets, and those that cannot be seen.
 
     Returns:
-        One entry a target, in their order; a target gets the same views alone and among others.
+        One entry per target, in their order; it does not depend on the other targets.
 
     Raises:
         UsageError: an unknown strategy or inpainter.
@@ -52,31 +49,19 @@ def find_views(
     for ids in wanted:
         target = make_target(scene, ids, config)
         if target is None:
-            named = (int(ids),) if np.isscalar(ids) else tuple(sorted({int(i) for i in ids}))
-            progress.note(f"No Gaussian belongs to {_named(named)}: no views of it.")
+            named = ids_of(ids)
+            progress.note(f"views: no Gaussian belongs to {_named(named)}; it gets no views")
             out.append(TargetViews(named, (), 0.0))
             progress.advance()
             continue
         views = []
         for point in strategy.choose(scene, target, config):
             scale = config.picture_side_px / max(point.camera.width, point.camera.height)
-            camera = point.camera.resized(
-                round(point.camera.width * scale), round(point.camera.height * scale)
-            )
-            views.append(
-                draw_view(
-                    scene,
-                    target,
-                    camera,
-                    point.world_from_camera,
-                    point.origin,
-                    point.gain,
-                    point.fronts,
-                    inpainter,
-                )
-            )
+            width, height = round(point.camera.width * scale), round(point.camera.height * scale)
+            point = replace(point, camera=point.camera.resized(width, height))
+            views.append(draw_view(scene, target, point, inpainter))
         if not views:
-            progress.note(f"{_named(target.ids)} can be seen from nowhere in free space: no views of it.")
+            progress.note(f"views: {_named(target.ids)} cannot be seen from free space; it gets no views")
         out.append(TargetViews(target.ids, tuple(views), target.distance_m))
         progress.advance()
     return out

@@ -1,4 +1,4 @@
-"""Where the search for a view may begin: at the input cameras, and at places around the target in free space."""
+"""Start poses of the viewpoint search: input cameras, and positions around the target in free space."""
 
 import math
 
@@ -9,33 +9,36 @@ from reconstruction.views.cameras import look_at, square_camera
 from reconstruction.views.config import AvoConfig
 from reconstruction.views.scene import Target, ViewScene
 
-_ZOOM, _WIDEST = 1.1, 0.8  # of the target's sphere; sine of half a field of view
-_AZIMUTHS, _PITCHES_DEG = 12, (6.0, 25.0, 45.0, 65.0)
+_ZOOM, _WIDEST = (
+    1.1,
+    0.8,
+)  # radius in view relative to the target's sphere; largest sine of half the field of view
+_AZIMUTHS, _PITCHES_DEG = 12, (6.0, 25.0, 45.0, 65.0)  # directions from the target to the camera
 _LOW_PITCHES_DEG = (-4.0, -10.0)
-_SHARES = (1.0, 1.2, 0.8, 0.62, 0.48)  # of the target distance, tried until a place is free
+_SHARES = (1.0, 1.2, 0.8, 0.62, 0.48)  # of the target distance, tried in this order until a position is free
 
 
 def input_starts(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
-    """Return the input cameras (n, 4, 4), turned so that they look at the target, upright."""
+    """Return world_from_camera (n, 4, 4) at the input cameras, upright and looking at the target."""
     return np.stack([look_at(p[:3, 3], target.center, config.max_pitch_deg) for p in scene.inputs])
 
 
 def zoomed_camera(pose: np.ndarray, target: Target, side_px: int) -> Camera:
-    """Return the camera at a pose (4, 4) that looks at the target and holds all of it."""
+    """Return a square camera whose field of view holds the target from a pose (4, 4) that looks at it."""
     away = max(float(np.linalg.norm(pose[:3, 3] - target.center)), 1e-6)
     half = math.asin(min(_ZOOM * target.radius_m / away, _WIDEST))
     return square_camera(side_px, 2.0 * math.degrees(half))
 
 
 def starts_around(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
-    """Return cameras (n, 4, 4) around the target that stand in free space, as near the target distance as can be."""
+    """Return poses (n, 4, 4) around the target in free space, near the target distance."""
     return _around(scene, target, config, _PITCHES_DEG, -math.inf)
 
 
 def starts_below(scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
-    """Return cameras (n, 4, 4) alike that look up from beside the lower half of the target, never from below its foot.
+    """Return poses (n, 4, 4) that look slightly up from beside the target, not from below its lowest Gaussian.
 
-    What stands on legs has an underside, much of which is seen from there.
+    They see the underside of objects on legs.
     """
     foot = float(scene.packed[target.rows, 2].min())
     return _around(scene, target, config, _LOW_PITCHES_DEG, foot)
@@ -48,9 +51,8 @@ def _around(
     for pitch in map(math.radians, pitches_deg):
         for number in range(_AZIMUTHS):
             angle = 2.0 * math.pi * number / _AZIMUTHS
-            away = np.array(
-                [math.cos(pitch) * math.cos(angle), math.cos(pitch) * math.sin(angle), math.sin(pitch)]
-            )
+            flat = math.cos(pitch)
+            away = np.array([flat * math.cos(angle), flat * math.sin(angle), math.sin(pitch)])
             for share in _SHARES:
                 eye = target.center + share * (target.distance_m + target.radius_m) * away
                 if eye[2] >= lowest and scene.clearance.at(eye) >= config.clearance_m:

@@ -1,34 +1,36 @@
-"""Filling what no Gaussian covers: the seam for inpainters, and OpenCV's two."""
+"""Inpainting of pixels that no Gaussian covers: the interface, and two methods of OpenCV."""
 
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from registry.errors import UsageError
+from reconstruction.core.plugins import load_plugin
+from reconstruction.views.config import AvoConfig
 
 
 class Inpainter(Protocol):
     """Fills holes in a picture."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Value of `AvoConfig.inpainting`."""
+        ...
 
     def inpaint(self, picture: np.ndarray, holes: np.ndarray) -> np.ndarray:
-        """Return the picture, uint8 (h, w, 3) RGB, with what lies under `holes`, bool (h, w), made up.
-
-        Pixels outside the holes stay as they are.
-        """
+        """Return the picture, uint8 (h, w, 3) RGB, with the pixels of `holes`, bool (h, w), filled."""
+        ...
 
 
 @dataclass(frozen=True)
 class OpenCvInpainter:
-    """Diffusion from the border of the holes: good for thin ones, a blur in wide ones."""
+    """Diffusion from the border of holes (Telea 2004, or Navier-Stokes): good for thin holes, blurry in wide ones."""
 
     name: str
     radius_px: float = 3.0
 
     def inpaint(self, picture: np.ndarray, holes: np.ndarray) -> np.ndarray:
-        """See `Inpainter.inpaint`; a picture that is nothing but hole stays as it is."""
+        """See `Inpainter.inpaint`; a picture without any known pixel is returned unchanged."""
         import cv2
 
         if not holes.any() or holes.all():
@@ -42,11 +44,9 @@ INPAINTERS: dict[str, Inpainter] = {name: OpenCvInpainter(name) for name in ("te
 
 
 def load_inpainter(name: str) -> Inpainter:
-    """Return an inpainter by name; to add one, put it into INPAINTERS.
+    """Return an inpainter by name.
 
     Raises:
         UsageError: there is no such inpainter.
     """
-    if name not in INPAINTERS:
-        raise UsageError(f"views: no inpainter {name!r}; there are {', '.join(INPAINTERS)}")
-    return INPAINTERS[name]
+    return INPAINTERS[name] if name in INPAINTERS else load_plugin("avo.inpainting", name, AvoConfig)()

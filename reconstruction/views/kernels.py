@@ -1,11 +1,11 @@
-"""Compiled kernels of the viewpoint objective: cull, blend the target behind its occluders, and differentiate by pose.
+"""Compiled kernels of the viewpoint objective: culling, blending of the target behind its occluders, and gradients.
 
-They extend `gaussians.kernels` (projection, sorting, tiles) by what a viewpoint needs and drop what it does not: no
-colors, no normals, no derivatives by the Gaussians. Every Gaussian stops light; only those of the target are summed,
-once plainly (what of the target is seen, and at what depth) and once by their weight (what seeing it is still worth).
+They share projection, sorting and tiles with `gaussians.kernels`, and omit colors, normals and derivatives by the
+Gaussians. All Gaussians absorb light. Only those of the target are summed: unweighted, weighted by their remaining
+worth, and times depth.
 
-Unlike there, a splat fades to nothing at its edge, alpha = o (f - f_edge) / (1 - f_edge), and its depth is within a
-tenth of its center's: both are continuous in the pose, so that the derivative is that of what is computed.
+Unlike there, a splat fades to zero at its edge, alpha = o (f - f_edge) / (1 - f_edge), and its depth stays within a
+tenth of its center's. Both are continuous in the pose, so the gradient is that of the computed value.
 """
 
 import math
@@ -30,27 +30,20 @@ from reconstruction.gaussians.kernels import (
     ZC,
 )
 
-# Planes of the blended image: sums of alpha T over the target's splats, plain, times weight, times depth.
+# Planes of the blended image: sums over the target's splats of alpha T, of alpha T worth, and of alpha T depth.
 SEEN, WORTH, DEPTH = 0, 1, 2
 N_PLANES = 3
-N_GRADIENTS = 9  # of a splat: by XC .. WY
+N_GRADIENTS = 9  # derivatives of a splat: by XC .. WY
 
 
 @numba.njit(cache=True, nogil=True)
 def mark_near_view(
     start, stop, means, radii, rotation, translation, intrinsics, window, far, near, marked
 ):  # pragma: no cover - compiled
-    """Mark spheres that may touch what lies between the camera and depth `far` within a window of the picture.
+    """Mark the spheres start..stop that may meet the frustum of a window between depths `near` and `far`.
 
-    Args:
-        start: First sphere; stop alike.
-        means: (n, 3) centers in world space; radii (n,).
-        rotation: (3, 3) camera_from_world; translation (3,) alike.
-        intrinsics: fx, fy, cx, cy.
-        window: x0, y0, x1, y1 in pixels.
-        far: Depth.
-        near: Depth.
-        marked: uint8 (n,) filled.
+    means (n, 3) and radii (n,) are in world space, rotation (3, 3) and translation (3,) are camera_from_world, window
+    is x0, y0, x1, y1 in pixels; marked is uint8 (n,).
     """
     left, right = (window[0] - intrinsics[2]) / intrinsics[0], (window[2] - intrinsics[2]) / intrinsics[0]
     top, bottom = (window[1] - intrinsics[3]) / intrinsics[1], (window[3] - intrinsics[3]) / intrinsics[1]
@@ -73,7 +66,7 @@ def mark_near_view(
 
 @numba.njit(cache=True)
 def last_of_target(tile_start, entries, own):  # pragma: no cover - compiled
-    """Return where each tile may stop (t,): behind its last entry of the target, as nothing behind it counts."""
+    """Return per tile, int64 (t,), the end of its entries after the last one of the target: later ones do not count."""
     ends = np.empty(len(tile_start) - 1, np.int64)
     for t in range(len(ends)):
         end = tile_start[t + 1]
@@ -85,34 +78,15 @@ def last_of_target(tile_start, entries, own):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True)
 def blend_target(
-    start,
-    stop,
-    splats,
-    boxes,
-    own,
-    worth,
-    tile_start,
-    tile_end,
-    entries,
-    tiles_x,
-    scalars,
-    image,
-    contributions,
-):  # pragma: no cover - compiled
-    """Sum the target's share of every pixel of the tiles start..stop, through everything that lies before it.
+    start, stop, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions
+):  # fmt: skip  # pragma: no cover - compiled
+    """Blend the target behind its occluders in the tiles start..stop.
 
-    Args:
-        start: First tile; stop alike.
-        splats: (k, 17) near to far; boxes (k, 4) alike.
-        own: (k,) 1 where a splat is of the target, else 0.
-        worth: (k,) weight of each splat in the objective, 0 where it is not of the target.
-        tile_start: Of `bin_to_tiles`; entries alike.
-        tile_end: Of `last_of_target`.
-        tiles_x: Tiles in a row.
-        scalars: (2,) largest alpha, transmittance at which a pixel is finished.
-        image: (h, w, 3) filled, planes SEEN, WORTH, DEPTH.
-        contributions: (e, 1) filled: sum over the tile's pixels of alpha T of every entry.
-    """  # fmt: skip
+    Splats (k, 17) and boxes (k, 4) are near to far; tile_start and entries are of `bin_to_tiles`, tile_end of
+    `last_of_target`. own (k,) is 1 for splats of the target, else 0; worth (k,) is their weight in the objective, else
+    0. scalars (2,) are the largest alpha and the transmittance at which a pixel is finished. Fills image (h, w, 3),
+    planes SEEN, WORTH, DEPTH, and contributions (e, 1), the sum over the tile's pixels of alpha T of each entry.
+    """
     for tile in range(start, stop):
         _blend_tile(
             tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions
@@ -123,6 +97,7 @@ def blend_target(
 def _blend_tile(
     tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions
 ):  # fmt: skip  # pragma: no cover - compiled
+    """Blend one tile; the inner loop has no branches, so that it is vectorized."""
     height, width = image.shape[0], image.shape[1]
     alpha_max, stop = scalars[0], scalars[1]
     zero = alpha_max - alpha_max
@@ -176,31 +151,14 @@ def _blend_tile(
 
 @numba.njit(cache=True, nogil=True)
 def blend_target_backward(
-    start,
-    stop,
-    splats,
-    boxes,
-    own,
-    worth,
-    tile_start,
-    tile_end,
-    entries,
-    tiles_x,
-    scalars,
-    image,
-    contributions,
-    image_gradients,
-    entry_gradients,
-):  # pragma: no cover - compiled
-    """Differentiate `blend_target`: front to back again, with what lies behind as total minus prefix.
+    start, stop, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions,
+    image_gradients, entry_gradients,
+):  # fmt: skip  # pragma: no cover - compiled
+    """Differentiate `blend_target` front to back; sums over the splats behind are total minus prefix.
 
-    Args:
-        start: As for `blend_target`, up to scalars.
-        image: (h, w, 3) of `blend_target`.
-        contributions: (e, 1) of `blend_target`: entries that stop no light have no derivative.
-        image_gradients: (h, w, 3).
-        entry_gradients: (e, 9) filled.
-    """  # fmt: skip
+    Takes the arguments and results of `blend_target` and image_gradients (h, w, 3); fills entry_gradients (e, 9).
+    Entries without contribution have no derivative.
+    """
     for tile in range(start, stop):
         _blend_tile_backward(
             tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions,
@@ -213,13 +171,15 @@ def _blend_tile_backward(
     tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions,
     image_gradients, entry_gradients,
 ):  # fmt: skip  # pragma: no cover - compiled
+    """Differentiate one tile. One function despite its length: it recomputes the forward values that it needs."""
     height, width = image.shape[0], image.shape[1]
     alpha_max, stop = scalars[0], scalars[1]
     zero = alpha_max - alpha_max
     tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
     light = np.ones((TILE, TILE), image.dtype)
-    given = np.zeros((N_PLANES + 1, TILE, TILE), image.dtype)  # gradients, and what is not passed yet
+    # Planes: image gradients, then the sum over splats not passed yet.
+    given = np.zeros((N_PLANES + 1, TILE, TILE), image.dtype)
     lanes = np.empty((N_GRADIENTS, TILE), image.dtype)
     xs, ys = np.empty(TILE, image.dtype), np.empty(TILE, image.dtype)
     for j in range(TILE):
@@ -298,7 +258,7 @@ def _blend_tile_backward(
 
 @numba.njit(cache=True, nogil=True)
 def sum_entries(start, stop, entry_gradients, first, positions, rows, out):  # pragma: no cover - compiled
-    """Sum the entries of the splats start..stop, in order, into out (n, 18) at the Gaussians' rows."""
+    """Sum the entries of each splat start..stop, in order, into out (n, 18) at the Gaussians' rows."""
     for r in range(start, stop):
         for c in range(N_SPLAT_GRADIENTS):
             out[rows[r], c] = 0

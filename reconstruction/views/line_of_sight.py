@@ -1,42 +1,21 @@
-"""Compiled: which points on a closed shape a camera sees past the shape itself and past what else is there."""
+"""Compiled ray marching: visibility of surface points of a closed shape past itself and other occluders."""
 
 import math
 
 import numba
 
-SQUARE = 0.5  # cosine; what is seen at a steeper slant waits for a better view
+SQUARE = 0.5  # cosine to the normal from which a point counts as fully visible
 
 
 @numba.njit(cache=True, nogil=True)
 def see_points(
-    start,
-    stop,
-    eyes,
-    points,
-    sides,
-    normals,
-    solid,
-    origin,
-    cell,
-    near,
-    near_origin,
-    near_cell,
-    occupied,
-    far_origin,
-    far_cell,
-    out,
-):  # pragma: no cover - compiled
-    """Follow the line from every point to every eye through two grids.
+    start, stop, eyes, points, sides, normals, solid, origin, cell, near, near_origin, near_cell, occupied, far_origin,
+    far_cell, out,
+):  # fmt: skip  # pragma: no cover - compiled
+    """March from every point to the eyes start..stop through the shape, near occluders and far occluders.
 
-    Args:
-        start: First eye; stop alike.
-        eyes: (k, 3).
-        points: (n, 3) on the border of the shape's cells.
-        sides: (n, 3) the direction in which the cell at each point ends; normals (n, 3) smooth ones.
-        solid: bool grid of the shape; origin (3,) of its corner, cell its size.
-        near: fine bool grid of everything else around the shape; near_origin (3,) and near_cell alike.
-        occupied: bool grid of everything else, for what lies farther; far_origin (3,) and far_cell alike.
-        out: float32 (k, n) filled: 0 where the point is not seen, 1 where it is seen at a slant of up to 60 degrees.
+    eyes (k, 3), points, sides and normals (n, 3), and the three bool grids with corner and cell size are those of
+    `ClosedShape`. Fills out, float32 (k, n): 0 if occluded, 1 if seen up to 60 degrees from the normal.
     """
     for k in range(start, stop):
         for i in range(len(points)):
@@ -53,7 +32,7 @@ def see_points(
             x = points[i, 0] + 0.3 * cell * sides[i, 0]
             y = points[i, 1] + 0.3 * cell * sides[i, 1]
             z = points[i, 2] + 0.3 * cell * sides[i, 2]
-            # The cells next to a point hide it only by their own steps.
+            # Start 1.5 cells away: adjacent cells would hide the point by their staircase alone.
             if (
                 _followed(x, y, z, dx, dy, dz, 1.5 * cell, length, 0.5 * cell, solid, origin, cell, True)
                 < 0.0
@@ -62,13 +41,13 @@ def see_points(
             last = length - 0.05
             at = _followed(
                 x, y, z, dx, dy, dz, near_cell, last, 0.5 * near_cell, near, near_origin, near_cell, True
-            )  # fmt: skip
+            )
             if at < 0.0:
                 continue
             at = max(at, far_cell)
             at = _followed(
                 x, y, z, dx, dy, dz, at, last, 0.5 * far_cell, occupied, far_origin, far_cell, False
-            )  # fmt: skip
+            )
             if at >= 0.0:
                 out[k, i] = min(along / SQUARE, 1.0)
 
@@ -77,7 +56,7 @@ def see_points(
 def _followed(
     x, y, z, dx, dy, dz, first, last, step, grid, origin, cell, leaves
 ):  # pragma: no cover - compiled
-    """Return how far a line was followed, -1 where it met a marked cell; with `leaves`, it ends with the grid."""
+    """March along a ray; return the distance reached, -1 at a marked cell. With `leaves`, stop outside of the grid."""
     at = first
     while at < last:
         a = int(math.floor((x + at * dx - origin[0]) / cell))

@@ -1,13 +1,12 @@
-"""What a viewpoint is worth: what it shows of the target through the whole scene, at which distance; and the gradient.
+"""Evaluate the objective of a viewpoint and its gradient by the pose.
 
     L(v) = -1/P sum_p w(p) sum_i e_i alpha_i T_i(p)  +  lambda (D/d - 1)^2
 
-i runs over the target's Gaussians, T over everything that lies before them, e_i is what is left of the effective
-opacity of the side of a Gaussian that is seen, D the mean depth of what is seen of the target and d the target
-distance. (The mean square over pixels would also count how deep the target itself is, and draw cameras to its
-flattest side.) w is the solid angle of a pixel beside that of the middle one, and a little less far out: plain
-pixels show more towards the border, which would draw the target there. P pixels count as 1, so that lambda means
-the same for targets of all sizes and shapes.
+i runs over the target's Gaussians. T_i is the transmittance of all Gaussians before i. e_i is the remaining effective
+opacity of the visible side of i. D is the mean depth of the visible target, d the target distance. (The mean square
+over pixels would also penalize the depth extent of the target and favor its flattest side.) w is the solid angle of a
+pixel relative to the central one, with some more falloff: unweighted pixels cover more towards the border, which would
+draw the target there. P normalizes by a number of pixels, so that lambda is independent of the target's size and shape.
 """
 
 from dataclasses import dataclass, replace
@@ -24,9 +23,9 @@ from registry.geometry import invert_rigid
 
 _ALPHA_MAX = 0.99
 _NEAR_M = 0.02
-_LEAST_SEEN = 1e-6
-# Splats are sorted by the distance of their centers, which turning the camera does not change, and the target's count
-# as this much nearer: where it lies on something, the order would change with every step, and the objective would jump.
+_LEAST_SEEN = 1e-6  # mean opacity below which the target counts as not visible
+# Splats are sorted by the distance of their centers, which is invariant to camera rotation. Those of the target count
+# as this much nearer: on a support, the order would otherwise change with each step and the objective would jump.
 _AHEAD_M = 0.01
 
 
@@ -34,37 +33,32 @@ _AHEAD_M = 0.01
 class Value:
     """The objective at one pose."""
 
-    information: (
-        float  # pixels that show the target, weighted with what is left, as a share of `reference_px`
-    )
-    seen: float  # the same, unweighted
-    depth_term: float  # squared difference of the depth to the target distance, relative to that
-    depth_m: float  # mean depth of the target's pixels, 0 where none is seen
+    information: float  # pixels of the target, weighted by w and e, relative to `reference_px`
+    seen: float  # pixels of the target, unweighted, relative to `reference_px`
+    depth_term: float  # (D/d - 1)^2
+    depth_m: float  # D, 0 if the target is not visible
     loss: float
-    gradient: np.ndarray | None  # (6,) by world_from_camera exp(xi): translation, rotation in camera axes
+    gradient: (
+        np.ndarray
+    )  # float64 (6,) by xi of world_from_camera exp(xi), translation and rotation; or zeros
 
 
 class Objective:
     """The objective of one target at one resolution.
 
     Attributes:
-        reference_px: P, pixels that count as 1.
-        fronts: (m, 3) normals of the target's Gaussians towards where they were seen from; None: all sides are fronts.
+        reference_px: P, the number of pixels that counts as 1.
+        fronts: (m, 3) normals of the target's Gaussians towards the cameras that saw them; None: all sides are fronts.
     """
 
     def __init__(
-        self,
-        packed: np.ndarray,
-        radii: np.ndarray,
-        own_rows: np.ndarray,
-        camera: Camera,
-        config: AvoConfig,
+        self, packed: np.ndarray, radii: np.ndarray, own_rows: np.ndarray, camera: Camera, config: AvoConfig
     ) -> None:
-        """Take the scene apart into the target and the rest.
+        """Prepare the objective.
 
         Args:
             packed: (n, 13) Gaussians in world space, metres; float32, or float64 to check derivatives.
-            radii: (n,) how far each reaches, metres.
+            radii: (n,) radius at which each splat ends, metres.
             own_rows: (m,) rows of the target, ascending.
             camera: of the views.
             config: weights and cut-offs.
@@ -87,38 +81,33 @@ class Objective:
         )
 
     def evaluate(
-        self,
-        world_from_camera: np.ndarray,
-        worth: np.ndarray,
-        target_distance_m: float,
-        depth_weight: float,
+        self, world_from_camera: np.ndarray, worth: np.ndarray, target_distance_m: float, depth_weight: float,
         gradient: bool = True,
-    ) -> Value:
+    ) -> Value:  # fmt: skip
         """Return the objective at a pose.
 
         Args:
             world_from_camera: (4, 4) rigid.
-            worth: (2, m) what is left of the effective opacity of the front and of the back of each of the target's
-                Gaussians.
+            worth: (2, m) e: remaining effective opacity of front and back of each of the target's Gaussians.
             target_distance_m: d.
             depth_weight: lambda.
-            gradient: also its derivative.
+            gradient: compute the gradient, too; else it is zero.
         """
         blended = self._blend(world_from_camera, worth)
         if blended is None:
-            return Value(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(6) if gradient else None)
+            return Value(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(6))
         found, by_image = self._loss(blended, target_distance_m, depth_weight)
         return replace(found, gradient=self._backward(blended, by_image)) if gradient else found
 
     def scan(self, world_from_camera: np.ndarray, camera: Camera | None = None) -> tuple[np.ndarray, float]:
-        """Return what each Gaussian of the target gives to the picture at a pose, and the target's depth there.
+        """Return the contributions of the target's Gaussians to the image at a pose, and the target's depth.
 
         Args:
             world_from_camera: (4, 4) rigid.
-            camera: another one than that of the views.
+            camera: replaces that of the views.
 
         Returns:
-            (2, m) sum over pixels of alpha T of fronts and of backs; mean depth in metres, 0 where nothing is seen.
+            Sum over pixels of alpha T of fronts and backs (2, m); mean depth in metres, 0 if the target is not visible.
         """
         out = np.zeros((2, len(self.own_rows)))
         blended = self._blend(world_from_camera, out, camera)
@@ -136,7 +125,7 @@ class Objective:
         return out, self._loss(blended, 1.0, 0.0)[0].depth_m
 
     def _loss(self, blended: "_Blended", distance: float, weight: float) -> tuple[Value, np.ndarray]:
-        """Return the value of the objective and its derivative by the blended image (h, w, 3)."""
+        """Return the objective and its derivative by the blended image (h, w, 3)."""
         planes, pixels = blended.image.astype(np.float64), self.reference_px
         seen, worth, depth = (planes[..., c] for c in (kernels.SEEN, kernels.WORTH, kernels.DEPTH))
         size = _pixel_sizes(blended.camera)
@@ -144,16 +133,16 @@ class Objective:
         by_image = np.zeros_like(planes)
         by_image[..., kernels.WORTH] = -size / pixels
         if total <= _LEAST_SEEN * size.size:
-            return Value(information, total / pixels, 0.0, 0.0, -information, None), by_image
+            return Value(information, total / pixels, 0.0, 0.0, -information, np.zeros(6)), by_image
         mean = float(depth.sum()) / total
         off = mean / distance - 1.0
         by_image[..., kernels.SEEN] = -weight * 2.0 * off * mean / (distance * total)
         by_image[..., kernels.DEPTH] = weight * 2.0 * off / (distance * total)
         loss = -information + weight * off**2
-        return Value(information, total / pixels, off**2, mean, loss, None), by_image
+        return Value(information, total / pixels, off**2, mean, loss, np.zeros(6)), by_image
 
     def _facing(self, eye: np.ndarray) -> np.ndarray:
-        """Tell which Gaussians of the target (m,) turn their front to the eye (3,)."""
+        """Return the mask (m,) of the target's Gaussians whose front faces the eye (3,)."""
         if self.fronts is None:
             return np.ones(len(self.own_rows), bool)
         return np.einsum("mc,mc->m", self.fronts, eye - self._own[:, :3]) > 0
@@ -161,6 +150,7 @@ class Objective:
     def _blend(
         self, world_from_camera: np.ndarray, worth: np.ndarray, camera: Camera | None = None
     ) -> "_Blended | None":
+        """Blend the target, cropped to the part of the image that it reaches; None if it is out of view."""
         camera_from_world = invert_rigid(world_from_camera)
         rotation, translation = camera_from_world[:3, :3].copy(), camera_from_world[:3, 3].copy()
         crop = self._crop(rotation, translation, camera or self.camera)
@@ -188,7 +178,7 @@ class Objective:
         return _Blended(camera, chosen, rows, splats, bins, common, weights, (rotation, translation))
 
     def _backward(self, blended: "_Blended", by_image: np.ndarray) -> np.ndarray:
-        """Return the derivative (6,) by the pose, from that by the blended image (h, w, 3)."""
+        """Return the gradient (6,) by the pose, given that by the blended image (h, w, 3)."""
         dtype, n, rows = self.packed.dtype, len(blended.chosen), blended.rows
         tiles = len(blended.bins[0]) - 1
         entry_gradients = np.empty((len(blended.bins[1]), kernels.N_GRADIENTS), dtype)
@@ -200,15 +190,14 @@ class Objective:
         run_over(
             len(rows), kernels.sum_entries, entry_gradients, blended.bins[2], blended.bins[3], rows, splat_gradients
         )  # fmt: skip
-        moved = np.flatnonzero(
-            splat_gradients[rows].any(axis=1)
-        )  # the others lie behind the target everywhere
-        rows, splats = rows[moved], blended.splats[moved]
+        # Splats wholly behind the target have no gradient.
+        relevant = np.flatnonzero(splat_gradients[rows].any(axis=1))
+        rows, splats = rows[relevant], blended.splats[relevant]
         by_parameters = np.empty((n, shared.N_PARAMETERS), dtype)
         by_pose = np.empty((len(rows), 6), np.float64)
         run_over(
             len(rows), shared.project_backward, self.packed[blended.chosen], rows, *blended.pose,
-            _intrinsics(blended.camera), splats, splat_gradients, by_parameters, by_pose,
+            blended.camera.intrinsics, splats, splat_gradients, by_parameters, by_pose,
         )  # fmt: skip
         return by_pose.sum(axis=0)
 
@@ -219,7 +208,7 @@ class Objective:
         boxes = np.empty((len(packed), 4), np.int32)
         settings = self.settings
         run_over(
-            len(packed), shared.project, packed, rotation, translation, _intrinsics(camera),
+            len(packed), shared.project, packed, rotation, translation, camera.intrinsics,
             (camera.width, camera.height), settings.near, settings.sigma_cutoff, settings.alpha_min, splats, boxes,
         )  # fmt: skip
         return splats, boxes
@@ -227,9 +216,9 @@ class Objective:
     def _crop(
         self, rotation: np.ndarray, translation: np.ndarray, camera: Camera
     ) -> tuple[Camera, np.ndarray] | None:
-        """Return the part of the picture that the target reaches, and the Gaussians (k,) that matter there.
+        """Return the camera of the part of the image that the target reaches, and the rows (k,) that may matter there.
 
-        None where the target is out of view.
+        None if the target is out of view.
         """
         settings = self.settings
         splats, boxes = self._project(self._own, camera, rotation, translation)
@@ -243,7 +232,7 @@ class Objective:
         window = np.array([x0 - spread, y0 - spread, x1 + spread, y1 + spread])
         run_over(
             len(self.packed), kernels.mark_near_view, self._means, self.radii, rotation, translation,
-            _intrinsics(camera), window, far, settings.near, self._marked,
+            camera.intrinsics, window, far, settings.near, self._marked,
         )  # fmt: skip
         self._marked[self.own_rows] = seen
         cropped = Camera(x1 - x0, y1 - y0, camera.fx, camera.fy, camera.cx - x0, camera.cy - y0)
@@ -252,29 +241,24 @@ class Objective:
 
 @dataclass(frozen=True)
 class _Blended:
-    """A blended picture, with what the backward pass needs."""
+    """A blended image and the inputs of the backward pass."""
 
     camera: Camera  # of the crop
-    chosen: np.ndarray  # (k,) rows of the packed Gaussians
+    chosen: np.ndarray  # int64 (k,) rows of the packed Gaussians
     rows: np.ndarray  # int32 (v,) rows of `chosen`, near to far
     splats: np.ndarray  # (v, 17)
-    bins: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-    common: tuple  # arguments that both passes share
-    weights: np.ndarray  # (e, 1) sum of alpha T of every entry
-    pose: tuple[np.ndarray, np.ndarray]
+    bins: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # of `bin_to_tiles`
+    common: tuple  # arguments of both passes
+    weights: np.ndarray  # (e, 1) sum of alpha T of each entry
+    pose: tuple[np.ndarray, np.ndarray]  # camera_from_world: rotation (3, 3), translation (3,)
 
     @property
     def image(self) -> np.ndarray:
-        """The picture (h, w, 3), planes SEEN, WORTH, DEPTH."""
+        """The image (h, w, 3), planes SEEN, WORTH, DEPTH."""
         return self.common[-1]
 
 
-def _intrinsics(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
-
-
 def _pixel_sizes(camera: Camera) -> np.ndarray:
-    """Return w (h, w): cos^3 of the angle to the axis is the solid angle, one more power keeps to the middle."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    return 1.0 / (1.0 + x[None, :] ** 2 + y[:, None] ** 2) ** 2
+    """Return w (h, w): cos^4 of the angle to the optical axis (the solid angle is cos^3)."""
+    rays = camera.pixel_rays()
+    return 1.0 / (1.0 + rays[..., 0] ** 2 + rays[..., 1] ** 2) ** 2

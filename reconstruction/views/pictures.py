@@ -1,6 +1,7 @@
-"""What a chosen camera shows: color, mask, depth, how much is visible, and the same without what hides the target."""
+"""Render the pictures of a viewpoint: color, mask, depth, visibility, and the view with occluders removed."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,48 +11,47 @@ from reconstruction.gaussians.rasterizer import RasterSettings, rasterize
 from reconstruction.views.inpainting import Inpainter
 from reconstruction.views.scene import Target, ViewScene, reach_of
 
+if TYPE_CHECKING:
+    from reconstruction.views.strategies import Viewpoint
+
 _OPAQUE = 0.5
-_WHOLE_HIDES = 0.1  # a thing that covers this share of the target's outline is taken away as a whole
-_NEARER = 0.97  # of the target's depth: what lies nearer than this within its outline hides it
-_HOLE_BORDER_PX = 2
+_WHOLE_HIDES = 0.1  # an object that covers more than this share of the target's outline is removed as a whole
+_NEARER = 0.97  # Gaussians within the outline nearer than this share of the target's depth are occluders
+_HOLE_BORDER_PX = 2  # dark border of holes, which is inpainted as well
 _SETTINGS = RasterSettings(near=0.02)
 
 
 @dataclass(frozen=True)
 class View:
-    """One view of a target. World space, metres; pictures have the camera's size."""
+    """One view of a target; world space, metres."""
 
-    target: tuple[int, ...]  # ids
-    world_from_camera: np.ndarray  # float64 (4, 4), OpenCV, upright
+    target: tuple[int, ...]  # instance ids
+    world_from_camera: np.ndarray  # float64 (4, 4) rigid, no roll
     camera: Camera
-    origin: str  # how it was found, for people
-    gain: float  # share of the target's opacity that it shows and no view before it did
+    origin: str  # how the viewpoint was found, for users
+    gain: float  # share of the target's opacity that no earlier view shows
     color: np.ndarray  # uint8 (h, w, 3) RGB of the whole scene, black where nothing is known
-    alpha: np.ndarray  # float32 (h, w) the target's own opacity, behind what hides it
+    alpha: np.ndarray  # float32 (h, w) opacity of the target behind its occluders
     depth: np.ndarray  # float32 (h, w) z-depth of the target where alpha > 0.5, else 0
-    outline: (
-        np.ndarray
-    )  # bool (h, w) where the target would be seen if nothing hid it, what no frame saw of it too
-    visibility: float  # share of the outline that nothing hides
-    fronts: (
-        float  # share of what is seen of it that frames saw; the rest are backs, through sides that none saw
-    )
-    clean: np.ndarray  # uint8 (h, w, 3) without what hides the target, holes inpainted
-    inpainted: np.ndarray  # bool (h, w) which pixels of `clean` are made up
+    outline: np.ndarray  # bool (h, w) silhouette of the target without occluders, with enclosed unseen holes
+    visibility: float  # share of the silhouette that is not occluded
+    fronts: float  # share of front sides, which frames saw, in the visible target; the rest are backs
+    clean: np.ndarray  # uint8 (h, w, 3) RGB without occluders, holes inpainted
+    inpainted: np.ndarray  # bool (h, w) inpainted pixels of `clean`
 
     @property
     def mask(self) -> np.ndarray:
-        """Where the target is seen, bool (h, w)."""
+        """Pixels of the visible target, bool (h, w)."""
         return self.alpha > _OPAQUE
 
     def cleared(self, margin: float = 0.25) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return `clean`, uint8 (h, w, 3), and where the target is in it, bool (h, w), cropped to the target.
+        """Return `clean`, uint8 (h, w, 3), and the target's mask, bool (h, w), cropped to the target.
 
         Args:
-            margin: of what is around it, as a share of its box on each side.
+            margin: kept on each side, as a share of the target's box.
 
         Returns:
-            None where nothing of it is in the picture.
+            None if the target is not in the picture.
         """
         whole = _filled(self.outline)
         if not whole.any():
@@ -64,28 +64,9 @@ class View:
         return np.ascontiguousarray(self.clean[tuple(window)]), whole[tuple(window)]
 
 
-def draw_view(
-    scene: ViewScene,
-    target: Target,
-    camera: Camera,
-    pose: np.ndarray,
-    origin: str,
-    gain: float,
-    fronts: float,
-    inpainter: Inpainter,
-) -> View:
-    """Draw a view.
-
-    Args:
-        scene: of `prepare_scene`.
-        target: what is looked at.
-        camera: of the pictures.
-        pose: (4, 4) world_from_camera.
-        origin: as in `View`.
-        gain: as in `View`.
-        fronts: as in `View`.
-        inpainter: for `clean`.
-    """
+def draw_view(scene: ViewScene, target: Target, point: "Viewpoint", inpainter: Inpainter) -> View:
+    """Render the pictures of a viewpoint at the size of its camera; `inpainter` fills holes of `View.clean`."""
+    camera, pose = point.camera, point.world_from_camera
     own = np.zeros(len(scene.packed), bool)
     own[target.rows] = True
     whole = rasterize(scene.packed, camera, pose, _SETTINGS).features
@@ -102,13 +83,13 @@ def draw_view(
         target=target.ids,
         world_from_camera=pose,
         camera=camera,
-        origin=origin,
-        gain=gain,
+        origin=point.origin,
+        gain=point.gain,
         color=_uint8(whole[..., :3]),
         alpha=alpha,
         depth=np.where(alpha > _OPAQUE, depth, 0.0).astype(np.float32),
         outline=(outline > _OPAQUE) | behind,
-        fronts=fronts,
+        fronts=point.fronts,
         visibility=min(float(alpha.sum()) / total, 1.0) if total > 0 else 0.0,
         clean=inpainter.inpaint(clean, holes),
         inpainted=holes,
@@ -118,7 +99,7 @@ def draw_view(
 def _own_alpha(
     scene: ViewScene, own: np.ndarray, camera: Camera, pose: np.ndarray, outline: np.ndarray
 ) -> np.ndarray:
-    """Return the opacity (h, w) of the target behind what hides it; only what may lie before it is drawn."""
+    """Return the opacity (h, w) of the target behind its occluders; only Gaussians before its far end are drawn."""
     out = np.zeros(outline.shape, np.float32)
     window = _window_of(outline > 0)
     if window is None:
@@ -126,42 +107,33 @@ def _own_alpha(
     local = (scene.packed[:, :3] - pose[:3, 3]) @ pose[:3, :3]
     reach = reach_of(scene.packed, _SETTINGS.sigma_cutoff)
     far = float((local[own, 2] + reach[own]).max())
-    marked = scene.packed[local[:, 2] <= far]  # sorted by the depth of their centers
-    mine = own[local[:, 2] <= far]
-    marked[:, 10:13] = (
-        np.where(mine[:, None], 0.5, -0.5) / SH_C0
-    )  # drawn as 1 where it is the target's, else 0
+    marked, mine = scene.packed[local[:, 2] <= far], own[local[:, 2] <= far]
+    marked[:, 10:13] = np.where(mine[:, None], 0.5, -0.5) / SH_C0  # color 1 for the target, 0 for the others
     out[window] = rasterize(marked, _cropped(camera, window), pose, _SETTINGS).features[..., 0]
     return out
 
 
 def _window_of(mask: np.ndarray) -> tuple[slice, slice] | None:
-    """Return rows and columns of the box around a mask (h, w); None where it is empty."""
+    """Return the bounding box of a mask (h, w) as slices of rows and columns; None if it is empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
 
 
 def _cropped(camera: Camera, window: tuple[slice, slice]) -> Camera:
-    """Return the camera of a part of its picture."""
+    """Return the camera of a window (rows, columns) of the image."""
     rows, columns = window
-    width, height = int(columns.stop - columns.start), int(rows.stop - rows.start)
-    return Camera(
-        width, height, camera.fx, camera.fy, camera.cx - float(columns.start), camera.cy - float(rows.start)
-    )
+    x, y = int(columns.start), int(rows.start)
+    width, height = int(columns.stop) - x, int(rows.stop) - y
+    return Camera(width, height, camera.fx, camera.fy, camera.cx - float(x), camera.cy - float(y))
 
 
 def _without_occluders(
-    scene: ViewScene,
-    own: np.ndarray,
-    camera: Camera,
-    pose: np.ndarray,
-    outline: np.ndarray,
-    depth: np.ndarray,
+    scene: ViewScene, own: np.ndarray, camera: Camera, pose: np.ndarray, outline: np.ndarray, depth: np.ndarray,
     whole: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the picture (h, w, 3) without what lies before the target, and where nothing is left to show (h, w).
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the picture (h, w, 3) with the target's occluders removed, and the mask (h, w) of holes in it.
 
-    Outside of what is taken away it is that of the whole scene (features (h, w, c)), which is not drawn again.
+    Only the window that the removed Gaussians touch is drawn again; the rest comes from the features `whole` (h, w, c).
     """
     before = _before_target(scene, own, camera, pose, outline, depth)
     share = {
@@ -184,15 +156,15 @@ def _without_occluders(
 
 
 def _hidden_holes(outline: np.ndarray, depth: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Return what the outline (h, w) surrounds that no frame saw because other things hide it, bool (h, w).
+    """Return the holes enclosed by the silhouette (h, w) that are unseen because of occluders, bool (h, w).
 
-    There the scene (features (h, w, c)) is nearer than the target (depth (h, w)) around; through open ones it is not.
+    There the scene (features `whole` (h, w, c)) is nearer than the target around the hole; in true openings it is not.
     """
     import cv2
 
     edges, _ = cv2.findContours(outline.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    filled = cv2.drawContours(np.zeros(outline.shape, np.uint8), edges, -1, 1, cv2.FILLED)
-    count, parts = cv2.connectedComponents(filled & ~outline, connectivity=4)
+    filled = cv2.drawContours(np.zeros(outline.shape, np.uint8), edges, -1, (1,), cv2.FILLED)
+    count, parts = cv2.connectedComponents((filled & ~outline).astype(np.uint8), connectivity=4)
     scene_depth = whole[..., 3] / np.maximum(whole[..., 7], 1e-6)
     known = whole[..., 7] > _OPAQUE
     out = np.zeros(outline.shape, bool)
@@ -214,11 +186,10 @@ def _before_target(
     outline: np.ndarray,
     depth: np.ndarray,
 ) -> np.ndarray:
-    """Return which Gaussians (g,) have their centers within the target's outline, nearer than it."""
+    """Return the mask (g,) of Gaussians with centers inside of the silhouette and nearer than the target."""
     local = (scene.packed[:, :3] - pose[:3, 3]) @ pose[:3, :3]
-    z = np.maximum(local[:, 2], 1e-6)
-    u = np.floor(camera.fx * local[:, 0] / z + camera.cx).astype(np.int64)
-    v = np.floor(camera.fy * local[:, 1] / z + camera.cy).astype(np.int64)
+    columns, rows = camera.project(np.column_stack([local[:, :2], np.maximum(local[:, 2], 1e-6)]))
+    u, v = np.floor(columns).astype(np.int64), np.floor(rows).astype(np.int64)
     inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height) & ~own
     out = np.zeros(len(own), bool)
     rows = np.flatnonzero(inside)
@@ -230,7 +201,7 @@ def _before_target(
 def _covered(
     scene: ViewScene, rows: np.ndarray, camera: Camera, pose: np.ndarray, outline: np.ndarray
 ) -> float:
-    """Return the share of the outline that some Gaussians cover."""
+    """Return the share of the silhouette that the Gaussians `rows` cover, at a quarter of the resolution."""
     small = camera.resized(max(camera.width // 4, 8), max(camera.height // 4, 8))
     opacity = rasterize(scene.packed[rows], small, pose, _SETTINGS).features[..., 7]
     rows_v = np.arange(small.height) * camera.height // small.height
@@ -240,7 +211,7 @@ def _covered(
 
 
 def _filled(outline: np.ndarray) -> np.ndarray:
-    """Return an outline with what it surrounds and is thin or small: gaps between Gaussians, which are inpainted."""
+    """Close thin gaps and small holes of a silhouette (h, w): gaps between Gaussians, which are inpainted."""
     import cv2
 
     closed = cv2.morphologyEx(outline.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
@@ -248,7 +219,7 @@ def _filled(outline: np.ndarray) -> np.ndarray:
 
 
 def _grown(holes: np.ndarray) -> np.ndarray:
-    """Return the holes with their dark border."""
+    """Dilate holes (h, w) by their dark border."""
     import cv2
 
     kernel = np.ones((2 * _HOLE_BORDER_PX + 1,) * 2, np.uint8)

@@ -1,4 +1,4 @@
-"""What all targets of a scene share, prepared once; and what a target is."""
+"""The scene as viewpoint optimization uses it, prepared once for all targets; and the targets."""
 
 import math
 from collections.abc import Sequence
@@ -12,37 +12,37 @@ from reconstruction.views.clearance import Clearance, measure_clearance
 from reconstruction.views.config import AvoConfig
 from registry.errors import UsageError
 
-_INPUTS = 40  # input cameras that are looked at, evenly spread over the film
-_CURVE_CELL_M = 0.01
-_OUTER_SHARE = 0.98  # of the target's Gaussians lie in its sphere: strays do not push the camera away
+_INPUTS = 40  # number of input cameras to use, evenly spaced in time
+_CURVE_CELL_M = 0.01  # cell of the Morton curve
+_OUTER_SHARE = 0.98  # share of the target's Gaussians inside of its bounding sphere; the rest are outliers
 
 
 @dataclass(frozen=True)
 class ViewScene:
-    """The scene as viewpoints see it. World space, metres, floor at z = 0."""
+    """Gaussians, surface, instances, free space and input cameras; world space, metres, floor at z = 0."""
 
     gaussians: Gaussians
-    packed: np.ndarray  # float32 (g, 13)
-    instance: np.ndarray  # int32 (g,) id of the thing that each Gaussian belongs to; 0 = none
-    points: np.ndarray  # float64 (v, 3) of the surface
-    point_instance: np.ndarray  # int32 (v,) alike
+    packed: np.ndarray  # float32 (g, 13) parameters of the Gaussians
+    instance: np.ndarray  # int32 (g,) instance id of each Gaussian, 0 = none
+    points: np.ndarray  # float64 (v, 3) vertices of the surface
+    point_instance: np.ndarray  # int32 (v,) instance id of each vertex, 0 = none
     base: tuple[int, ...]  # ids of floor, walls and ceiling
     clearance: Clearance
-    space: SpaceGrid  # what is known of space, where things are closed
+    space: SpaceGrid  # occupancy; closed shapes exclude its free voxels
     camera: Camera  # of the input frames
-    inputs: np.ndarray  # float64 (n, 4, 4) world_from_camera of input frames, evenly spread
-    frames: np.ndarray  # int (n,) their rows among the keyframes
+    inputs: np.ndarray  # float64 (n, 4, 4) world_from_camera of input frames, evenly spaced in time
+    frames: np.ndarray  # int64 (n,) their rows among the keyframes
 
 
 @dataclass(frozen=True)
 class Target:
-    """One thing, or a region: several things that are looked at together."""
+    """An object, or a region: several objects viewed as one."""
 
     ids: tuple[int, ...]
-    rows: np.ndarray  # int64 (m,) of its Gaussians, ascending
-    center: np.ndarray  # float64 (3,)
-    radius_m: float  # of a sphere that holds (nearly) all of it
-    distance_m: float  # d_target: at which that sphere fills the wanted share of the field of view
+    rows: np.ndarray  # int64 (m,) rows of its Gaussians, ascending
+    center: np.ndarray  # float64 (3,) of its bounding sphere, world space
+    radius_m: float  # of its bounding sphere, without outliers
+    distance_m: float  # target distance d: the sphere fills the share `AvoConfig.fill` of the field of view
 
 
 def prepare_scene(
@@ -52,8 +52,8 @@ def prepare_scene(
 
     Args:
         gaussians: in world space (`GaussianScene.in_world`), with the input cameras.
-        surface: with its free space.
-        instances: what belongs to which thing.
+        surface: of the same scene, with its occupancy grid.
+        instances: of the same scene.
         camera: of the input frames.
 
     Raises:
@@ -64,7 +64,7 @@ def prepare_scene(
     poses = np.asarray(gaussians.world_from_camera, np.float64)
     if not len(poses):
         raise UsageError(
-            "views: the Gaussians carry no input cameras, so nothing is known of where one may stand"
+            "views: the Gaussians have no input cameras, which are needed as start poses; fit them to frames anew"
         )
     rows = np.unique(np.linspace(0, len(poses) - 1, _INPUTS).round().astype(int))
     return ViewScene(
@@ -82,9 +82,14 @@ def prepare_scene(
     )
 
 
+def ids_of(ids: Sequence[int] | int) -> tuple[int, ...]:
+    """Return an id, or the ids of a region, as a sorted tuple without repetitions."""
+    return (int(ids),) if isinstance(ids, int | np.integer) else tuple(sorted({int(i) for i in ids}))
+
+
 def make_target(scene: ViewScene, ids: Sequence[int] | int, config: AvoConfig) -> Target | None:
-    """Return the target of an id, or of a region of ids; None where no Gaussian belongs to it."""
-    wanted = (int(ids),) if np.isscalar(ids) else tuple(sorted({int(i) for i in ids}))
+    """Return the target of an id, or of the ids of a region; None if no Gaussian belongs to it."""
+    wanted = ids_of(ids)
     rows = np.flatnonzero(np.isin(scene.instance, wanted))
     if not len(rows):
         return None
@@ -99,10 +104,10 @@ def make_target(scene: ViewScene, ids: Sequence[int] | int, config: AvoConfig) -
 
 
 def thinned(scene: ViewScene, target: Target, most: int) -> tuple[ViewScene, Target]:
-    """Return the scene and a target with at most `most` Gaussians, for pictures that show it coarsely.
+    """Subsample a scene such that the target keeps at most `most` Gaussians, for coarse images.
 
-    Of the target, and of everything else, the same share of the Gaussians stays, evenly spread and so much larger that
-    they cover the same area. Only `packed` and `instance` of the scene and `rows` of the target are thinned.
+    The same share of the target's and of the other Gaussians is kept, evenly spread along a space-filling curve and
+    enlarged to cover the same area. Only `packed` and `instance` of the scene and `rows` of the target change.
     """
     share = most / len(target.rows)
     if share >= 1.0:
@@ -122,7 +127,7 @@ def thinned(scene: ViewScene, target: Target, most: int) -> tuple[ViewScene, Tar
 
 
 def _along_curve(packed: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return rows of Gaussians along a curve that fills space (Morton's): neighbors on it lie close together."""
+    """Return `rows` of Gaussians in the order of a Morton curve, which keeps spatial neighbors together."""
     if not len(rows):
         return rows
     means = packed[rows, :3].astype(np.float64)
@@ -135,5 +140,5 @@ def _along_curve(packed: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def reach_of(packed: np.ndarray, sigma_cutoff: float) -> np.ndarray:
-    """Return how far each Gaussian (n, 13) reaches from its center, (n,) metres."""
+    """Return the radius (n,) at which each Gaussian (n, 13) ends, in the units of the scene."""
     return (sigma_cutoff * np.exp(packed[:, 7:9].max(axis=1))).astype(packed.dtype)

@@ -1,7 +1,6 @@
-"""The search for the best view: gradient descent over position and quaternion, inside observed free space."""
+"""Search for the best viewpoint: gradient descent on the pose inside observed free space."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,54 +13,53 @@ from reconstruction.views.config import AvoConfig
 if TYPE_CHECKING:
     from reconstruction.views.objective import Objective, Value
 
-_DECAYS, _EPSILON = (0.8, 0.95), 1e-8  # Adam, with memories as short as the search
-_LAST_RATE = 0.1
-_PUSHES = 12
-_PATIENCE = 12  # steps without a better pose, after which the search is over
+_DECAYS, _EPSILON = (0.8, 0.95), 1e-8  # of Adam; decays for a search of few steps
+_LAST_RATE = 0.1  # final step size relative to the first
+_PUSHES = 12  # attempts to move a camera into free space
+_PATIENCE = 12  # steps without improvement after which the search stops
 
 
 @dataclass(frozen=True)
 class Found:
-    """A viewpoint and what it is worth."""
+    """A viewpoint and its value."""
 
     pose: np.ndarray  # float64 (4, 4) world_from_camera
-    value: "Value"  # of the objective, without the terms of the place
-    loss: float  # with them
-    steps: int
+    value: "Value"  # of the objective, without the clearance penalty
+    loss: float  # with the clearance penalty
+    steps: int  # step of the schedule at which it was found
 
 
 @dataclass(frozen=True)
 class Search:
-    """Descends from a start; see `AvoConfig` for the weights."""
+    """Gradient descent from start poses; see `AvoConfig` for the weights."""
 
     objective: "Objective"
     clearance: Clearance
-    distance_m: float  # the target distance
-    depth_weight: float
+    distance_m: float  # target distance d
+    depth_weight: float  # lambda
     config: AvoConfig
 
     def loss_of_place(self, eye: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the penalty of a place (3,) that is too near to what is not free, and its derivative (3,)."""
+        """Return the clearance penalty of a camera position (3,) and its gradient (3,)."""
         wanted = self.config.clearance_m
         clearance, slope = self.clearance.with_gradient(eye)
         lacking = max(wanted - clearance, 0.0) / wanted
         weight = self.config.free_weight
         return weight * lacking**2, -2.0 * weight * lacking / wanted * slope
 
-    def best_of(self, starts: Sequence[np.ndarray], worth: np.ndarray) -> Found | None:
-        """Return the best pose on the way down from several starts: some steps from each, the rest from the best one.
+    def best_of(self, starts: np.ndarray, worth: np.ndarray) -> Found | None:
+        """Optimize from several starts: a third of the steps from each, the rest from the best one.
 
         Args:
-            starts: poses (4, 4).
-            worth: (m,) what is left of the effective opacity of each Gaussian of the target.
+            starts: (k, 4, 4) poses.
+            worth: (2, m) as in `Objective.evaluate`.
 
         Returns:
-            None where no free place is near any start.
+            The best pose on the way; None if no start is near free space.
         """
         scouting = self.config.steps // 3 if len(starts) > 1 else self.config.steps
-        found = [
-            one for one in (self.descend(start, worth, 0, scouting) for start in starts) if one is not None
-        ]
+        tried = (self.descend(start, worth, 0, scouting) for start in starts)
+        found = [one for one in tried if one is not None]
         if not found:
             return None
         best = min(found, key=lambda one: one.loss)
@@ -73,13 +71,13 @@ class Search:
     def descend(
         self, start: np.ndarray, worth: np.ndarray, first: int = 0, last: int | None = None
     ) -> Found | None:
-        """Return the best pose on the way down from `start` (4, 4); None where no free place is near it.
+        """Optimize from one start with Adam; return the best pose on the way, None if the start is not near free space.
 
         Args:
-            start: pose (4, 4).
-            worth: (m,) as in `best_of`.
-            first: step to begin with, of the schedule of rates.
-            last: step to end with; None is the last one.
+            start: (4, 4) pose.
+            worth: (2, m) as in `Objective.evaluate`.
+            first: first step of the rate schedule.
+            last: last step of the rate schedule; None is that of the config.
         """
         config = self.config
         pose = self._into_free_space(start)
@@ -104,10 +102,11 @@ class Search:
             spread = _DECAYS[1] * spread + (1 - _DECAYS[1]) * gradient**2
             share = step / max(config.steps, 1)
             rate = config.rate * (_LAST_RATE + (1 - _LAST_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
-            unit = (mean / (1 - _DECAYS[0] ** number)) / (
-                np.sqrt(spread / (1 - _DECAYS[1] ** number)) + _EPSILON
-            )
-            size = rate * np.array([1.0, 1.0, 1.0, 0.3, 0.3])  # turning alone moves the picture faster
+            scale = np.sqrt(spread / (1 - _DECAYS[1] ** number)) + _EPSILON
+            unit = (mean / (1 - _DECAYS[0] ** number)) / scale
+            size = rate * np.array(
+                [1.0, 1.0, 1.0, 0.3, 0.3]
+            )  # pan and tilt change the image faster than orbiting
             after = self._into_free_space(moved(pose, -size * unit, ahead, config.max_pitch_deg))
             if after is None:
                 mean[:3] = 0.0
@@ -116,7 +115,7 @@ class Search:
         return best
 
     def _into_free_space(self, pose: np.ndarray) -> np.ndarray | None:
-        """Return the pose, moved up the slope of the clearance until the camera is free; None where that fails."""
+        """Return the pose moved along the clearance gradient until the camera is free; None if that fails."""
         least = self.config.min_clearance_m
         eye = pose[:3, 3].copy()
         for _ in range(_PUSHES):

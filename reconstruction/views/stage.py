@@ -1,4 +1,4 @@
-"""The stage `views`: views of every thing that a generator, a vision-language model or a person is shown."""
+"""The stage `views`: views of every object, for generators, vision-language models and users."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,26 +15,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """What the stage makes: the views of each thing, in the order of `InstanceSet.objects`."""
+    """The views of each object, in the order of `InstanceSet.objects`."""
 
-    strategy: str
+    strategy: str  # `AvoConfig.strategy`
     targets: tuple[TargetViews, ...]
 
     def of(self, number: int) -> tuple[View, ...]:
-        """Return the views of a thing by its id, the most informative first; none where nothing of it can be seen."""
+        """Return the views of the object with an id, the most informative first; empty if it cannot be seen."""
         return next((target.views for target in self.targets if target.ids == (number,)), ())
 
 
 def make_views(
     scene: "ViewScene", instances: InstanceSet, config: AvoConfig, *, progress: Progress = NO_PROGRESS
 ) -> SceneViews:
-    """Choose and draw the views of every thing.
+    """Choose and draw the views of every object.
 
     Args:
         scene: of `prepare_scene`, in world space, metres.
-        instances: the things.
-        config: how views are chosen.
-        progress: told of things, and of those that cannot be seen.
+        instances: whose objects are viewed.
+        config: settings.
+        progress: receives objects, and those that cannot be seen.
 
     Raises:
         UsageError: an unknown strategy or inpainter.

@@ -1,4 +1,4 @@
-"""How viewpoints are chosen: the strategies that the paper compares, behind one interface."""
+"""Strategies that choose viewpoints, as compared in the paper, behind one interface."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from reconstruction.core.plugins import load_plugin
 from reconstruction.core.types import Camera
 from reconstruction.views.cameras import look_at, square_camera
 from reconstruction.views.closure import close_shape
@@ -15,30 +16,29 @@ from reconstruction.views.coverage import LEAST_PX, Coverage, Unseen
 from reconstruction.views.initial_views import input_starts, starts_around, starts_below, zoomed_camera
 from reconstruction.views.scene import Target, ViewScene, reach_of, thinned
 from reconstruction.views.search import Search
-from registry.errors import UsageError
 from registry.geometry import matrix_from_quat
 
 if TYPE_CHECKING:
     from reconstruction.views.objective import Objective
 
-_APART_DEG = 25.0  # starts that are optimized look from directions at least this far apart
-_CANONICAL_PITCH_DEG = 25.0
-_BY_PIXELS = 0.15  # beside what is seen anew, which counts as 1
-_FRONTS_FROM = 2  # every second input camera tells fronts from backs
-_FURNITURE_M = 0.35  # radius: what is larger may stand on legs and have an underside
-_LARGE_STEPS = 2 / 3  # of the steps are taken for large targets
+_APART_DEG = 25.0  # smallest angle between the viewing directions of optimized starts
+_CANONICAL_PITCH_DEG = 25.0  # from which `canonical` looks down
+_BY_PIXELS = 0.15  # weight of the number of pixels relative to the newly seen share
+_FRONTS_FROM = 2  # every second input camera is used to tell fronts from backs
+_FURNITURE_M = 0.35  # radius above which a target may stand on legs and have a visible underside
+_LARGE_STEPS = 2 / 3  # share of the steps for large targets
 
 
 @dataclass(frozen=True)
 class Viewpoint:
     """One chosen camera."""
 
-    world_from_camera: np.ndarray  # float64 (4, 4)
-    camera: Camera  # field of view; its size is the working resolution
-    origin: str  # how it was found, for people
-    gain: float  # share of the target's opacity that it showed for the first time
+    world_from_camera: np.ndarray  # float64 (4, 4) rigid
+    camera: Camera  # at the working resolution
+    origin: str  # how it was found, for users
+    gain: float  # share of the target's opacity that no earlier viewpoint showed
     fronts: float = (
-        1.0  # share of what is seen that frames saw, not backs; 1 where the strategy does not tell them
+        1.0  # share of fronts in the visible target; 1 if the strategy does not tell them from backs
     )
 
 
@@ -48,7 +48,8 @@ class Strategy(Protocol):
     name: str
 
     def choose(self, scene: ViewScene, target: Target, config: AvoConfig) -> list[Viewpoint]:
-        """Return at most `config.views` viewpoints, the most informative first; none where nothing can be seen."""
+        """Return at most `config.views` viewpoints, the most informative first; empty if the target cannot be seen."""
+        ...
 
 
 def _coverage(scene: ViewScene, target: Target, most: np.ndarray, config: AvoConfig) -> Coverage:
@@ -64,7 +65,7 @@ def _objective(scene: ViewScene, target: Target, camera: Camera, config: AvoConf
 
 
 class ActiveViews:
-    """Active viewpoint optimization (SimRecon, section on AVO)."""
+    """Active viewpoint optimization (SimRecon, section on AVO): greedy selection of optimized viewpoints."""
 
     def __init__(self, name: str, with_depth: bool) -> None:
         self.name, self._with_depth = name, with_depth
@@ -76,14 +77,8 @@ class ActiveViews:
         config, scene, target = _affordable(config, scene, target)
         fine = _objective(scene, target, square_camera(config.side_px, config.fov_deg), config)
         search = Search(fine, scene.clearance, target.distance_m, weight, config)
-        starts = input_starts(scene, target, config)
         fine.fronts = _fronts(scene, target, fine, config)
-        if config.starts == "around":
-            starts = np.concatenate([starts, starts_around(scene, target, config)])
-            if target.radius_m > _FURNITURE_M:
-                starts = np.concatenate([starts, starts_below(scene, target, config)])
-        if self._with_depth:
-            starts = _at_target_distance(starts, scene, target, config)
+        starts = self._starts(scene, target, config)
         shown = np.array([_scan(fine, start, target)[0] for start in starts])
         sights = closed.seen(starts, fine.camera)
         fixed = np.array([search.loss_of_place(start[:3, 3])[0] for start in starts])
@@ -101,7 +96,6 @@ class ActiveViews:
                 break
             drawn = _scan(fine, found.pose, target)[0]
             pool = pool.with_one(found.pose, drawn, closed.seen(found.pose[None], fine.camera)[0])
-            # What counts is what is seen anew: more pixels of less are no progress.
             pixels = np.einsum("ksm,sm->k", pool.shown, coverage.worth) / fine.reference_px
             best = int(np.argmax(unseen.worth_of(pool.shown, pool.sights) + _BY_PIXELS * pixels))
             if unseen.gain(pool.shown[best], pool.sights[best]) < config.min_gain:
@@ -112,22 +106,31 @@ class ActiveViews:
                 break
         return pool.viewpoints(first.revised(chosen, pool.shown, pool.sights), first, fine.camera, free)
 
+    def _starts(self, scene: ViewScene, target: Target, config: AvoConfig) -> np.ndarray:
+        """Return the start poses (k, 4, 4) that the config asks for."""
+        starts = input_starts(scene, target, config)
+        if config.starts == "around":
+            starts = np.concatenate([starts, starts_around(scene, target, config)])
+            if target.radius_m > _FURNITURE_M:
+                starts = np.concatenate([starts, starts_below(scene, target, config)])
+        return _at_target_distance(starts, scene, target, config) if self._with_depth else starts
+
 
 @dataclass(frozen=True)
 class _Pool:
-    """Poses that can be chosen: the starts in free space, then what searches made of them."""
+    """Candidate poses: the starts in free space, then the optimized ones."""
 
-    poses: np.ndarray  # (k, 4, 4)
-    shown: np.ndarray  # (k, 2, m) of the target's Gaussians
-    sights: np.ndarray  # (k, n) of the closed shape's points
+    poses: np.ndarray  # float64 (k, 4, 4)
+    shown: np.ndarray  # float64 (k, 2, m) contributions of the target's Gaussians
+    sights: np.ndarray  # float32 (k, n) visibilities of the closed shape's points
 
     def with_one(self, pose: np.ndarray, shown: np.ndarray, sight: np.ndarray) -> "_Pool":
-        """Return the pool with one more, the last."""
+        """Return the pool with one candidate appended."""
         added = ((self.poses, pose), (self.shown, shown), (self.sights, sight))
         return _Pool(*(np.concatenate([many, one[None]]) for many, one in added))
 
     def viewpoints(self, rows: Sequence[int], unseen: Unseen, camera: Camera, starts: int) -> list[Viewpoint]:
-        """Return the viewpoints of rows, each next one that which shows most of what is left; starts come first."""
+        """Return the viewpoints of rows in greedy order of gain; rows below `starts` are start poses."""
         left, out = list(dict.fromkeys(rows)), []
         while left:
             row = max(left, key=lambda one: unseen.gain(self.shown[one], self.sights[one]))
@@ -141,7 +144,7 @@ class _Pool:
 
 
 def _affordable(config: AvoConfig, scene: ViewScene, target: Target) -> tuple[AvoConfig, ViewScene, Target]:
-    """Return what a target is sought with: coarser, shorter and through fewer Gaussians where it is large."""
+    """Return config, scene and target; for a large target at lower resolution, with fewer steps and Gaussians."""
     if not 0 < config.large_gaussians < len(target.rows):
         return config, scene, target
     side, steps = min(config.side_px, config.scan_side_px), round(_LARGE_STEPS * config.steps)
@@ -149,9 +152,9 @@ def _affordable(config: AvoConfig, scene: ViewScene, target: Target) -> tuple[Av
 
 
 def _scan(objective: "Objective", pose: np.ndarray, target: Target) -> tuple[np.ndarray, float]:
-    """Return what a pose shows of each side of the target's Gaussians (2, m), and at which depth.
+    """Return the contributions (2, m) at a pose in pixels as from the target distance, and the target's depth.
 
-    In pixels from the target distance: so they say how well a side is seen, not how close the camera is.
+    This scaling makes them independent of the camera's distance.
     """
     contributions, depth = objective.scan(pose)
     return contributions * (depth / target.distance_m) ** 2, depth
@@ -160,7 +163,7 @@ def _scan(objective: "Objective", pose: np.ndarray, target: Target) -> tuple[np.
 def _at_target_distance(
     starts: np.ndarray, scene: ViewScene, target: Target, config: AvoConfig
 ) -> np.ndarray:
-    """Return the starts (n, 4, 4) moved along their view to the target distance, as far as is free."""
+    """Return the starts (n, 4, 4) moved along their view towards the target distance, within free space."""
     out = starts.copy()
     away = np.linalg.norm(starts[:, :3, 3] - target.center, axis=1)
     for row, forward in enumerate(away - target.distance_m - target.radius_m):
@@ -173,7 +176,7 @@ def _at_target_distance(
 
 
 def _fronts(scene: ViewScene, target: Target, objective: "Objective", config: AvoConfig) -> np.ndarray:
-    """Return the normals (m, 3) of the target's Gaussians towards the input cameras that see them, zoomed in."""
+    """Return the normals (m, 3) of the target's Gaussians, oriented towards the input cameras that see them."""
     packed = scene.packed[target.rows].astype(np.float64)
     normals = matrix_from_quat(packed[:, 3:7])[:, :, 2]
     side = np.zeros(len(packed))
@@ -186,7 +189,7 @@ def _fronts(scene: ViewScene, target: Target, objective: "Objective", config: Av
 
 
 def _apart(starts: np.ndarray, losses: np.ndarray, count: int) -> list[int]:
-    """Return the rows of the best starts that look from different directions."""
+    """Return up to `count` rows of starts (n, 4, 4) by ascending loss, with viewing directions _APART_DEG apart."""
     chosen: list[int] = []
     for row in np.argsort(losses, kind="stable"):
         ahead = starts[row, :3, 2]
@@ -198,7 +201,7 @@ def _apart(starts: np.ndarray, losses: np.ndarray, count: int) -> list[int]:
 
 
 class InputFrames:
-    """The input frames that see most, each next one by what the ones before it did not show."""
+    """Greedy selection of input frames by newly visible opacity."""
 
     name = "max-visibility"
 
@@ -221,7 +224,7 @@ class InputFrames:
 
 
 class Orbit:
-    """Evenly spread places around the target, the first where the input cameras are; it knows nothing of the room."""
+    """Evenly spaced viewpoints around the target, the first on the side of the input cameras; ignores the room."""
 
     name = "canonical"
 
@@ -263,6 +266,4 @@ def load_strategy(name: str) -> Strategy:
     Raises:
         UsageError: there is no such strategy.
     """
-    if name not in STRATEGIES:
-        raise UsageError(f"views: no strategy {name!r}; there are {', '.join(STRATEGIES)}")
-    return STRATEGIES[name]
+    return STRATEGIES[name] if name in STRATEGIES else load_plugin("avo.strategy", name, AvoConfig)()

@@ -1,4 +1,4 @@
-"""Stage 4: the world frame. Gravity, yaw, floor and metres: PosedFrames + DepthMaps (sfm) -> WorldFrame."""
+"""Stage 4: estimate the world frame (gravity, yaw, floor, metric scale) from posed frames and depth maps."""
 
 from reconstruction.world.config import WORLD_PRESETS, WorldConfig
 from reconstruction.world.frame import find_world, rescale_for_object

@@ -1,8 +1,7 @@
-"""Where the floor is: the lowest large level surface that faces up, unless things are seen below it.
+"""Detect the floor: the lowest large level surface that faces up, unless surface is seen below it.
 
-A table top is told from a floor by what lies below: rays that pass its edge and end lower. Wrong depth and
-mirror images in a glossy floor lie below, too, but their rays pass *through* the seen floor, so they do not
-count.
+Rays that pass the edge of a candidate and end lower show that it is a table top. Outliers and mirror images in a glossy
+floor also lie lower, but their rays pass through the candidate, so they do not count.
 """
 
 from dataclasses import dataclass
@@ -13,35 +12,31 @@ from reconstruction.world.planes import plane_cells
 from reconstruction.world.samples import SurfaceSamples
 
 _UP = np.array([0.0, 0.0, 1.0])
-_LEVEL_DEG = 14.0
+_LEVEL_DEG = 14.0  # largest tilt of the normals of a level surface
 _BAND_SHARE = 0.012  # half thickness of a level surface, as a share of the median depth
-_CELL_SHARE = 0.05
-_MIN_SHARE = 0.12  # of the largest level surface: smaller ones are no floor
-_MIN_CELLS = 30
-_BELOW_SHARE = 0.18  # of the candidate's own cells: so much seen below its edge makes it a table
-_BELOW_MARGIN = 0.10  # of the camera's height over the candidate: nearer is its own noise
+_CELL_SHARE = 0.05  # side of the grid cells that measure area, as a share of the median depth
+_MIN_SHARE = 0.12  # smallest area of a floor, as a share of the largest level surface
+_MIN_CELLS = 30  # smallest area of a floor, in cells
+_BELOW_SHARE = 0.18  # a candidate with more cells below its edge than this share of its own cells is a table
+_BELOW_MARGIN = 0.10  # surface counts as below from this share of the camera's height over the candidate
 
 
 @dataclass(frozen=True)
 class Floor:
-    """The floor in upright, unscaled space."""
+    """The floor in upright `sfm` space (+z up, unscaled)."""
 
-    height: float  # z of the floor; else of the level surface that is `table`; else of the lowest point
+    height: float  # z of the floor if observed, else of the table, else of the lowest points
     observed: bool
-    table: bool  # a level surface was found, but it stands above something else
+    table: bool  # no floor was found, but a level surface above other surface
 
 
 def find_floor(samples: SurfaceSamples) -> Floor:
-    """Find the floor among upright samples (+z is up)."""
+    """Detect the floor in upright samples (+z up)."""
     depth = float(np.median(samples.depths))
     band, cell = _BAND_SHARE * depth, _CELL_SHARE * depth
     level = np.flatnonzero(samples.normals[:, 2] > np.cos(np.radians(_LEVEL_DEG)))
     candidates = _level_surfaces(samples, level, band, cell)
-    lowest = float(
-        np.quantile(
-            samples.points[samples.measured, 2] if samples.measured.any() else samples.points[:, 2], 0.005
-        )
-    )
+    lowest = lowest_height(samples)
     eye = float(np.median(samples.eyes[:, 2]))
     candidates = [(height, cells) for height, cells in candidates if height < eye]
     if not candidates:
@@ -53,23 +48,29 @@ def find_floor(samples: SurfaceSamples) -> Floor:
             below = _cells_below_edge(samples, height, _BELOW_MARGIN * (eye - height) + band, cell, band)
             if below < _BELOW_SHARE * cells:
                 return Floor(height, True, False)
-            # Things stand on something lower that is not seen. The largest surface is most likely a table.
+            # Surface is seen below: the floor is hidden, and the largest candidate is most likely a table.
             table = max(candidates, key=lambda item: item[1])[0]
             return Floor(_settle(samples, level, table, band), False, True)
     return Floor(lowest, False, False)
 
 
+def lowest_height(samples: SurfaceSamples) -> float:
+    """Return the 0.5 % quantile of the heights of upright samples, the measured ones if there are any."""
+    points = samples.points[samples.measured] if samples.measured.any() else samples.points
+    return float(np.quantile(points[:, 2], 0.005))
+
+
 def _level_surfaces(
     samples: SurfaceSamples, level: np.ndarray, band: float, cell: float
 ) -> list[tuple[float, int]]:
-    """Return (height, number of covered cells) of every peak of the level area over height."""
+    """Return (height, number of covered cells) at each peak of the histogram of level area over height."""
     if len(level) < 50:
         return []
     heights = samples.points[level, 2]
     cells = plane_cells(samples.points[level], _UP, cell)
     low = heights.min()
     layer = ((heights - low) / band).astype(np.int64)
-    # Distinct cells a layer, not pixels: what many frames see counts once.
+    # Count distinct cells per layer, so that surface seen by many frames counts once.
     unique = np.unique(np.column_stack([layer, cells]), axis=0)
     counts = np.bincount(unique[:, 0], minlength=int(layer.max()) + 3).astype(float)
     smooth = np.convolve(counts, [0.5, 1.0, 0.5], mode="same")
@@ -84,7 +85,7 @@ def _level_surfaces(
 
 
 def _settle(samples: SurfaceSamples, level: np.ndarray, height: float, band: float) -> float:
-    """Refine the height by the weighted median of what lies within the band."""
+    """Refine a height by the weighted median of the level samples within the band, iterated."""
     for _ in range(5):
         off = samples.points[level, 2] - height
         near = np.abs(off) < 2 * band
@@ -95,7 +96,7 @@ def _settle(samples: SurfaceSamples, level: np.ndarray, height: float, band: flo
 
 
 def _cells_below_edge(samples: SurfaceSamples, height: float, margin: float, cell: float, band: float) -> int:
-    """Count the cells of things below a level surface that are seen past its edge, not through it."""
+    """Count the cells below a level surface that at least two frames see past its edge, not through it."""
     deep = samples.measured & (samples.points[:, 2] < height - margin)
     if not deep.any():
         return 0
@@ -107,18 +108,17 @@ def _cells_below_edge(samples: SurfaceSamples, height: float, margin: float, cel
     through = _is_near(plane_cells(crossing, _UP, cell), covered)
     seen = samples.frames[deep][~through]
     voxels = np.floor(points[~through] / cell).astype(np.int64)
-    # Two frames must agree on a cell; what one frame alone sees is noise.
     pairs = np.unique(np.column_stack([voxels, seen]), axis=0)
     _, views = np.unique(pairs[:, :3], axis=0, return_counts=True)
     return int((views >= 2).sum())
 
 
 def _is_near(cells: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Tell which cells (m, 2) are covered or next to a covered one."""
+    """Return the mask (m,) of cells (m, 2) that are covered (c, 2) or next to a covered one."""
     low = np.minimum(cells.min(axis=0), covered.min(axis=0)) - 2
     size = np.maximum(cells.max(axis=0), covered.max(axis=0)) - low + 3
     if size[0] * size[1] > 50_000_000:
-        # Wild outliers: look only where the surface is.
+        # Far outliers would make the grid too large: limit it to the covered cells.
         low, size = covered.min(axis=0) - 2, np.ptp(covered, axis=0) + 5
     inside = np.all((cells >= low + 1) & (cells < low + size - 1), axis=1)
     grid = np.zeros(size, bool)

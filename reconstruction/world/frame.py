@@ -1,4 +1,4 @@
-"""The stage: gravity, yaw, floor and metres, put together into one similarity."""
+"""The world stage: compose gravity, yaw, floor and scale into one similarity transform."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import numpy as np
 from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.core.types import DepthMaps, PosedFrames, ScaleEstimate, WorldFrame
 from reconstruction.world.config import WorldConfig
-from reconstruction.world.floor import Floor, find_floor
+from reconstruction.world.floor import Floor, find_floor, lowest_height
 from reconstruction.world.gravity import find_gravity
 from reconstruction.world.request import parse_scale
 from reconstruction.world.samples import SurfaceSamples, sample_surface
@@ -15,23 +15,23 @@ from reconstruction.world.scale import Metres, camera_heights, find_scale
 from reconstruction.world.yaw import find_yaw, level_rotation, turn_about_z
 from registry.errors import UsageError
 
-_USER_OBJECT_SIGMA = 0.03
-_CLEARANCE_M = 0.05
+_USER_OBJECT_SIGMA = 0.03  # relative standard deviation of a scale from `--scale object`
+_CLEARANCE_M = 0.05  # an unseen floor is assumed at least this far below all seen surface
 
 
 def find_world(
     posed: PosedFrames, depth: DepthMaps, config: WorldConfig, *, progress: Progress = NO_PROGRESS
 ) -> WorldFrame:
-    """Find the similarity from sfm space to the world: metres, +z up, walls along x and y, floor at z = 0.
+    """Estimate the similarity from `sfm` to `world`: metres, +z up, walls along x and y, floor at z = 0.
 
     Args:
-        posed: Keyframes with cameras in sfm space.
-        depth: Their depth maps in sfm units.
-        config: See `WorldConfig`.
-        progress: Told about decisions and fallbacks.
+        posed: keyframes with cameras in `sfm` space.
+        depth: their depth maps in `sfm` units.
+        config: settings.
+        progress: receives steps, decisions and fallbacks.
 
     Raises:
-        InputError: there is next to no depth.
+        InputError: there is too little depth.
         UsageError: `config.scale` names a frame or pixel that does not exist.
     """
     progress.start(4, "world frame")
@@ -54,21 +54,19 @@ def find_world(
     height = floor_height(upright, floor, metres, config)
     world_from_sfm[:3, 3] = -metres.per_unit * np.array([middle[0], middle[1], height])
     if not floor.observed:
-        why = (
-            "a level surface is seen, but things are seen below it"
-            if floor.table
-            else "nothing level is seen"
-        )
+        why = "there is surface below the level surface" if floor.table else "no level surface was found"
         below_m = metres.per_unit * (float(np.median(camera_heights(upright))) - height)
         progress.note(f"world: no floor is in view ({why}); one is assumed {below_m:.2f} m below the camera")
     if not snapped:
-        progress.note("world: no walls or upright faces were found to align x and y with")
+        progress.note(
+            "world: no walls or upright faces were found; x and y follow the viewing direction instead"
+        )
     world = WorldFrame(
-        world_from_sfm=world_from_sfm,
-        scale=metres.estimate,
-        gravity_method=gravity.method,
-        gravity_sigma_deg=gravity.sigma_deg,
-        floor_observed=floor.observed,
+        world_from_sfm,
+        metres.estimate,
+        gravity.method,
+        gravity.sigma_deg,
+        floor.observed,
         yaw_snapped=snapped,
     )
     progress.advance()
@@ -76,7 +74,7 @@ def find_world(
 
 
 def floor_height(upright: SurfaceSamples, floor: Floor, metres: Metres, config: WorldConfig) -> float:
-    """Return the floor's height in upright sfm units: as seen, or a likely place below everything seen."""
+    """Return the floor's height in upright `sfm` units: as observed, or assumed below all seen surface."""
     if floor.observed:
         return floor.height
     clearance = _CLEARANCE_M / metres.per_unit
@@ -85,36 +83,32 @@ def floor_height(upright: SurfaceSamples, floor: Floor, metres: Metres, config: 
     if known is not None and known.kind == "camera-height":
         height_m = known.value_m
     expected = float(np.median(camera_heights(upright))) - height_m / metres.per_unit
-    measured = upright.points[upright.measured] if upright.measured.any() else upright.points
-    lowest = float(np.quantile(measured[:, 2], 0.005)) - clearance
     if floor.table:
         expected = floor.height - config.table_height_prior_m / metres.per_unit
-    return min(expected, lowest)
+    return min(expected, lowest_height(upright) - clearance)
 
 
 def rescale_for_object(world: WorldFrame, measured_height_m: float, wanted_height_m: float) -> WorldFrame:
-    """Return the world scaled so that an object which measured `measured_height_m` is `wanted_height_m` high.
+    """Return the world rescaled so that an object of height `measured_height_m` gets height `wanted_height_m`.
 
-    The floor stays at z = 0 and the origin where it is.
+    The floor stays at z = 0, and the origin in place.
 
     Raises:
         UsageError: a height is not a positive number.
     """
     for name, value in (("measured", measured_height_m), ("wanted", wanted_height_m)):
         if not np.isfinite(value) or value <= 0:
-            raise UsageError(f"--scale object: the {name} height is {value:g} m, which is no height")
+            raise UsageError(f"--scale object: the {name} height is {value:g} m; it must be positive")
     factor = wanted_height_m / measured_height_m
     world_from_sfm = world.world_from_sfm.copy()
     world_from_sfm[:3] *= factor
-    detail = (
-        f"you said that an object is {wanted_height_m:g} m high; it had measured {measured_height_m:.3f} m"
-    )
+    detail = f"--scale: an object is {wanted_height_m:g} m high; at the former scale it was {measured_height_m:.3f} m"
     estimate = ScaleEstimate("user-object", _USER_OBJECT_SIGMA, detail)
     return replace(world, world_from_sfm=world_from_sfm, scale=estimate)
 
 
 def rotate_samples(samples: SurfaceSamples, rotation: np.ndarray) -> SurfaceSamples:
-    """Return the samples in a rotated space."""
+    """Return the samples in space b, for `rotation` (3, 3) = b_from_a."""
     return replace(
         samples,
         points=samples.points @ rotation.T,
@@ -124,13 +118,13 @@ def rotate_samples(samples: SurfaceSamples, rotation: np.ndarray) -> SurfaceSamp
 
 
 def _apply_object_request(world: WorldFrame, config: WorldConfig, progress: Progress) -> WorldFrame:
+    """Apply `--scale object` once the object's height is known; a marker takes precedence."""
     request = parse_scale(config.scale) if config.scale else None
     if request is None or request.kind != "object" or world.scale.method == "marker":
         return world
     if config.object_measured_height_m <= 0:
         progress.note(
-            f"world: the scale is provisional ({world.scale.method}) until object {request.object_id} "
-            "is found"
+            f"world: the scale is provisional ({world.scale.method}) until object {request.object_id} is found"
         )
         return world
     return rescale_for_object(world, config.object_measured_height_m, request.value_m)

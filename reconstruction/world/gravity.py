@@ -1,10 +1,9 @@
-"""Which way is up: horizontal planes and walls vote, the cameras' own up says where to look.
+"""Estimate the up direction from camera orientations, surface normals and fitted planes.
 
-People hold a camera without roll, more or less, and pitch it as they like. So each camera's x axis is nearly
-orthogonal to up (a few degrees), while its -y axis is only roughly up. Directions near that are scored by the
-share of the surface that would be horizontal or vertical, the best is refined by iteratively reweighted least
-squares on the sphere, and at last by planes fitted through whole floors, tables and walls, which average over
-more than any window.
+Hand-held cameras have little roll but any pitch: each camera's x axis is orthogonal to up within a few degrees, while
+its -y axis is only roughly up. Candidate directions near that prior are scored by the share of surface that they make
+horizontal or vertical. The best is refined by iteratively reweighted least squares on the normals, then on planes
+fitted to whole floors, tables and walls.
 """
 
 from dataclasses import dataclass
@@ -15,29 +14,31 @@ from reconstruction.core.types import PosedFrames
 from reconstruction.world.planes import FittedPlane, fit_planes
 from reconstruction.world.samples import SurfaceSamples
 
-_ROLL_SIGMA_DEG = 4.0
-_PITCH_SIGMA_DEG = 28.0
-_SEARCH_DEG = 60.0
-_MAX_ROLL_COST = 1.8  # six times the surface outweighs any roll
-_VOTE_WIDTH_DEG = 5.0
-_WALL_SHARE = 0.35  # a wall's vote leaves one direction free, and furniture has many upright faces
-_PLANE_SIGMA_DEG = 0.6  # how far a fitted plane may be from level or plumb and still count in full
-_SYSTEMATIC_DEG = 0.15
-_MIN_EVIDENCE = 0.03  # share of the surface
+_ROLL_SIGMA_DEG = 4.0  # standard deviation of camera roll
+_PITCH_SIGMA_DEG = 28.0  # standard deviation of camera pitch
+_SEARCH_DEG = 60.0  # largest angle between candidates and the camera prior
+_MAX_ROLL_COST = 1.8  # in log votes: six times the surface outweighs any roll
+_VOTE_WIDTH_DEG = 5.0  # standard deviation of a normal's vote
+_WALL_SHARE = (
+    0.35  # weight of vertical surface: it leaves one rotation free, and furniture has many upright faces
+)
+_PLANE_SIGMA_DEG = 0.6  # standard deviation of floors, tables and walls from level or plumb
+_SYSTEMATIC_DEG = 0.15  # lower bound of the reported standard deviation
+_MIN_EVIDENCE = 0.03  # smallest share of level or plumb surface for plane fitting
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """The direction of up and how it was found."""
+    """The up direction, its evidence and its accuracy."""
 
-    up: np.ndarray  # float64 (3,) unit, sfm space
+    up: np.ndarray  # float64 (3,) unit, `sfm` space
     method: str  # "planes+walls+cameras" | "planes+cameras" | "walls+cameras" | "cameras"
-    sigma_deg: float
-    planes: tuple[FittedPlane, ...]  # level and plumb planes that it rests on
+    sigma_deg: float  # standard deviation
+    planes: tuple[FittedPlane, ...]  # level and plumb planes that determined it
 
 
 def find_gravity(posed: PosedFrames, samples: SurfaceSamples) -> Gravity:
-    """Find up in sfm space."""
+    """Estimate up in `sfm` space."""
     right = posed.world_from_camera[:, :3, 0]
     rough_up = -posed.world_from_camera[:, :3, 1]
     prior = camera_up(right, rough_up)
@@ -52,18 +53,18 @@ def find_gravity(posed: PosedFrames, samples: SurfaceSamples) -> Gravity:
     has_level = any(p.level for p in planes)
     has_plumb = any(not p.level for p in planes)
     if not has_level and has_plumb:
-        # One wall leaves the turn about its normal to the cameras; two cross.
+        # Parallel walls leave the rotation about their normal to the cameras.
         sigma = max(sigma, _camera_sigma(up, right) if _walls_are_parallel(planes) else sigma)
     parts = ["planes"] * has_level + ["walls"] * has_plumb + ["cameras"]
     return Gravity(up, "+".join(parts), float(sigma), planes)
 
 
 def camera_up(right: np.ndarray, rough_up: np.ndarray) -> np.ndarray:
-    """Return up as the cameras alone tell it: no roll, moderate pitch, robust to some turned frames.
+    """Estimate up (3,) from cameras alone: no roll, moderate pitch; robust to some rolled frames.
 
     Args:
-        right: The cameras' x axes (n, 3).
-        rough_up: The cameras' -y axes (n, 3).
+        right: x axes (n, 3) of the cameras.
+        rough_up: -y axes (n, 3) of the cameras.
     """
     weights = np.ones(len(right))
     up = _unit(np.median(rough_up, axis=0))
@@ -80,7 +81,7 @@ def camera_up(right: np.ndarray, rough_up: np.ndarray) -> np.ndarray:
 def _best_vote(
     prior: np.ndarray, right: np.ndarray, rough_up: np.ndarray, samples: SurfaceSamples
 ) -> np.ndarray:
-    """Return the direction near the cameras' up that makes most of the surface level or plumb."""
+    """Return the candidate direction near the prior with the most level and plumb surface and the least roll."""
     normals, mass = _binned(samples)
     candidates = _fibonacci_sphere(6000)
     candidates = candidates[candidates @ prior > np.cos(np.radians(_SEARCH_DEG))]
@@ -90,16 +91,15 @@ def _best_vote(
     plumb = np.exp(-0.5 * (np.arcsin(np.clip(cosine, -1, 1)) / width) ** 2)
     votes = (level + _WALL_SHARE * plumb) @ mass
     roll = np.arcsin(np.clip(candidates @ right.T, -1, 1)) / np.radians(_ROLL_SIGMA_DEG)
-    # A Cauchy-like penalty: a few turned frames must not veto. A whole film held askew is rarer than a level room.
+    # Cauchy-like and bounded, so that neither a few rolled frames nor a wholly rolled video outvote the surface.
     roll_cost = np.minimum(np.log1p(0.5 * roll**2).mean(axis=1), _MAX_ROLL_COST)
-    pitch = np.arccos(np.clip(candidates @ _unit(rough_up.mean(axis=0)), -1, 1)) / np.radians(
-        _PITCH_SIGMA_DEG
-    )
+    pitch_rad = np.arccos(np.clip(candidates @ _unit(rough_up.mean(axis=0)), -1, 1))
+    pitch = pitch_rad / np.radians(_PITCH_SIGMA_DEG)
     return candidates[np.argmax(np.log(votes + 0.02) - roll_cost - 0.5 * pitch**2)]
 
 
 def _binned(samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
-    """Return a few thousand directions (k, 3) and the share of the surface that faces each."""
+    """Bin the normals; return mean directions (k, 3) and the share of surface (k,) in each bin."""
     keys = np.round(samples.normals * 14).astype(np.int64) + 20
     _, bins = np.unique(keys @ [1600, 40, 1], return_inverse=True)
     total = [np.bincount(bins, weights=samples.weights * samples.normals[:, k]) for k in range(3)]
@@ -109,7 +109,7 @@ def _binned(samples: SurfaceSamples) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _refine_on_normals(up: np.ndarray, right: np.ndarray, samples: SurfaceSamples) -> np.ndarray:
-    """Refine by reweighted least squares: level normals along up, plumb ones and camera x axes across it."""
+    """Refine up by reweighted least squares: level normals parallel to it, plumb ones and camera x axes orthogonal."""
     for width_deg in (8.0, 6.0, 5.0, 4.0, 3.0, 3.0, 3.0, 3.0):
         width = np.radians(width_deg)
         cosine = np.clip(samples.normals @ up, -1, 1)
@@ -117,7 +117,7 @@ def _refine_on_normals(up: np.ndarray, right: np.ndarray, samples: SurfaceSample
         plumb = _WALL_SHARE * samples.weights * _biweight(np.arcsin(cosine) / (2 * width))
         n = samples.normals
         matrix = level.sum() * np.eye(3) - (level[:, None] * n).T @ n + (plumb[:, None] * n).T @ n
-        # The cameras decide only what the surface leaves open.
+        # A small weight: cameras decide only what the surface leaves open.
         matrix += 1e-3 * samples.weights.sum() * right.T @ right / len(right)
         _, vectors = np.linalg.eigh(matrix)
         up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
@@ -127,7 +127,7 @@ def _refine_on_normals(up: np.ndarray, right: np.ndarray, samples: SurfaceSample
 def _refine_on_planes(
     up: np.ndarray, right: np.ndarray, planes: tuple[FittedPlane, ...]
 ) -> tuple[np.ndarray, float]:
-    """Refine by whole planes; those that are not level or plumb after all lose their weight."""
+    """Refine up by robust least squares over fitted planes and cameras; return it and its standard deviation (deg)."""
     camera = right.T @ right / len(right) / np.radians(_ROLL_SIGMA_DEG) ** 2
     normals = np.array([p.normal for p in planes])
     level = np.array([p.level for p in planes])
@@ -142,13 +142,13 @@ def _refine_on_planes(
             matrix += w * (np.eye(3) - np.outer(n, n) if is_level else np.outer(n, n))
         values, vectors = np.linalg.eigh(matrix)
         up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
-    # The second smallest eigenvalue is the information about the least certain turn.
-    return up, float(
-        np.degrees(np.hypot(1 / np.sqrt(max(values[1] - values[0], 1e-9)), np.radians(_SYSTEMATIC_DEG)))
-    )
+    # The second smallest eigenvalue is the information about the least certain rotation.
+    sigma = 1 / np.sqrt(max(values[1] - values[0], 1e-9))
+    return up, float(np.degrees(np.hypot(sigma, np.radians(_SYSTEMATIC_DEG))))
 
 
 def _evidence(up: np.ndarray, samples: SurfaceSamples) -> tuple[float, float]:
+    """Return the shares of surface that are level and plumb within 8 degrees."""
     cosine = samples.normals @ up
     total = samples.weights.sum()
     level = samples.weights[np.abs(cosine) > np.cos(np.radians(8))].sum() / total
@@ -161,7 +161,7 @@ def _walls_are_parallel(planes: tuple[FittedPlane, ...]) -> bool:
 
 
 def _camera_sigma(up: np.ndarray, right: np.ndarray) -> float:
-    """Return how sure the cameras alone are: the spread of their roll, which has a habit, too."""
+    """Return the standard deviation of camera roll (deg), by the median absolute deviation, at least 1.5."""
     roll_deg = np.degrees(np.arcsin(np.clip(right @ up, -1, 1)))
     return float(max(1.5, 1.4826 * np.median(np.abs(roll_deg))))
 

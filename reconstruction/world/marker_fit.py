@@ -1,9 +1,9 @@
-"""The size of a printed marker by its whole picture: a square in space is moved until its pattern matches all views.
+"""Measure the side of a printed marker by direct image alignment over all views.
 
-Corners found in single images are off by a tenth of a pixel or two, always to the same side where code cells touch
-them; on a marker of 20 pixels that is a percent. Here every pixel counts: the known pattern, blurred as a lens does,
-is drawn at the seven parameters of a square (place, direction, side), and Gauss-Newton steps bring the drawing to the
-images. Brightness and contrast are free in every view.
+Corner detections are biased by a tenth of a pixel or two where code cells touch the corner, which is a percent of a
+marker of 20 pixels. Therefore the known pattern, blurred as by a lens, is rendered as a square in space with seven
+parameters (position, rotation, side), and Gauss-Newton minimizes its difference to the images. Gain and offset are free
+in each view.
 """
 
 from dataclasses import dataclass
@@ -14,29 +14,30 @@ from scipy.spatial.transform import Rotation
 
 from reconstruction.core.types import PosedFrames
 
-_TEXELS = 16  # of the drawn pattern, per cell
-_MARGIN_CELLS = 0.5  # of the white around the square that is compared, too
+_TEXELS = 16  # of the rendered pattern, per cell
+_MARGIN_CELLS = 0.5  # width of the white border that is compared as well
 _MAX_VIEWS = 24
 _MAX_PIXELS = 900  # per view
-_BLURS_PX = (0.35, 0.6, 0.9, 1.3)
-_STEPS = 8
+_BLURS_PX = (0.35, 0.6, 0.9, 1.3)  # candidates for the standard deviation of the blur
+_STEPS = 8  # of Gauss-Newton
 _STEP_PX = 0.15  # of the finite differences
-_MIN_CORRELATION = 0.8
-_GROUPS = 8
+_MIN_CORRELATION = 0.8  # of image and pattern, for a view to count
+_GROUPS = 8  # of the jackknife
+# Samples within a pixel, in standard deviations of the blur.
 _TAPS = np.array([(x, y) for x in (-1.2, 0.0, 1.2) for y in (-1.2, 0.0, 1.2)])
 
 
 @dataclass(frozen=True)
 class Square:
-    """A marker in space: x to its right, y down, seen from its front."""
+    """A marker in `sfm` space; seen from its front, x is right and y down."""
 
     center: np.ndarray  # float64 (3,)
-    axes: np.ndarray  # float64 (3, 3), columns x, y and the normal
-    side: float
+    axes: np.ndarray  # float64 (3, 3) columns x, y and normal
+    side: float  # `sfm` units
 
     @classmethod
     def of_corners(cls, corners: np.ndarray) -> "Square":
-        """Return the square nearest to four corners (4, 3): top left, top right, bottom right, bottom left."""
+        """Fit a square to four corners (4, 3): top left, top right, bottom right, bottom left."""
         center = corners.mean(axis=0)
         x = corners[1] + corners[2] - corners[0] - corners[3]
         y = corners[2] + corners[3] - corners[0] - corners[1]
@@ -46,39 +47,37 @@ class Square:
         return cls(center, axes, float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).mean()))
 
     def moved(self, step: np.ndarray) -> "Square":
-        """Return the square moved by (7,): shift in sides along its axes, turn in radians, log of the side."""
+        """Apply a step (7,): translation along its axes in sides, rotation vector in radians, log of the side."""
         turn = Rotation.from_rotvec(step[3:6]).as_matrix()
-        return Square(
-            self.center + self.side * self.axes @ step[:3],
-            self.axes @ turn,
-            self.side * float(np.exp(step[6])),
-        )
+        center = self.center + self.side * self.axes @ step[:3]
+        return Square(center, self.axes @ turn, self.side * float(np.exp(step[6])))
 
 
 @dataclass(frozen=True)
 class _View:
     """The pixels of one image that a marker covers."""
 
-    values: np.ndarray  # float64 (p,)
-    rays: np.ndarray  # float64 (p, t, 3) through the taps of each pixel, world space
-    tap_weights: np.ndarray  # float64 (t,)
-    eye: np.ndarray  # float64 (3,)
+    values: np.ndarray  # float64 (p,) gray levels
+    rays: np.ndarray  # float64 (p, t, 3) through the taps of each pixel, `sfm` space
+    tap_weights: np.ndarray  # float64 (t,) sum 1
+    eye: np.ndarray  # float64 (3,) camera center
     pixels: float  # side of the marker in the image
 
 
 def fit_square(
     posed: PosedFrames, rows: list[int], start: Square, cells: np.ndarray
 ) -> tuple[Square, float, int] | None:
-    """Return the square that matches the images, the relative 1-sigma of its side, and the number of views used.
+    """Align a square to the images of a marker.
 
     Args:
         posed: the frames.
-        rows: those that see the marker.
-        start: where the marker is, within a pixel or two.
-        cells: uint8 (n, n) the printed cells, 0 black, 255 white, with the black border.
+        rows: frames that see the marker.
+        start: the marker, accurate to a pixel or two.
+        cells: uint8 (n, n) the printed cells with the black border, 0 black, 255 white.
 
     Returns:
-        None where fewer than two views agree with the pattern.
+        The square, the relative standard deviation of its side, and the number of views used; None if fewer than two
+        views match the pattern.
     """
     pattern = _pattern(cells)
     views = [view for row in rows if (view := _best_blur(posed, row, start, pattern, len(cells))) is not None]
@@ -87,7 +86,7 @@ def fit_square(
     for _ in range(2):
         if len(views) < 2:
             return None
-        square, _ = _descend(views, square, pattern, len(cells), _STEPS)
+        square = _descend(views, square, pattern, len(cells))
         scores = [_correlation(view, square, pattern, len(cells)) for view in views]
         views = [view for view, score in zip(views, scores) if score > _MIN_CORRELATION]
     if len(views) < 2:
@@ -96,13 +95,13 @@ def fit_square(
 
 
 def _pattern(cells: np.ndarray) -> np.ndarray:
-    """Return the print in [0, 1] at _TEXELS a cell with two white cells around it, a little blurred."""
+    """Return the print in [0, 1] at _TEXELS per cell, with a white border of two cells, slightly blurred."""
     padded = np.pad(cells.astype(np.float32) / 255.0, 2, constant_values=1.0)
     return cv2.GaussianBlur(padded.repeat(_TEXELS, 0).repeat(_TEXELS, 1), (0, 0), 0.06 * _TEXELS)
 
 
 def _view(posed: PosedFrames, row: int, square: Square, cells: int, blur_px: float) -> _View | None:
-    """Gather the pixels of one frame; None where the marker is not wholly in it."""
+    """Gather the pixels of one frame; None if the marker is not wholly in view."""
     camera, pose = posed.camera, posed.world_from_camera[row]
     reach = 0.5 + _MARGIN_CELLS / cells
     outline = reach * square.side * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
@@ -121,16 +120,14 @@ def _view(posed: PosedFrames, row: int, square: Square, cells: int, blur_px: flo
     gray = np.asarray(posed.images[row]).astype(np.float64) @ [0.299, 0.587, 0.114]
     taps = _TAPS * blur_px
     at = np.stack([u, v], axis=1)[:, None] + 0.5 + taps
-    local = np.concatenate(
-        [(at - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((*at.shape[:2], 1))], -1
-    )
+    local = camera.unproject(at[..., 0], at[..., 1], 1.0)
     weights = np.exp(-0.5 * (taps**2).sum(axis=1) / blur_px**2)
     side_px = float(np.sqrt(cv2.contourArea(quad.astype(np.float32)))) / (2 * reach)
     return _View(gray[v, u], local @ pose[:3, :3].T, weights / weights.sum(), pose[:3, 3], side_px)
 
 
 def _drawn(view: _View, square: Square, pattern: np.ndarray, cells: int) -> np.ndarray:
-    """Return what the pattern gives at the view's pixels (p,)."""
+    """Render the pattern at the view's pixels (p,)."""
     normal = square.axes[:, 2]
     depth = (square.center - view.eye) @ normal / (view.rays @ normal)
     on_plane = (view.eye + depth[..., None] * view.rays - square.center) @ square.axes[:, :2]
@@ -152,18 +149,16 @@ def _correlation(view: _View, square: Square, pattern: np.ndarray, cells: int) -
 
 
 def _best_blur(posed: PosedFrames, row: int, square: Square, pattern: np.ndarray, cells: int) -> _View | None:
-    views = [_view(posed, row, square, cells, blur) for blur in _BLURS_PX]
-    if views[0] is None or len(views[0].values) < 40:
+    """Return the view of a frame with the blur that correlates best; None if the marker is too small or cut off."""
+    views = [view for blur in _BLURS_PX if (view := _view(posed, row, square, cells, blur)) is not None]
+    if not views or len(views[0].values) < 40:
         return None
     return max(views, key=lambda view: _correlation(view, square, pattern, cells))
 
 
-def _descend(
-    views: list[_View], square: Square, pattern: np.ndarray, cells: int, steps: int
-) -> tuple[Square, np.ndarray]:
-    """Take Gauss-Newton steps on all views together; also return the last step (7,)."""
-    step = np.zeros(7)
-    for _ in range(steps):
+def _descend(views: list[_View], square: Square, pattern: np.ndarray, cells: int) -> Square:
+    """Take Gauss-Newton steps on all views together, until they are below 3e-5."""
+    for _ in range(_STEPS):
         normal, right = np.zeros((7, 7)), np.zeros(7)
         for view in views:
             jacobian, residual = _linearized(view, square, pattern, cells)
@@ -174,13 +169,13 @@ def _descend(
         square = square.moved(step)
         if np.abs(step).max() < 3e-5:
             break
-    return square, step
+    return square
 
 
 def _linearized(
     view: _View, square: Square, pattern: np.ndarray, cells: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the drawing's derivative (p, 7) and what it lacks to the image (p,), both without gain and offset."""
+    """Return the Jacobian (p, 7) and the residual (p,), robustly weighted, with gain and offset projected out."""
     drawn = _drawn(view, square, pattern, cells)
     size = _STEP_PX / max(view.pixels, 1.0)
     jacobian = np.empty((len(drawn), 7))
@@ -195,12 +190,12 @@ def _linearized(
     weight = np.sqrt(np.minimum(1.0, 2.0 * spread / np.maximum(np.abs(residual), 1e-12)))
     base, jacobian, residual = base * weight[:, None], jacobian * weight[:, None], residual * weight
     jacobian = jacobian - base @ np.linalg.lstsq(base, jacobian, rcond=None)[0]
-    # Every view has the same noise in grey levels: what it says is worth its contrast.
+    # Divide by the noise, which is the same in gray levels in every view.
     return jacobian / spread, residual / spread
 
 
 def _jackknife(views: list[_View], square: Square, pattern: np.ndarray, cells: int) -> float:
-    """Return the relative 1-sigma of the side from how much it changes where some views are left out."""
+    """Return the relative standard deviation of the side, by a jackknife over groups of views."""
     groups = min(_GROUPS, len(views))
     parts = []
     for view in views:

@@ -1,4 +1,4 @@
-"""A sheet of A4 with one marker in its true size, as a PDF (vectors) or a PNG (with its resolution written into it)."""
+"""Write an A4 sheet with one marker at true size, as PDF (vectors) or PNG (with its resolution as metadata)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,33 +17,33 @@ _PIXELS_PER_M = 11_811  # 300 dots per inch
 
 @dataclass(frozen=True)
 class MarkerSheet:
-    """What is printed."""
+    """A marker to print."""
 
-    dictionary: str
+    dictionary: str  # name of cv2.aruco
     id: int
     side_m: float  # of the black square
 
     def __post_init__(self) -> None:
-        """Check that the marker and the white around it fit the page."""
+        """Check that the marker and its white border fit the page."""
         cells = len(printed_cells(self.dictionary, self.id))
         largest = (_PAGE_M[0] - 2 * _PRINTER_MARGIN_M) / (1 + 2 / cells)
         if not _LEAST_SIDE_M <= self.side_m <= largest:
             raise UsageError(
                 f"a marker of {self.side_m:g} m: an A4 sheet takes {_LEAST_SIDE_M:g} to {largest:.3f} m "
-                "(the side of the black square, in metres, with the white border that it needs)"
+                "(side of the black square; a white border must fit around it)"
             )
 
     @property
     def caption(self) -> tuple[str, str]:
-        """Return the two lines below the marker."""
+        """Return the two lines of text below the marker."""
         name = self.dictionary.removeprefix("DICT_").replace("APRILTAG_", "AprilTag ")
         return (
             f"{name}, id {self.id}. Print at 100 %, then measure: the black square is {1000 * self.side_m:.1f} mm.",
-            f"simrecon reconstruct VIDEO --marker-size {self.side_m:g}   (or what you measured, in metres)",
+            f"simrecon reconstruct VIDEO --marker-size {self.side_m:g}   (or the side that you measured, in metres)",
         )
 
     def black_cells(self) -> list[tuple[float, float, float]]:
-        """Return (x, y, width) in metres from the page's lower left corner of every black cell."""
+        """Return (x, y, width) of every black cell, in metres from the page's lower left corner."""
         cells = printed_cells(self.dictionary, self.id)
         size, n = self.side_m / len(cells), len(cells)
         left, top = (_PAGE_M[0] - self.side_m) / 2, (_PAGE_M[1] + self.side_m) / 2
@@ -56,10 +56,10 @@ class MarkerSheet:
 
 
 def write_marker(sheet: MarkerSheet, file: Path) -> None:
-    """Write the sheet as PDF or PNG, by the file's ending.
+    """Write the sheet as PDF or PNG, by the file's suffix.
 
     Raises:
-        UsageError: another ending, or the folder does not exist.
+        UsageError: another suffix, or the folder does not exist.
     """
     writers = {".pdf": _write_pdf, ".png": _write_png}
     if file.suffix.lower() not in writers:
@@ -105,7 +105,7 @@ def _write_png(sheet: MarkerSheet, file: Path) -> None:
     from PIL import Image
 
     cells = printed_cells(sheet.dictionary, sheet.id)
-    # Whole pixels a cell, and the resolution that makes them the size asked for.
+    # Whole pixels per cell; the resolution makes up for the rounding.
     cell_px = round(sheet.side_m * _PIXELS_PER_M / len(cells))
     per_m = cell_px * len(cells) / sheet.side_m
     page = np.full((round(_PAGE_M[1] * per_m), round(_PAGE_M[0] * per_m)), 255, np.uint8)
@@ -114,9 +114,7 @@ def _write_png(sheet: MarkerSheet, file: Path) -> None:
     page[top : top + len(square), left : left + len(square)] = square
     line_px = 0.005 * per_m
     for n, line in enumerate(sheet.caption):
-        at = (
-            round(0.02 * per_m),
-            min(round(top + len(square) + (4 + 1.4 * n) * line_px), page.shape[0] - 20),
-        )
+        x, y = round(0.02 * per_m), round(top + len(square) + (4 + 1.4 * n) * line_px)
+        at = (x, min(y, page.shape[0] - 20))
         cv2.putText(page, line, at, cv2.FONT_HERSHEY_SIMPLEX, line_px / 60, 0, 2, cv2.LINE_AA)
     Image.fromarray(page).save(file, dpi=(per_m * 0.0254, per_m * 0.0254))

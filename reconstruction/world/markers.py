@@ -1,4 +1,4 @@
-"""Metres from printed ArUco or AprilTag markers of known size (OpenCV)."""
+"""Detect and triangulate printed ArUco or AprilTag markers (OpenCV), and measure their sides in `sfm` units."""
 
 from dataclasses import dataclass
 
@@ -10,34 +10,38 @@ from reconstruction.world.marker_fit import Square, fit_square
 from registry.errors import UsageError
 from registry.geometry import invert_rigid
 
-_MAX_REPROJECTION_PX = 2.0
-_MAX_SIDE_SPREAD = 0.10  # relative: a square has four equal sides
-_MIN_ANGLE_DEG = 2.0  # between the views of a corner
-_LEAST_SIGMA = 0.0016  # relative: what the scatter between views cannot tell
+_MAX_REPROJECTION_PX = 2.0  # mean over the corners of a frame
+_MAX_SIDE_SPREAD = 0.10  # of the four sides of a marker, relative
+_MIN_ANGLE_DEG = 2.0  # largest parallax angle of a marker must exceed this
+_LEAST_SIGMA = 0.0016  # relative error that the scatter between views does not show
 
 
 @dataclass(frozen=True)
 class MarkerSide:
-    """A marker found in several frames: the length of its side in sfm units."""
+    """The side of a marker that several frames show."""
 
-    dictionary: str
+    dictionary: str  # name of cv2.aruco
     id: int
-    side: float
-    views: int
-    relative_sigma: float
+    side: float  # of the black square, `sfm` units
+    views: int  # number of frames used
+    relative_sigma: float  # standard deviation of the side
 
 
 def detect_markers(
     posed: PosedFrames, dictionaries: tuple[str, ...], rows: np.ndarray
 ) -> dict[tuple[str, int], dict[int, np.ndarray]]:
-    """Return {(dictionary, marker id): {frame row: corners (4, 2) in pixels, centres at .5}}."""
+    """Detect markers in frames `rows`; return {(dictionary, id): {row: corners (4, 2) in pixels}}.
+
+    Raises:
+        UsageError: OpenCV has no such dictionary.
+    """
     known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
     found: dict[tuple[str, int], dict[int, np.ndarray]] = {}
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     for name in dictionaries:
         if name not in known:
-            raise UsageError(f"marker dictionary {name!r}: there are {', '.join(known)}")
+            raise UsageError(f"marker dictionary {name!r} does not exist; choose among {', '.join(known)}")
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         for row in rows:
@@ -45,7 +49,7 @@ def detect_markers(
             corners, ids, _ = detector.detectMarkers(gray)
             flat = [] if ids is None else ids.ravel().tolist()
             for marker_id, quad in zip(flat, corners):
-                # The same id twice in one image is two prints of it: neither can be followed.
+                # The same id twice in one image: two prints that cannot be told apart. Both are dropped.
                 seen = found.setdefault((name, marker_id), {})
                 seen[int(row)] = np.full((4, 2), np.nan) if int(row) in seen else quad[0] + 0.5
     for seen in found.values():
@@ -55,11 +59,10 @@ def detect_markers(
 
 
 def measure_markers(posed: PosedFrames, dictionaries: tuple[str, ...]) -> list[MarkerSide]:
-    """Triangulate every marker that two or more frames see; false detections do not survive as squares."""
+    """Measure every marker that two or more frames show; detections that are no squares in space are dropped."""
     sides = []
-    for (name, marker_id), seen in sorted(
-        detect_markers(posed, dictionaries, np.arange(len(posed.images))).items()
-    ):
+    found = detect_markers(posed, dictionaries, np.arange(len(posed.images)))
+    for (name, marker_id), seen in sorted(found.items()):
         if len(seen) < 2:
             continue
         corners = _triangulate_quad(posed, seen)
@@ -68,11 +71,8 @@ def measure_markers(posed: PosedFrames, dictionaries: tuple[str, ...]) -> list[M
         lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
         flatness = abs(np.linalg.det(corners[1:] - corners[0])) / lengths.mean() ** 3
         diagonals = np.linalg.norm(corners[:2] - corners[2:], axis=1) / (np.sqrt(2) * lengths.mean())
-        if (
-            np.ptp(lengths) > _MAX_SIDE_SPREAD * lengths.mean()
-            or flatness > 0.1
-            or abs(diagonals - 1).max() > 0.1
-        ):
+        uneven = np.ptp(lengths) > _MAX_SIDE_SPREAD * lengths.mean()
+        if uneven or flatness > 0.1 or abs(diagonals - 1).max() > 0.1:
             continue
         fitted = fit_square(posed, sorted(seen), Square.of_corners(corners), printed_cells(name, marker_id))
         if fitted is None:
@@ -83,7 +83,7 @@ def measure_markers(posed: PosedFrames, dictionaries: tuple[str, ...]) -> list[M
 
 
 def printed_cells(dictionary: str, marker_id: int) -> np.ndarray:
-    """Return the cells (n, n) of a marker with its black border, 0 or 255.
+    """Return the cells, uint8 (n, n), of a marker with its black border, 0 or 255.
 
     Raises:
         UsageError: the dictionary has no such marker.
@@ -91,13 +91,13 @@ def printed_cells(dictionary: str, marker_id: int) -> np.ndarray:
     table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     if not 0 <= marker_id < len(table.bytesList):
         raise UsageError(
-            f"marker {marker_id}: {dictionary.removeprefix('DICT_')} has 0 to {len(table.bytesList) - 1}"
+            f"marker id {marker_id}: {dictionary.removeprefix('DICT_')} has 0 to {len(table.bytesList) - 1}"
         )
     return cv2.aruco.generateImageMarker(table, marker_id, table.markerSize + 2)
 
 
 def _triangulate_quad(posed: PosedFrames, seen: dict[int, np.ndarray]) -> np.ndarray | None:
-    """Return the corners (4, 3), or None where they do not agree across the frames."""
+    """Triangulate corners (4, 3), dropping frames with the largest error; None if fewer than two agree."""
     rows = sorted(seen)
     keep = list(rows)
     for _ in range(len(rows)):
@@ -123,7 +123,7 @@ def _parallax_deg(posed: PosedFrames, rows: list[int], corners: np.ndarray) -> f
 
 
 def _triangulate(projections: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return the point (3,) seen at `pixels` (n, 2) through `projections` (n, 3, 4), by the linear method."""
+    """Return the point (3,) seen at `pixels` (n, 2) through `projections` (n, 3, 4), by the direct linear transform."""
     rows = pixels[:, :, None] * projections[:, 2:3] - projections[:, :2]
     _, _, vt = np.linalg.svd(rows.reshape(-1, 4) / np.linalg.norm(rows.reshape(-1, 4), axis=1, keepdims=True))
     return vt[-1, :3] / vt[-1, 3]

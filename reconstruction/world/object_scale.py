@@ -1,4 +1,4 @@
-"""`--scale object:ID.height=H`: find the scale at which the object, reconstructed at that scale, is H high."""
+"""Solve `--scale object:ID.height=H`: find the scale at which the reconstructed object is H high."""
 
 from collections.abc import Callable
 
@@ -13,16 +13,16 @@ def settle_object_height(
 ) -> tuple[float, float]:
     """Return the divisor of the scale that brings the object closest to `wanted_m`, and its relative error there.
 
-    Thresholds are in metres, so a scene of another size is cut and completed a little differently: the object does
-    not grow with the scale alone, and one correction leaves up to a tenth.
+    Fixed-point iteration. Thresholds of later stages are in metres, so the object's height is not proportional to the
+    scale: a single correction leaves up to a tenth.
 
     Args:
-        provisional_m: the object's height at the provisional scale.
-        wanted_m: what the user says that it is.
-        height_at: reconstructs with the provisional scale times wanted_m / measured_m, and returns the object's height;
-            called with measured_m.
-        tolerance: relative error that is good enough.
-        passes: how often `height_at` is called at most.
+        provisional_m: height of the object at the provisional scale.
+        wanted_m: height given by the user.
+        height_at: called with measured_m, reconstructs at the provisional scale times wanted_m / measured_m and returns
+            the object's height.
+        tolerance: relative error at which to stop.
+        passes: largest number of calls of `height_at`.
     """
     measured_m, best = provisional_m, (provisional_m, float("inf"))
     for _ in range(passes):

@@ -1,7 +1,6 @@
-"""Planes through the sampled surface: level ones (floor, tables) by height, plumb ones (walls) by direction.
+"""Fit planes to surface samples of all frames: level ones (floor, tables) and plumb ones (walls).
 
-Fits run over all frames at once. A plane's area is counted in cells of a grid, so that what many frames see
-does not count more than what few see.
+The area of a plane is counted in grid cells, so that it does not grow with the number of frames that see it.
 """
 
 from dataclasses import dataclass
@@ -11,42 +10,40 @@ import numpy as np
 from reconstruction.world.samples import SurfaceSamples
 
 _BAND_SHARE = 0.012  # half the thickness of a plane's band, as a share of the median depth
-_CELL_SHARE = 0.04  # side of the cells that measure area
-_MIN_CELLS = 40
-_NORMAL_DEG = 15.0
-_MAX_PLANES = 6
+_CELL_SHARE = 0.04  # side of the cells that measure area, as a share of the median depth
+_MIN_CELLS = 40  # smallest area of a plane
+_NORMAL_DEG = 15.0  # largest angle between normals and the plane's expected direction
+_MAX_PLANES = 6  # per direction
 
 
 @dataclass(frozen=True)
 class FittedPlane:
-    """A plane through many samples: normal . x = offset."""
+    """A plane normal . x = offset in `sfm` space."""
 
     normal: np.ndarray  # float64 (3,) unit
-    offset: float
-    level: bool  # True: horizontal, False: vertical
-    area: float  # in sfm units squared
-    sigma_deg: float  # of the normal, from the scatter between frames
+    offset: float  # `sfm` units
+    level: bool  # True: horizontal; False: vertical
+    area: float  # squared `sfm` units
+    sigma_deg: float  # standard error of the normal, from the scatter between frames
 
 
 def fit_planes(samples: SurfaceSamples, up: np.ndarray) -> tuple[FittedPlane, ...]:
-    """Find the largest level and plumb planes, given up within a few degrees."""
+    """Fit the largest level and plumb planes, given `up` (3,) within a few degrees."""
     depth = float(np.median(samples.depths))
     cosine = samples.normals @ up
     tolerance = np.radians(_NORMAL_DEG)
-    found = []
-    level = np.abs(cosine) > np.cos(tolerance)
-    found += _peel(samples, level, np.broadcast_to(up, samples.normals.shape), True, depth)
+    found = _peel(samples, np.abs(cosine) > np.cos(tolerance), up, True, depth)
     for direction in _wall_directions(samples, up):
         near = np.abs(samples.normals @ direction) > np.cos(tolerance)
-        found += _peel(samples, near, np.broadcast_to(direction, samples.normals.shape), False, depth)
+        found += _peel(samples, near, direction, False, depth)
     return tuple(found)
 
 
 def _peel(
-    samples: SurfaceSamples, member: np.ndarray, axis: np.ndarray, level: bool, depth: float
+    samples: SurfaceSamples, member: np.ndarray, direction: np.ndarray, level: bool, depth: float
 ) -> list[FittedPlane]:
-    """Take the largest plane along `axis`, remove its samples, and repeat."""
-    band, direction = _BAND_SHARE * depth, axis[0]
+    """Fit planes with normals near `direction` (3,), each time to the largest peak of the remaining samples."""
+    band = _BAND_SHARE * depth
     rest = np.flatnonzero(member)
     found: list[FittedPlane] = []
     while len(rest) >= 200 and len(found) < _MAX_PLANES:
@@ -63,7 +60,7 @@ def _peel(
 
 
 def strongest_height(heights: np.ndarray, weights: np.ndarray, band: float) -> float:
-    """Return the height that most samples are near to, by a smoothed histogram."""
+    """Return the mode of heights (m,), by a smoothed weighted histogram."""
     low = heights.min() - 2 * band
     index = ((heights - low) / (0.5 * band)).astype(np.int64)
     histogram = np.bincount(np.minimum(index, 200_000), weights=weights)
@@ -72,20 +69,14 @@ def strongest_height(heights: np.ndarray, weights: np.ndarray, band: float) -> f
 
 
 def _fit(
-    samples: SurfaceSamples,
-    rows: np.ndarray,
-    axis: np.ndarray,
-    peak: float,
-    band: float,
-    level: bool,
-    depth: float,
-) -> FittedPlane | None:
+    samples: SurfaceSamples, rows: np.ndarray, axis: np.ndarray, peak: float, band: float, level: bool, depth: float
+) -> FittedPlane | None:  # fmt: skip
+    """Fit a plane near offset `peak` along `axis` by reweighted least squares; None if it is too small or oblique."""
     normal, offset = axis, peak
     for factor in (3.0, 2.0, 1.5, 1.0, 1.0, 1.0):
         off = samples.points[rows] @ normal - offset
         weight = samples.weights[rows] * np.maximum(1 - (off / (factor * band)) ** 2, 0.0) ** 2
-        # Depth noise grows with depth, so far points count less, or they would tilt the plane by their
-        # leverage.
+        # Depth noise grows with depth: far points, which have the most leverage, get less weight.
         weight = weight / (samples.depths[rows] / depth) ** 2
         if (weight > 0).sum() < 100:
             return None
@@ -100,6 +91,7 @@ def _fit(
 
 
 def _weighted_plane(points: np.ndarray, weight: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return normal (3,), on the side of `axis`, and offset of the weighted least-squares plane."""
     mean = weight @ points / weight.sum()
     centred = points - mean
     _, vectors = np.linalg.eigh((weight[:, None] * centred).T @ centred)
@@ -108,7 +100,7 @@ def _weighted_plane(points: np.ndarray, weight: np.ndarray, axis: np.ndarray) ->
 
 
 def _scatter_deg(samples: SurfaceSamples, rows: np.ndarray, normal: np.ndarray, axis: np.ndarray) -> float:
-    """Return the standard error of the normal: the plane fitted to five interleaved groups of frames."""
+    """Return the standard error of the normal (deg), from fits to five interleaved groups of frames; 3 if unknown."""
     errors = []
     for group in range(5):
         part = rows[samples.frames[rows] % 5 == group]
@@ -119,12 +111,12 @@ def _scatter_deg(samples: SurfaceSamples, rows: np.ndarray, normal: np.ndarray, 
 
 
 def covered_area(points: np.ndarray, normal: np.ndarray, cell: float) -> float:
-    """Return the area of the grid cells on a plane that hold points."""
+    """Return the area of the grid cells of side `cell` that hold points (m, 3) projected along `normal`."""
     return len(np.unique(plane_cells(points, normal, cell), axis=0)) * cell**2
 
 
 def plane_cells(points: np.ndarray, normal: np.ndarray, cell: float) -> np.ndarray:
-    """Return the 2D grid cells (m, 2) of points projected along a normal."""
+    """Return the 2D grid cells, int64 (m, 2), of points (m, 3) projected along a normal (3,)."""
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first)], axis=1)
@@ -132,15 +124,14 @@ def plane_cells(points: np.ndarray, normal: np.ndarray, cell: float) -> np.ndarr
 
 
 def _wall_directions(samples: SurfaceSamples, up: np.ndarray) -> list[np.ndarray]:
-    """Return the dominant horizontal directions of plumb normals, folded by 180 degrees, at most four."""
+    """Return up to four dominant horizontal directions (3,) of plumb normals, modulo 180 degrees."""
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
     plumb = np.abs(samples.normals @ up) < np.sin(np.radians(_NORMAL_DEG))
     angle = np.arctan2(samples.normals[plumb] @ second, samples.normals[plumb] @ first) % np.pi
-    histogram = np.bincount(
-        (angle / np.pi * 90).astype(int) % 90, weights=samples.weights[plumb], minlength=90
-    )
+    bins = (angle / np.pi * 90).astype(int) % 90
+    histogram = np.bincount(bins, weights=samples.weights[plumb], minlength=90)
     smooth = histogram + 0.7 * (np.roll(histogram, 1) + np.roll(histogram, -1))
     smooth += 0.3 * (np.roll(histogram, 2) + np.roll(histogram, -2))
     found: list[np.ndarray] = []

@@ -1,4 +1,4 @@
-"""What the user says about metres: the text of `--scale`, parsed."""
+"""Parse the option `--scale`: a length that the user knows."""
 
 import math
 import re
@@ -15,17 +15,12 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 @dataclass(frozen=True)
 class ScaleRequest:
-    """One statement of the user about a length in the scene."""
+    """A known length in the scene."""
 
     kind: str  # "camera-height" | "distance" | "object"
     value_m: float
     frame: int = -1  # "distance": decoded video frame number
-    pixels: tuple[float, float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )  # "distance": x1, y1, x2, y2 in the video
+    pixels: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # "distance": x1, y1, x2, y2
     object_id: int = 0  # "object"
 
 
@@ -33,7 +28,7 @@ def parse_scale(text: str) -> ScaleRequest:
     """Parse the text of `--scale`.
 
     Raises:
-        UsageError: says what is wrong with it and shows what can be written.
+        UsageError: the text is malformed; the message shows the possible forms.
     """
     subject, equals, value = text.strip().partition("=")
     subject = subject.strip()
@@ -43,7 +38,7 @@ def parse_scale(text: str) -> ScaleRequest:
     if subject == "camera-height":
         if not 0.05 <= length_m <= 20:
             raise UsageError(
-                f"--scale {text!r}: a camera {length_m:g} m above the floor? The unit is metres. {_HELP}"
+                f"--scale {text!r}: a camera height must lie between 0.05 and 20. The unit is metres. {_HELP}"
             )
         return ScaleRequest("camera-height", length_m)
     if subject.startswith("distance:"):
@@ -53,15 +48,16 @@ def parse_scale(text: str) -> ScaleRequest:
         x1, y1, x2, y2 = (float(p) for p in parts[1:])
         if math.hypot(x2 - x1, y2 - y1) < 2:
             raise UsageError(
-                f"--scale {text!r}: the two pixels are the same; choose two that are far apart. {_HELP}"
+                f"--scale {text!r}: the two pixels coincide; choose two that are far apart. {_HELP}"
             )
         return ScaleRequest("distance", length_m, frame=int(parts[0]), pixels=(x1, y1, x2, y2))
     if match := re.fullmatch(r"object:(\d+)\.height", subject):
         return ScaleRequest("object", length_m, object_id=int(match.group(1)))
-    raise UsageError(f"--scale {text!r}: nothing is known about {subject!r}. {_HELP}")
+    raise UsageError(f"--scale {text!r}: {subject!r} is not one of the possible forms. {_HELP}")
 
 
 def _length(text: str, value: str) -> float:
+    """Parse a positive length in metres, with or without the unit m; `text` is for the error."""
     number = value[:-1].strip() if value.endswith("m") and not value.endswith(("cm", "mm")) else value
     if not re.fullmatch(_NUMBER, number) or not math.isfinite(float(number)) or float(number) <= 0:
         hint = " (centimetres? 74 cm is 0.74)" if value.endswith(("cm", "mm")) else ""

@@ -1,9 +1,8 @@
-"""Oriented surface points from depth maps: what gravity, walls and the floor are voted by.
+"""Sample oriented surface points from depth maps.
 
-On a plane the inverse depth is an affine function of the pixel, so a least-squares fit of 1/z over a window
-(all windows at once, by box sums) gives the normal. Its residual tells planes from edges, corners and bad
-depth. The pixel coordinates carry no noise, hence noise of the depth spreads the normals but does not bias
-them.
+On a plane, inverse depth is an affine function of the pixel. A least-squares fit of 1/z over a window (all windows at
+once, by box filters) gives the normal; its residual tells planes from edges, corners and outliers. Pixel coordinates
+are free of noise, so depth noise scatters the normals without bias.
 """
 
 from dataclasses import dataclass
@@ -16,46 +15,46 @@ from reconstruction.world.config import WorldConfig
 from registry.errors import InputError
 
 _WINDOW_SHARE = 0.014  # half the window, as a share of the image width: 7 px of 480
-_MIN_WINDOW_FILL = 0.35
-_GOOD_RESIDUAL = 0.006  # relative: what a plane sweep leaves on a plane
-_MAX_RESIDUAL = 0.03
-_MIN_SAMPLES = 500
+_MIN_WINDOW_FILL = 0.35  # smallest share of valid pixels in a window
+_GOOD_RESIDUAL = 0.006  # relative residual of plane-sweep depth on a plane; halves the weight
+_MAX_RESIDUAL = 0.03  # relative residual above which a pixel is not sampled
+_MIN_SAMPLES = 500  # in all frames together
 
 
 @dataclass(frozen=True)
 class SurfaceSamples:
-    """Points of the seen surface with normals, in sfm space."""
+    """Oriented points of the seen surface, in `sfm` space and units."""
 
     points: np.ndarray  # float64 (m, 3)
     normals: np.ndarray  # float64 (m, 3) unit, towards the camera
-    weights: np.ndarray  # float64 (m,) how planar the surroundings are, in (0, 1]
-    frames: np.ndarray  # int32 (m,) row of the camera that sees the point
-    measured: np.ndarray  # bool (m,) False: completed by a plane
-    eyes: np.ndarray  # float64 (m, 3) centre of that camera
-    depths: np.ndarray  # float64 (m,) z-depth
+    weights: np.ndarray  # float64 (m,) planarity of the window, in (0, 1]
+    frames: np.ndarray  # int32 (m,) row of the keyframe
+    measured: np.ndarray  # bool (m,) False: completed depth
+    eyes: np.ndarray  # float64 (m, 3) camera centre of the keyframe
+    depths: np.ndarray  # float64 (m,) z-depth in the keyframe
 
 
 def choose_frames(count: int, limit: int) -> np.ndarray:
-    """Return up to `limit` rows, evenly spread."""
+    """Return up to `limit` evenly spaced rows of `count`."""
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))
 
 
 def sample_surface(posed: PosedFrames, depth: DepthMaps, config: WorldConfig) -> SurfaceSamples:
-    """Take oriented points from the depth maps of evenly chosen keyframes.
+    """Sample oriented points from the depth maps of evenly spaced keyframes.
 
     Raises:
-        InputError: there is next to no depth.
+        InputError: there is too little depth.
     """
     rng = np.random.default_rng(0)
-    parts = []
-    for row in choose_frames(len(posed.world_from_camera), config.max_frames):
-        found = _sample_frame(depth, int(row), posed.world_from_camera[row], config.samples_per_frame, rng)
-        parts.append(found)
+    parts = [
+        _sample_frame(depth, int(row), posed.world_from_camera[row], config.samples_per_frame, rng)
+        for row in choose_frames(len(posed.world_from_camera), config.max_frames)
+    ]
     merged = [np.concatenate([part[i] for part in parts]) for i in range(7)] if parts else []
     if not parts or len(merged[0]) < _MIN_SAMPLES:
         raise InputError(
-            "world: the depth maps are almost empty, so neither the floor nor gravity can be found. Film "
-            "textured things from several sides, slowly, in good light."
+            "world: the depth maps are almost empty, so floor and gravity cannot be found. Film textured objects from "
+            "several sides, slowly, in good light."
         )
     return SurfaceSamples(*merged)
 
@@ -63,9 +62,10 @@ def sample_surface(posed: PosedFrames, depth: DepthMaps, config: WorldConfig) ->
 def _sample_frame(
     depth: DepthMaps, row: int, world_from_camera: np.ndarray, limit: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
+    """Return the columns of `SurfaceSamples` for up to `limit` random planar pixels of one keyframe."""
     z = np.asarray(depth.depth[row])
     measured = (np.asarray(depth.confidence[row]) >= 2) & (z > 0)
-    # Completed pixels were made by planes already: they count only where nothing was measured.
+    # Completed pixels come from planes already: use them only where nothing was measured.
     normals, residual = window_normals(z, measured, depth.camera)
     rough = ~np.isfinite(residual)
     if (z[rough] > 0).any():
@@ -77,8 +77,7 @@ def _sample_frame(
         good = np.sort(rng.choice(good, limit, replace=False))
     v, u = np.divmod(good, z.shape[1])
     z_good = z.ravel()[good].astype(np.float64)
-    x, y = normalised(depth.camera)
-    points_camera = np.stack([x[u] * z_good, y[v] * z_good, z_good], axis=1)
+    points_camera = depth.camera.unproject(u + 0.5, v + 0.5, z_good)
     rotation, eye = world_from_camera[:3, :3], world_from_camera[:3, 3]
     weights = 1.0 / (1.0 + (residual.ravel()[good] / _GOOD_RESIDUAL) ** 2)
     return (
@@ -92,28 +91,21 @@ def _sample_frame(
     )
 
 
-def normalised(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return x/z of the columns (w,) and y/z of the rows (h,)."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    return x, y
-
-
 def window_normals(z: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a plane around every pixel.
+    """Fit a plane to the window around every pixel.
 
     Args:
-        z: z-depth, float32 (h, w).
-        valid: bool (h, w), which pixels take part.
-        camera: The camera of the depth map.
+        z: float32 (h, w) z-depth.
+        valid: bool (h, w) pixels that take part.
+        camera: of the depth map.
 
     Returns:
-        Unit normals towards the camera (h, w, 3) in camera space, and the relative residual (h, w), infinite
-        where the window is too empty.
+        Unit normals (h, w, 3) towards the camera, in the camera frame, and the relative residual (h, w), infinite where
+        the window has too few valid pixels.
     """
     half = max(2, round(_WINDOW_SHARE * camera.width))
-    x, y = normalised(camera)
-    x, y = np.broadcast_to(x, z.shape), np.broadcast_to(y[:, None], z.shape)
+    rays = camera.pixel_rays()
+    x, y = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
     m = valid.astype(np.float64)
     w = np.divide(1.0, z, out=np.zeros(z.shape), where=valid)
 
@@ -126,8 +118,7 @@ def window_normals(z: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[np
     enough = n >= _MIN_WINDOW_FILL * (2 * half + 1) ** 2
     n = np.where(enough, n, 1.0)
     mean_x, mean_y, mean_w = total(m * x) / n, total(m * y) / n, total(w) / n
-    # Second moments about the window's own means; coordinates are of order one, so float64 leaves nothing
-    # out.
+    # Second moments about the window's means; coordinates are of order one, so float64 suffices.
     xx, yy = total(m * x * x) / n - mean_x**2, total(m * y * y) / n - mean_y**2
     xy, ww = total(m * x * y) / n - mean_x * mean_y, total(w * w) / n - mean_w**2
     xw, yw = total(w * x) / n - mean_x * mean_w, total(w * y) / n - mean_y * mean_w
@@ -137,7 +128,7 @@ def window_normals(z: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[np
     a, b = (yy * xw - xy * yw) / safe, (xx * yw - xy * xw) / safe
     c = mean_w - a * mean_x - b * mean_y
     residual = np.sqrt(np.maximum(ww - a * xw - b * yw, 0.0)) / np.where(enough, mean_w, 1.0)
-    # At a pixel off its own window's plane (a thin thing before a wall) the normal says nothing about it.
+    # A pixel off the plane of its window (a thin object before a wall) has no valid normal.
     off = np.abs(w - (a * x + b * y + c)) / np.where(enough, mean_w, 1.0)
     enough &= (off < 3 * _MAX_RESIDUAL) | ~valid
     normals = -np.stack([a, b, c], axis=-1)

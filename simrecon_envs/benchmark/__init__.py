@@ -1,10 +1,10 @@
-"""Suites of tasks that are proven to be solvable, policies in them, comparisons, demonstrations.
+"""Suites of tasks that an oracle has solved, evaluation of policies on them, comparisons, demonstrations.
 
     from simrecon_envs.benchmark import load_suite
     suite = load_suite("suite.json")
     env = suite.make(suite.tasks[0])
 
-`simrecon benchmark --help` is the way in for people; docs/embodied_benchmarks.md says how it works.
+The command line is `simrecon benchmark --help`; docs/embodied_benchmarks.md explains the method.
 """
 
 from simrecon_envs.benchmark.compare import compare_results

@@ -1,4 +1,4 @@
-"""Which tasks are worth a try in a scene, in which order. Reads bundles, builds nothing."""
+"""List the tasks of a scene that may enter a suite, in the order in which they are tried. Reads bundles only."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,33 +12,27 @@ from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import THEN
 
 SEQUENCE = "sequence"
-ALL_KINDS = (*KINDS, SEQUENCE)
-_MOST_A_KIND = 24  # of one kind and robot; a scene of 20 objects has hundreds of places and stacks
-_FIRST = (
-    "put",
-    "place",
-    "push",
-    "stack",
-    "reach",
-)  # how a composite may begin: what lasts, before what is quick
+_MOST_A_KIND = 24  # candidates per kind and robot; a scene of 20 objects has hundreds of places and stacks
+# Kinds of the first and second stage of a composite, preferred ones first.
+_FIRST = ("put", "place", "push", "stack", "reach")
 _THEN = ("pick", "push", "put", "place", "reach")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """A task that may become one of the suite."""
+    """A task that may enter the suite."""
 
     scene: str
     revision: str
     robot: str
     task: str
     kind: str
-    objects: tuple[int, ...]  # what it is about, but for what cannot move
-    problems: tuple[str, ...]  # what speaks against it, by the bundle alone
+    objects: tuple[int, ...]  # ids of the movable objects that it is about
+    problems: tuple[str, ...]  # known from the bundle
 
     @property
     def name(self) -> str:
-        """Return the name in the suite."""
+        """Return the task's name in the suite."""
         return f"{self.scene}-{self.task}-{self.robot}"
 
     @property
@@ -50,7 +44,7 @@ class Candidate:
 def scene_candidates(
     scene: str, robots: tuple[str, ...], kinds: tuple[str, ...], registry: Path | None
 ) -> list[Candidate]:
-    """Return the candidates of a scene but for composites: in turn one of each kind and robot, the easiest first.
+    """Return the candidates of a scene without composites: round-robin over kinds and robots, the easiest first.
 
     Raises:
         SceneNotFound: there is no such scene.
@@ -70,11 +64,11 @@ def scene_candidates(
 
 
 def composites(accepted: list[Candidate], most: int) -> Iterator[Candidate]:
-    """Yield composites of two tasks that were proven alone: of one robot, about different objects.
+    """Yield composites of two proven tasks of one robot about different objects.
 
     Args:
-        accepted: What was proven, of one scene.
-        most: How many a robot.
+        accepted: The proven candidates of one scene.
+        most: Greatest number per robot.
     """
     for robot in dict.fromkeys(c.robot for c in accepted):
         mine = [c for c in accepted if c.robot == robot]
@@ -90,7 +84,7 @@ def composites(accepted: list[Candidate], most: int) -> Iterator[Candidate]:
             if count == most:
                 break
             if used.get(a.task, 0) > 1 or used.get(b.task, 0) > 1:
-                continue  # one task in many composites would say little new
+                continue  # a task is in at most two composites
             used[a.task], used[b.task] = used.get(a.task, 0) + 1, used.get(b.task, 0) + 1
             count += 1
             yield Candidate(
@@ -100,19 +94,20 @@ def composites(accepted: list[Candidate], most: int) -> Iterator[Candidate]:
 
 
 def check_kinds(kinds: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the kinds in their usual order, all where none is named.
+    """Return the kinds in listing order; all where none is named.
 
     Raises:
         UsageError: there is no such kind.
     """
-    wrong = [kind for kind in kinds if kind not in ALL_KINDS]
+    known = (*KINDS, SEQUENCE)
+    wrong = [kind for kind in kinds if kind not in known]
     if wrong:
-        raise UsageError(f"{wrong[0]!r} is not a kind of task. Kinds: {', '.join(ALL_KINDS)}")
-    return tuple(kind for kind in ALL_KINDS if not kinds or kind in kinds)
+        raise UsageError(f"{wrong[0]!r} is not a kind of task. Kinds: {', '.join(known)}")
+    return tuple(kind for kind in known if not kinds or kind in kinds)
 
 
 def _concerns(spec: TaskSpec, facts: SceneFacts) -> bool:
-    """Tell whether a robot has to do with a task at all: an arm does not drive."""
+    """Return whether the robot is of the right sort for a task: a fixed arm does not drive."""
     return facts.traits.mobile or not kind_of(spec).mobile_only
 
 
@@ -120,7 +115,7 @@ def _candidate(scene: str, revision: str, facts: SceneFacts, spec: TaskSpec) -> 
     keys = KINDS[spec.kind].things(facts) if spec.subject is None else [spec.subject, spec.place]
     objects = tuple(key for key in keys if key in facts.movable)
     if not objects and spec.subject is not None and spec.subject not in facts.base_ids:
-        objects = (spec.subject,)  # to drive to a table is about the table
+        objects = (spec.subject,)  # navigate_table is about the table
     return Candidate(
         scene=scene, revision=revision, robot=facts.robot, task=spec.name, kind=spec.kind, objects=objects,
         problems=spec.problems,

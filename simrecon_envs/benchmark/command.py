@@ -1,4 +1,4 @@
-"""The runner of `simrecon benchmark`; its parser is `reconstruction/commands/benchmark.py`."""
+"""Run the subcommands of `simrecon benchmark`; the parser is in `reconstruction/commands/benchmark.py`."""
 
 import argparse
 import json
@@ -22,11 +22,11 @@ from simrecon_envs.files import absolute
 def generate(arguments: argparse.Namespace) -> int:
     """Run `simrecon benchmark generate`."""
     if bool(arguments.scenes) == arguments.all:
-        raise UsageError("name scenes, or --all for all of the registry, not both and not neither")
+        raise UsageError("name SCENEs or pass --all for all scenes of the registry, one of both")
     if arguments.lerobot is not None:
         from simrecon_envs.benchmark.demonstrations_lerobot import need_pyarrow
 
-        need_pyarrow()  # before minutes of proving
+        need_pyarrow()  # fail before minutes of proving
     reporter = Reporter(arguments.quiet)
     config = GenerateConfig(
         kinds=arguments.kinds,
@@ -71,8 +71,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.videos is not None:
         from simrecon_envs.backends import choose_render_backend
 
-        choose_render_backend("auto", None, "rgb_array")  # says at once where nothing can render
-    records = Records(arguments.out) if arguments.out is not None else None
+        choose_render_backend("auto", None, "rgb_array")  # fail before the run if nothing can render
+    out: Path | None = arguments.out
+    records = Records(out) if out is not None else None
     results = run_suite(
         suite,
         tasks,
@@ -84,8 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
         suite_name=arguments.suite.name,
         selection=selection,
     )
-    if records is not None:
-        results.save(arguments.out)
+    if out is not None and records is not None:
+        results.save(out)
         records.clear()
     if arguments.json:
         print(json.dumps(results.summary(), indent=2))
@@ -102,8 +103,8 @@ def compare(arguments: argparse.Namespace) -> int:
         print(json.dumps(_plain(found), indent=2))
         return 0
     whole: Difference = found["all"]
-    print(f"{arguments.second} ({second.policy['name']}) less {arguments.first} ({first.policy['name']}), "
-          f"{whole.episodes} episodes of both")  # fmt: skip
+    print(f"{arguments.second} ({second.policy['name']}) minus {arguments.first} ({first.policy['name']}), "
+          f"{whole.episodes} common episodes")  # fmt: skip
     print(f"success          {_percent(whole.success_first)} -> {_percent(whole.success_second)}: "
           f"{_points(whole.success, whole.success_interval)}; only A {whole.only_first}, only B {whole.only_second}, "
           f"McNemar p = {whole.p:.2g}")  # fmt: skip
@@ -121,7 +122,7 @@ def compare(arguments: argparse.Namespace) -> int:
 def demos(arguments: argparse.Namespace) -> int:
     """Run `simrecon benchmark demos`."""
     if not arguments.maniskill and not arguments.lerobot:
-        raise UsageError("say where demonstrations go: --maniskill DIR, --lerobot DIR, or both")
+        raise UsageError("name an output folder: --maniskill DIR, --lerobot DIR, or both")
     suite = load_suite(arguments.suite)
     tasks, _ = _choose(suite, arguments)
     _record_demos(
@@ -175,13 +176,11 @@ def _choose(suite: Suite, arguments: argparse.Namespace) -> tuple[list[SuiteTask
 def _randomize(text: str | None) -> dict[str, float] | str | None:
     if text is None or text in ("none", "all"):
         return text
-    out = {}
-    for key, value in _pairs(text.split(","), "--randomize").items():
-        try:
-            out[key] = float(value)
-        except ValueError:
-            raise UsageError(f"--randomize {key}={value}: expected a number") from None
-    return out
+    pairs = _pairs(text.split(","), "--randomize")
+    try:
+        return {key: float(value) for key, value in pairs.items()}
+    except ValueError as error:
+        raise UsageError(f"--randomize {text}: expected numbers ({error})") from None
 
 
 def _pairs(texts: list[str], flag: str) -> dict[str, str]:
@@ -216,7 +215,7 @@ def _print_suite(suite: Suite, out: Path) -> None:
         kinds = ", ".join(f"{n} {kind}" for kind, n in Counter(task.kind for task in mine).items())
         print(f"  {scene:<20} {len(mine):>3} tasks: {kinds}")
     print(f"test side: {counts['test']['object']} tasks by object, {counts['test']['scene']} by scene; left out: "
-          f"{counts['left_out']} candidates, with reasons in the file")  # fmt: skip
+          f"{counts['left_out']} candidates (the file has the reasons)")  # fmt: skip
 
 
 def _print_results(results: Results) -> None:

@@ -1,4 +1,4 @@
-"""Two results -> what differs, paired by episode."""
+"""Compare two policies on the episodes that both have run, paired by task, revision and seed."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,19 +12,19 @@ _KEYS = ("kind", "scene", "robot")
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Second less first, over the episodes that both have."""
+    """Second minus first, over the common episodes."""
 
     episodes: int
     success_first: float
     success_second: float
     success: float
     success_interval: Interval | None  # bootstrap over tasks
-    only_first: int  # episodes in which only one succeeded
+    only_first: int  # episodes that only the first policy solved
     only_second: int
-    p: float  # McNemar's exact test over episodes
+    p: float  # of McNemar's exact test over episodes
     efficiency: float
     efficiency_interval: Interval | None
-    steps: float | None  # where both succeeded
+    steps: float | None  # over the episodes that both solved
     steps_interval: Interval | None
 
 
@@ -32,7 +32,7 @@ def compare_results(first: Results, second: Results) -> dict[str, Any]:
     """Return {"all": Difference, "kind": {…}, "scene": {…}, "robot": {…}, "notes": [...]}.
 
     Raises:
-        UsageError: they have no episode in common.
+        UsageError: the results have no episode in common.
     """
     mine = {episode.pair: episode for episode in first.episodes}
     pairs = [(mine[e.pair], e) for e in second.episodes if e.pair in mine]
@@ -75,15 +75,15 @@ def _difference(pairs: list[tuple[EpisodeResult, EpisodeResult]]) -> Difference:
 def _notes(first: Results, second: Results, count: int) -> list[str]:
     notes = []
     if first.suite["digest"] != second.suite["digest"]:
-        notes.append("the results are of different suites: only episodes that both have are compared")
+        notes.append("the results are of different suites; only common episodes are compared")
     alone = [len(r.episodes) - count for r in (first, second)]
     if any(alone):
         notes.append(
-            f"not compared, as the other has not run them: {alone[0]} episodes of the first, {alone[1]} of the second"
+            f"not compared: {alone[0]} episodes that only the first ran, {alone[1]} that only the second ran"
         )
     keys = sorted(first.made_with.keys() | second.made_with.keys())
     differs = [key for key in keys if first.made_with.get(key) != second.made_with.get(key)]
     if differs:
         texts = [f"{key} {first.made_with.get(key)} and {second.made_with.get(key)}" for key in differs]
-        notes.append(f"they were made with different versions: {', '.join(texts)}")
+        notes.append(f"different versions: {', '.join(texts)}")
     return notes

@@ -1,4 +1,4 @@
-"""A recorded episode."""
+"""`Demonstration`: one recorded episode."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Demonstration:
-    """One episode: what was seen before each action, the action, and what came of it."""
+    """Observations, actions, rewards and success of an episode of t steps."""
 
     task: str
     instruction: str
@@ -15,7 +15,7 @@ class Demonstration:
     seed: int
     fps: int
     joint_names: tuple[str, ...]
-    observations: list[dict]  # t of them, NumPy, as with obs_mode "state_dict" or one with pictures
+    observations: list[dict]  # t, each before its action; nested dicts of NumPy arrays
     actions: np.ndarray  # float32 (t, a)
     rewards: np.ndarray  # float32 (t,)
     success: np.ndarray  # bool (t,)

@@ -1,18 +1,23 @@
-"""The oracle's runs of a suite, recorded: every episode is run again, and kept if it succeeds."""
+"""Record the oracle's episodes of a suite as demonstrations; episodes without success are dropped."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 
 from registry import UsageError
 from simrecon_envs.benchmark.demonstration import Demonstration
-from simrecon_envs.benchmark.episodes import run_episode
+from simrecon_envs.benchmark.episodes import Episode, run_episode
 from simrecon_envs.benchmark.policies import CONTROL_MODE, OraclePolicy
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.run import RunSettings, check_revisions
 from simrecon_envs.benchmark.suite import Suite, SuiteTask
 from simrecon_envs.files import absolute
+from simrecon_envs.unwrapped import scene_of
+
+if TYPE_CHECKING:
+    from simrecon_envs.benchmark.demonstrations_maniskill import TrajectoryFile
 
 
 def record_demonstrations(
@@ -27,26 +32,26 @@ def record_demonstrations(
     any_revision: bool = False,
     reporter: Reporter | None = None,
 ) -> dict[str, Any]:
-    """Record the oracle's episodes of some tasks.
+    """Run the oracle on the seeds of some tasks and write the episodes.
 
     Args:
         suite: The suite.
-        tasks: Those of it that are recorded.
-        maniskill: A folder for trajectories of ManiSkill, one folder a task.
-        lerobot: A folder for LeRobot datasets, one a robot: its actions are not another's.
-        obs_mode: What is observed; "state_dict", or a mode with pictures.
-        episodes: Most of a task; all where None.
+        tasks: Its tasks to record.
+        maniskill: Folder for ManiSkill trajectories; one subfolder per task.
+        lerobot: Folder for LeRobot datasets; one per robot, since action spaces differ.
+        obs_mode: "state_dict", or a mode with images.
+        episodes: Greatest number per task; all where None.
         registry: The registry's folder; the default registry where None.
-        any_revision: Go on where a scene has another revision than the suite's.
-        reporter: Is told what happens.
+        any_revision: Accept scenes with another revision than the suite's.
+        reporter: Receives progress messages.
 
     Returns:
         {"tasks", "episodes", "steps", "written": files and folders, "failed": texts}.
 
     Raises:
-        UsageError: scenes are missing or of another revision; a folder is there already and not empty; nothing can
-            be observed so.
-        EnvironmentMissing: the extra `lerobot` is not installed, or pictures cannot be rendered.
+        UsageError: scenes are missing or of another revision; an output folder is not empty; `obs_mode` does not fit
+            the dataset.
+        EnvironmentMissing: the extra `lerobot` is not installed, or images cannot be rendered.
     """
     from simrecon_envs.benchmark.demonstrations_maniskill import TrajectoryFile
 
@@ -60,45 +65,49 @@ def record_demonstrations(
     written: list[str] = []
     for task in tasks:
         env = suite.make(task, registry=root, control_mode=CONTROL_MODE, obs_mode=obs_mode)
-        file = None
+        file, seeds = None, task.seeds[:episodes]
         try:
             file = TrajectoryFile(env, maniskill / task.name) if maniskill is not None else None
-            recorded = file.env if file is not None else env
-            policy = OraclePolicy(recorded)
-            done = 0
-            for seed in task.seeds[:episodes]:
-                shown = _Recorder()
-                episode = run_episode(recorded, policy, seed, shown)
-                if file is not None:
-                    file.end_episode(keep=episode.success)
-                if not episode.success:
-                    failed.append(f"{task.name}: seed {seed} was not done and is left out")
-                    continue
-                done, steps = done + 1, steps + episode.steps
-                if datasets is not None:
-                    datasets.add(shown.demonstration(task, env.unwrapped, seed))
-            count += done
+            found = [_record(task, env, seed, file, datasets) for seed in seeds]
         finally:
             written += file.close() if file is not None else []
             env.close()
-        reporter.done(f"{task.name}: {done} of {len(task.seeds[:episodes])}")
+        done = [episode.steps for episode in found if episode.success]
+        count, steps = count + len(done), steps + sum(done)
+        failed += [
+            f"{task.name}: seed {e.seed} was not solved and is left out" for e in found if not e.success
+        ]
+        reporter.done(f"{task.name}: {len(done)} of {len(seeds)}")
     written += datasets.close() if datasets is not None else []
     return {"tasks": len(tasks), "episodes": count, "steps": steps, "written": written, "failed": failed}
 
 
+def _record(
+    task: SuiteTask, env: gym.Env, seed: int, file: "TrajectoryFile | None", datasets: "_Datasets | None"
+) -> Episode:
+    """Run the oracle for one episode; add it to the outputs if it succeeds."""
+    recorder, recorded = _Recorder(), file.env if file is not None else env
+    episode = run_episode(recorded, OraclePolicy(recorded), seed, recorder)
+    if file is not None:
+        file.end_episode(keep=episode.success)
+    if episode.success and datasets is not None:
+        datasets.add(recorder.demonstration(task, scene_of(env), seed))
+    return episode
+
+
 class _Recorder:
-    """Collects an episode."""
+    """Collects the steps of an episode."""
 
     def __init__(self) -> None:
         self.rows: list[tuple[Any, Any, tuple]] = []
 
     def __call__(self, obs: Any, action: Any, result: tuple | None) -> None:
-        """Take what `run_episode` tells of a step."""
+        """Store one step; the callback of `run_episode`."""
         if result is not None:
             self.rows.append((obs, action, result))
 
     def demonstration(self, task: SuiteTask, scene: Any, seed: int) -> Demonstration:
-        """Return the episode."""
+        """Return the collected episode."""
         return Demonstration(
             task=task.name,
             instruction=scene.instruction,
@@ -114,15 +123,15 @@ class _Recorder:
 
 
 class _Datasets:
-    """One LeRobot dataset a robot, begun with its first demonstration."""
+    """One LeRobot dataset per robot, created by its first demonstration."""
 
     def __init__(self, folder: Path, obs_mode: str) -> None:
         from simrecon_envs.benchmark.demonstrations_lerobot import check_folder, need_pyarrow
 
         if obs_mode in ("state", "none"):
             raise UsageError(
-                f"--demo-obs {obs_mode}: a LeRobot dataset keeps joints apart from the rest, which needs state_dict, "
-                "or a mode with pictures such as rgb"
+                f"--demo-obs {obs_mode}: a LeRobot dataset stores joints separately, which needs state_dict or a mode "
+                "with images such as rgb"
             )
         need_pyarrow()
         check_folder(folder)
@@ -138,5 +147,5 @@ class _Datasets:
         self._made[robot].add(demonstration)
 
     def close(self) -> list[str]:
-        """Finish all; return their folders."""
+        """Finish all datasets; return their folders."""
         return [str(writer.close()) for writer in self._made.values()]

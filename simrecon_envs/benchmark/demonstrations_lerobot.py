@@ -1,16 +1,17 @@
-"""Demonstrations as a LeRobot dataset, format v3.0: Parquet, JSON and, with pictures, MP4.
+"""Write demonstrations as a LeRobot dataset, format v3.0: Parquet, JSON and, for images, MP4.
 
-    data/chunk-000/file-000.parquet            a row a frame
-    meta/info.json, stats.json, tasks.parquet  what there is, its statistics, the instructions
-    meta/episodes/chunk-000/file-000.parquet   a row an episode: where it is, and its statistics
-    videos/KEY/chunk-000/file-NNN.mp4          one an episode and camera
+    data/chunk-000/file-000.parquet            one row per frame
+    meta/info.json, stats.json, tasks.parquet  features, their statistics, instructions
+    meta/episodes/chunk-000/file-000.parquet   one row per episode: position, statistics
+    videos/KEY/chunk-000/file-NNN.mp4          one per episode and camera
 
-`observation.state` is the robot's joints, `observation.environment_state` what else the simulation knows (tip, goal,
-objects); the latter is of different length in different tasks, so it is written only where all tasks agree.
+`observation.state` holds joint positions, `observation.environment_state` the rest of the state (hand, goal, objects).
+The length of the latter depends on the task; it is written only if all tasks have the same.
 """
 
 import contextlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +23,19 @@ from simrecon_envs.files import write_json
 from simrecon_envs.rollout import open_video
 
 VERSION = "v3.0"
-_CHUNK = 1000  # files a folder
+_CHUNK = 1000  # files per folder
 _EPISODES_A_FILE = 500
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_OUTCOMES = {"reward": "float32", "success": "bool", "done": "bool"}
 _COUNTERS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
              "task_index": "int64"}  # fmt: skip
 
 
 def need_pyarrow() -> Any:
-    """Return pyarrow.
+    """Import and return pyarrow.
 
     Raises:
-        EnvironmentMissing: says which extra has it.
+        EnvironmentMissing: it is not installed.
     """
     try:
         import pyarrow
@@ -46,20 +48,20 @@ def need_pyarrow() -> Any:
 
 
 def check_folder(folder: Path) -> None:
-    """Make sure that nothing is there yet.
+    """Check that a folder is absent or empty.
 
     Raises:
-        UsageError: there is.
+        UsageError: it is not.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty; choose another folder for the dataset")
 
 
 class LeRobotWriter:
-    """Writes a dataset of one robot; files get whole with `close`."""
+    """Writes the dataset of one robot: videos with `add`, everything else with `close`."""
 
     def __init__(self, folder: Path, first: Demonstration) -> None:
-        """Take the features of the first demonstration; all others must have them, too."""
+        """Take the features from the first demonstration (which is not added)."""
         self._folder = folder
         self._robot, self._fps = first.robot, first.fps
         self._joints, self._actions = first.joint_names, first.actions.shape[1]
@@ -74,7 +76,7 @@ class LeRobotWriter:
         """Add an episode.
 
         Raises:
-            UsageError: its robot has other joints or cameras than the first one's.
+            UsageError: its joints or cameras differ from the first demonstration's.
         """
         shapes = {name: p.shape for name, p in _pictures(demonstration.observations[0]).items()}
         if (demonstration.joint_names, shapes) != (self._joints, self._pictures):
@@ -108,7 +110,7 @@ class LeRobotWriter:
         self._stats.append(stats)
 
     def close(self) -> Path:
-        """Write all but the videos, which are there; return the folder."""
+        """Write tables and metadata; return the folder."""
         pa = need_pyarrow()
         keys = [
             key for key in self._columns[0] if len({_width(columns, key) for columns in self._columns}) == 1
@@ -132,30 +134,18 @@ class LeRobotWriter:
 
     def _features(self, keys: list[str]) -> dict[str, dict[str, Any]]:
         features: dict[str, dict[str, Any]] = {
-            "action": {
-                "dtype": "float32",
-                "shape": [self._actions],
-                "names": _numbered("action", self._actions),
-            },
-            "observation.state": {
-                "dtype": "float32",
-                "shape": [len(self._joints)],
-                "names": list(self._joints),
-            },
+            "action": _feature("float32", [self._actions], _numbered("action", self._actions)),
+            "observation.state": _feature("float32", [len(self._joints)], list(self._joints)),
         }
         if "observation.environment_state" in keys:
             width = _width(self._columns[0], "observation.environment_state")
-            features["observation.environment_state"] = {"dtype": "float32", "shape": [width],
-                                                         "names": _numbered("value", width)}  # fmt: skip
-        features |= {"next.reward": {"dtype": "float32", "shape": [1], "names": None},
-                     "next.success": {"dtype": "bool", "shape": [1], "names": None},
-                     "next.done": {"dtype": "bool", "shape": [1], "names": None}}  # fmt: skip
+            features["observation.environment_state"] = _feature(
+                "float32", [width], _numbered("value", width)
+            )
+        features |= {f"next.{key}": _feature(dtype) for key, dtype in _OUTCOMES.items()}
         for name, shape in self._pictures.items():
             height, width, channels = shape
-            features[name] = {
-                "dtype": "video",
-                "shape": list(shape),
-                "names": ["height", "width", "channels"],
+            features[name] = _feature("video", shape, ["height", "width", "channels"]) | {
                 "info": {
                     "video.height": height,
                     "video.width": width,
@@ -165,11 +155,9 @@ class LeRobotWriter:
                     "video.is_depth_map": False,
                     "video.fps": self._fps,
                     "has_audio": False,
-                },
+                }
             }
-        return features | {
-            key: {"dtype": dtype, "shape": [1], "names": None} for key, dtype in _COUNTERS.items()
-        }
+        return features | {key: _feature(dtype) for key, dtype in _COUNTERS.items()}
 
     def _info(self, features: dict[str, dict[str, Any]]) -> dict[str, Any]:
         return {
@@ -258,7 +246,7 @@ def _columns(demonstration: Demonstration, episode: int, first: int, task: int) 
 
 
 def _flat(obs: dict[str, Any], name: str = "") -> np.ndarray:
-    """Return all values but the joints' positions as one vector."""
+    """Return all values except joint positions as one vector."""
     parts = []
     for key, value in obs.items():
         path = f"{name}/{key}"
@@ -270,13 +258,13 @@ def _flat(obs: dict[str, Any], name: str = "") -> np.ndarray:
 
 
 def _pictures(obs: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return {feature: (h, w, 3) uint8}."""
+    """Return {feature name: RGB image uint8 (h, w, 3)}."""
     cameras = obs.get("sensor_data", {})
     return {f"observation.images.{name}": data["rgb"] for name, data in cameras.items() if "rgb" in data}
 
 
 def _statistics(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return a feature's statistics over its rows, one value a component."""
+    """Return the statistics of a feature over its rows, per component."""
     rows = values.reshape(len(values), -1).astype(np.float64)
     out = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0),
            "count": np.array([len(rows)])}  # fmt: skip
@@ -284,14 +272,14 @@ def _statistics(values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _picture_statistics(frames: np.ndarray) -> dict[str, np.ndarray]:
-    """Return statistics a channel, (3, 1, 1), of some pixels of values in [0, 1]."""
+    """Return statistics per channel (3, 1, 1), over every 16th pixel, values in [0, 1]."""
     values = frames[:, ::4, ::4].reshape(-1, 3) / 255.0
     out = {name: value.reshape(3, 1, 1) for name, value in _statistics(values).items() if name != "count"}
     return out | {"count": np.array([len(frames)])}
 
 
 def _merged(stats: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the statistics of all episodes from those of each; quantiles as their weighted means."""
+    """Merge the episodes' statistics, weighted by length; quantiles are averaged."""
     counts = np.array([one["count"][0] for one in stats], np.float64)
 
     def mean_of(values: list[np.ndarray]) -> np.ndarray:
@@ -316,7 +304,7 @@ def _arrow(pa: Any, values: np.ndarray, feature: dict[str, Any]) -> Any:
 
 
 def _with_index(table: Any) -> Any:
-    """Say that the texts are the index of a data frame, which is how LeRobot reads tasks."""
+    """Declare the texts as the index of a pandas data frame, as LeRobot expects for tasks."""
     column = {"name": None, "field_name": "__index_level_0__", "pandas_type": "unicode", "numpy_type": "object",
               "metadata": None}  # fmt: skip
     task = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64",
@@ -328,6 +316,10 @@ def _with_index(table: Any) -> Any:
 
 def _plain(stats: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, list]]:
     return {key: {name: value.tolist() for name, value in one.items()} for key, one in stats.items()}
+
+
+def _feature(dtype: str, shape: Sequence[int] = (1,), names: list[str] | None = None) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": list(shape), "names": names}
 
 
 def _numbered(name: str, count: int) -> list[str]:

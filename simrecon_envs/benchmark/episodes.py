@@ -1,4 +1,4 @@
-"""One episode: reset, ask the policy until the environment ends, measure."""
+"""Run one episode of a policy in an environment, and measure it."""
 
 import hashlib
 import time
@@ -10,40 +10,40 @@ import gymnasium as gym
 import numpy as np
 
 from simrecon_envs.arrays import numpy
-from simrecon_envs.benchmark.policies import Policy
+from simrecon_envs.benchmark.policies import Policy, begin_episode
+from simrecon_envs.unwrapped import scene_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """What happened."""
+    """Measurements of an episode."""
 
     seed: int
     success: bool
-    at_reset: bool  # it was done before the first action
+    at_reset: bool  # success before the first action
     steps: int
-    path_m: float  # way of the hand's tip, of the base where the task is about driving
-    reward: float  # sum
-    act_s: float  # wall time that the policy took
+    path_m: float  # path length of the hand; of the base in navigation tasks
+    reward: float  # undiscounted return
+    act_s: float  # wall time of the policy
     start: str  # digest of the first observation
 
 
 def run_episode(
     env: gym.Env, policy: Policy, seed: int, on_step: Callable[[Any, Any, tuple | None], None] | None = None
 ) -> Episode:
-    """Run an episode to its end: success, or the horizon.
+    """Run an episode until success or the step limit.
 
     Args:
-        env: A plain Gymnasium environment around a `SceneEnv` with a limit of steps.
-        policy: Acts; its `reset` is called after the environment's.
-        seed: Of the reset.
-        on_step: Called with (observation, None, None) after the reset, then with each action's (observation before,
-            action, what `step` returned).
+        env: A `SceneEnv` wrapped to NumPy, with a step limit.
+        policy: Its `reset`, if any, is called after the environment's.
+        seed: For the environment's reset.
+        on_step: Called after the reset with (observation, None, None), then after each step with (observation before,
+            action, result of `step`).
     """
-    scene = env.unwrapped
+    scene = scene_of(env)
     obs, _ = env.reset(seed=seed)
     start = _digest(obs)
-    if hasattr(policy, "reset"):
-        policy.reset()
+    begin_episode(policy)
     if on_step is not None:
         on_step(obs, None, None)
     at_reset = bool(numpy(scene.evaluate()["success"])[0])
@@ -67,7 +67,7 @@ def run_episode(
 
 
 def _place(scene: Any) -> np.ndarray:
-    """Return where what does the task is (3,), world, metres."""
+    """Return the position (3,) of the hand, or of the base in navigation tasks; world, metres."""
     if scene.task_object.mobile_only:
         return numpy(scene.agent.base_link.pose.p)[0].astype(np.float64)
     return numpy(scene.measures.tcp)[0, :3].astype(np.float64)

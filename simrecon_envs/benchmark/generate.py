@@ -1,4 +1,4 @@
-"""Scenes -> a suite of tasks that can be done and are not done by themselves."""
+"""Generate a suite from scenes: the candidates that are proven (see `feasibility`)."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -16,27 +16,27 @@ from simrecon_envs.files import absolute, versions
 from simrecon_envs.randomization import Randomization
 from simrecon_envs.robots import check_robot
 
-_COMPOSITE_SHARE = 5  # one task in so many may be a composite
+_COMPOSITE_SHARE = 5  # one task in five may be a composite
 DEFAULT_RANDOMIZE = {"shift_m": 0.03, "turn_rad": 0.3}
 
 
 @dataclass(frozen=True, kw_only=True)
 class GenerateConfig:
-    """What a suite is made of. The same values and scenes give the same suite, whatever `jobs` is."""
+    """Settings of a suite. The same settings and scenes give the same suite for any number of jobs."""
 
     kinds: tuple[str, ...] = ()
     """Kinds of tasks; all where empty."""
     robots: tuple[str, ...] = ("panda", "fetch")
     per_scene: int = 30
-    """Most tasks of a scene."""
+    """Greatest number of tasks per scene."""
     seeds: int = 5
-    """Episodes of a task."""
+    """Episodes per task."""
     seed: int = 0
-    """Of the episodes' seeds."""
+    """Seed from which the episodes' seeds are derived."""
     test_share: float = 0.2
-    """Share of scenes and of objects on the side "test"."""
+    """Share of scenes and of objects in the test split."""
     randomize: dict | str | None = None
-    """What differs from episode to episode; None: poses by up to 3 cm and 0.3 rad. "none": only goals and starts."""
+    """As of `Randomization`; None: poses by up to 3 cm and 0.3 rad. "none": only goals and starts differ."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -48,7 +48,7 @@ class GenerateConfig:
             check_robot(robot)
 
     def randomization(self) -> dict[str, float]:
-        """Return what differs, without what does not."""
+        """Return the non-zero fields of the randomization."""
         wanted = DEFAULT_RANDOMIZE if self.randomize is None else self.randomize
         return {key: value for key, value in asdict(Randomization.parse(wanted)).items() if value}
 
@@ -62,18 +62,18 @@ def generate_suite(
     records: Records | None = None,
     reporter: Reporter | None = None,
 ) -> Suite:
-    """Prove tasks in scenes.
+    """Prove candidates in scenes and return the suite.
 
     Args:
-        scenes: Ids of scenes; all of the registry where empty.
-        config: What is wanted.
+        scenes: Scene ids; all of the registry where empty.
+        config: Settings of the suite.
         registry: The registry's folder; the default registry where None.
-        jobs: How many processes.
-        records: Where proofs are kept and found; a run that was killed goes on with them.
-        reporter: Is told what happens.
+        jobs: Number of processes.
+        records: Store of finished proofs; a run that was killed continues from it.
+        reporter: Receives progress messages.
 
     Raises:
-        UsageError: scenes are missing (all that are), or nothing could be proven.
+        UsageError: scenes are missing (lists all of them), or no candidate was proven.
     """
     reporter = reporter or Reporter(quiet=True)
     kinds = check_kinds(config.kinds)
@@ -107,10 +107,10 @@ def generate_suite(
 
 
 def check_scenes(scenes: list[str], registry: Path | None) -> list[str]:
-    """Return the scenes without repetition, all of the registry where none is named.
+    """Return the unique scene ids; all of the registry where none is given.
 
     Raises:
-        UsageError: lists what is missing, and what there is.
+        UsageError: scenes are missing; lists them and the existing ones.
     """
     catalog = SceneRegistry(registry)
     known = list(catalog.revisions())
@@ -130,18 +130,17 @@ def check_scenes(scenes: list[str], registry: Path | None) -> list[str]:
 
 
 class _Prover:
-    """Proves candidates, some at a time, and remembers."""
+    """Proves batches of candidates and stores the proofs."""
 
     def __init__(
         self, workers: Workers, settings: ProofSettings, records: Records | None, reporter: Reporter
     ) -> None:
         self._workers, self._settings, self._records, self._reporter = workers, settings, records, reporter
-        versions_ = versions()
-        self._frame = {"versions": versions_, "options": settings.options(), "seed": settings.seed,
+        self._frame = {"versions": versions(), "options": settings.options(), "seed": settings.seed,
                        "seeds": settings.seeds}  # fmt: skip
 
     def __call__(self, candidates: list[Candidate]) -> list[Proof]:
-        """Return the proofs, in the candidates' order."""
+        """Return the proofs in the order of the candidates."""
         proofs: dict[int, Proof] = {}
         for number, candidate in enumerate(candidates):
             record = self._records.get(self._key(candidate)) if self._records else None
@@ -170,13 +169,13 @@ def _of_scene(
     prover: _Prover,
     left_out: list[LeftOut],
 ) -> list[tuple[Candidate, Proof]]:
-    """Return what is proven of a scene; the rest goes to `left_out`."""
+    """Return the proven candidates of a scene; append the others to `left_out`."""
     reserve = config.per_scene // _COMPOSITE_SHARE if SEQUENCE in kinds else 0
     singles = scene_candidates(scene, config.robots, kinds, registry)
     found = _take(singles, config.per_scene - reserve, prover, left_out)
     pairs = list(composites([candidate for candidate, _ in found], most=reserve)) if reserve else []
     found += _take(pairs, config.per_scene - len(found), prover, left_out)
-    found += _take(singles, config.per_scene - len(found), prover, left_out)  # where composites are wanting
+    found += _take(singles, config.per_scene - len(found), prover, left_out)  # if composites are too few
     for candidate in singles + pairs:
         reason = "; ".join(candidate.problems) or f"not tried: the scene has {len(found)} tasks without it"
         left_out.append(_left(candidate, reason))
@@ -186,9 +185,9 @@ def _of_scene(
 def _take(
     candidates: list[Candidate], most: int, prover: _Prover, left_out: list[LeftOut]
 ) -> list[tuple[Candidate, Proof]]:
-    """Take the first `most` that are proven out of a list, and what was tried.
+    """Remove candidates from a list until `most` of them are proven; return these.
 
-    As many are tried at once as are wanting, so that jobs change nothing.
+    Batches have as many candidates as are still needed, so the result does not depend on the number of jobs.
     """
     taken: list[tuple[Candidate, Proof]] = []
     while candidates and len(taken) < most:

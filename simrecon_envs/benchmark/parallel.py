@@ -1,4 +1,4 @@
-"""The same function on many things, in one process or in several; each has one thread."""
+"""Map a function over items in one or several single-threaded processes."""
 
 import gc
 import multiprocessing
@@ -11,59 +11,64 @@ from registry import EnvironmentMissing, UsageError
 
 
 class Workers:
-    """Up to `jobs` processes that stay; one job runs here. Use as a context."""
+    """A pool of `jobs` processes; one job runs in this process. Use as a context manager."""
 
     def __init__(self, jobs: int) -> None:
+        """Set the number of processes.
+
+        Raises:
+            UsageError: it is less than one.
+        """
         if jobs < 1:
             raise UsageError(f"--jobs {jobs}: expected at least 1")
         self.jobs = jobs
         self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> "Workers":
-        """Start; processes begin with the first work."""
+        """Prepare; processes start with the first item."""
         self._frozen_before = gc.get_freeze_count()
         prepare_process()
         if self.jobs > 1:
-            # A simulator must not be forked, so every process starts afresh.
+            # spawn: a simulator must not be forked.
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=prepare_process)
         return self
 
     def __exit__(self, *exc: object) -> None:
-        """End the processes; what was not begun is dropped."""
+        """End the processes; items that have not begun are dropped."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
         if not self._frozen_before:
-            gc.unfreeze()  # of whoever called, once more its own affair
+            gc.unfreeze()  # restore the caller's setting
 
     def map(
         self, function: Callable[..., Any], items: Sequence[Any], *arguments: Any
     ) -> Iterator[tuple[int, Any]]:
-        """Yield (number, function(item, *arguments)) as they are done."""
+        """Yield (index, function(item, *arguments)) in the order of completion."""
         if self._pool is None:
             for number, item in enumerate(items):
                 yield number, function(item, *arguments)
             return
         futures = {self._pool.submit(function, item, *arguments): n for n, item in enumerate(items)}
-        for future in as_completed(futures):
-            try:
+        try:
+            for future in as_completed(futures):
                 yield futures[future], future.result()
-            except BrokenProcessPool as error:
-                raise EnvironmentMissing(
-                    f"one of {self.jobs} processes was ended from outside, most likely as memory ran out; run the same "
-                    "command again with fewer --jobs: what was finished is kept"
-                ) from error
+        except BrokenProcessPool as error:
+            raise EnvironmentMissing(
+                f"one of {self.jobs} processes was killed, most likely because memory ran out; run the same command "
+                "again with fewer --jobs: finished work is kept"
+            ) from error
 
 
 def prepare_process() -> None:
-    """Load the simulator, one thread: its arrays are small, and episodes must not differ with the machine.
+    """Load the simulator and limit torch to one thread: arrays are small, and results must not depend on the machine.
 
-    What is loaded is taken out of the garbage collection, which ManiSkill runs whenever a scene is built anew, that is
-    before every episode, and which took a third of all time.
+    Loaded modules are frozen out of garbage collection. ManiSkill collects at every rebuild of a scene, that is before
+    every episode, which took a third of the time.
     """
     import torch
 
-    import simrecon_envs.scene_env  # noqa: F401 - all that is heavy
+    import simrecon_envs.scene_env  # noqa: F401
 
     torch.set_num_threads(1)
     gc.collect()

@@ -1,9 +1,8 @@
-"""Policies by name: the built-in ones, and `module:callable` of anybody.
+"""Load policies by name: built-in ones, or `module:callable`.
 
-The callable is called with an environment (NumPy observations, not batched) and returns an object with `act`, and
-perhaps `reset`, which is called after every reset of the environment. What it needs of the environment it says in
-its attribute `policy_options`: keyword arguments of `gym.make`, or a function of the suite's task and of the policy's
-own arguments that returns them.
+The callable takes an environment (NumPy observations, not batched) and returns an object with `act` and, optionally,
+`reset`, which is called after every reset of the environment. Its attribute `policy_options` holds arguments of
+`gym.make`, or is a function that returns them, given the suite's task and the policy's own arguments.
 
     class Mine:
         policy_options = {"control_mode": "pd_ee_delta_pose", "obs_mode": "rgb"}
@@ -13,49 +12,55 @@ own arguments that returns them.
 """
 
 import hashlib
-import os
 import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Protocol
 
 import gymnasium as gym
 import numpy as np
 
 from registry import SimReconError, UsageError
+from simrecon_envs.unwrapped import scene_of
 
 if TYPE_CHECKING:
     from simrecon_envs.benchmark.suite import SuiteTask
 
 CONTROL_MODE = "pd_ee_delta_pose"  # the oracle's
-# What makes an episode what it is; a policy may choose the others.
+# Arguments of `gym.make` that define an episode; a policy may set the others.
 FIXED = ("task", "target", "robot_uids", "randomize", "pose_noise", "max_episode_steps", "reconfiguration_freq",
          "num_envs", "scene_id", "revision", "registry", "task_config", "render_mode")  # fmt: skip
 
 
 class Policy(Protocol):
-    """What `benchmark run` needs; `reset()` may be absent."""
+    """Interface of `benchmark run`; `reset()` is optional."""
 
     def act(self, observation: Any) -> np.ndarray:
         """Return the action for an observation."""
+        ...
 
 
+def begin_episode(policy: Policy) -> None:
+    """Call the policy's `reset`, if it has one."""
+    if (reset := getattr(policy, "reset", None)) is not None:
+        reset()
+
+
+@dataclass
 class OraclePolicy:
-    """The script that the suite was proven with. It sees the simulation, not the observations."""
+    """The scripted policy of `simrecon_envs.oracle`; it reads the simulator's state, not the observations."""
 
-    policy_options = {"control_mode": CONTROL_MODE}  # noqa: RUF012 - read only, as in the protocol
-
-    def __init__(self, env: gym.Env) -> None:
-        self._env = env
+    env: gym.Env
+    policy_options: ClassVar = {"control_mode": CONTROL_MODE}
 
     def reset(self) -> None:
-        """Start the script again."""
+        """Restart the script."""
         from simrecon_envs.oracle import Oracle
 
-        self._oracle = Oracle(self._env)
+        self._oracle = Oracle(self.env)
 
     def act(self, observation: Any) -> np.ndarray:
         """Return the script's next action."""
@@ -63,29 +68,36 @@ class OraclePolicy:
 
 
 class StillPolicy:
-    """Does nothing: every action is zero."""
+    """All actions are zero."""
 
     def __init__(self, env: gym.Env) -> None:
-        self._action = np.zeros(env.action_space.shape, np.float32)
+        """Act in an environment."""
+        self._action = np.zeros(action_shape(env), np.float32)
 
     def act(self, observation: Any) -> np.ndarray:
         """Return zeros."""
         return self._action
 
 
+@dataclass
 class RandomPolicy:
-    """Draws actions uniformly, the same ones for the same episode."""
+    """Uniformly random actions, determined by the episode's seed."""
 
-    def __init__(self, env: gym.Env) -> None:
-        self._env = env
+    env: gym.Env
 
     def reset(self) -> None:
-        """Seed the actions by the episode's seed."""
-        self._env.action_space.seed(int(self._env.unwrapped._episode_seed[0]))
+        """Seed the action space with the episode's seed."""
+        self.env.action_space.seed(int(scene_of(self.env)._episode_seed[0]))
 
     def act(self, observation: Any) -> np.ndarray:
         """Return a random action."""
-        return self._env.action_space.sample()
+        return self.env.action_space.sample()
+
+
+def action_shape(env: gym.Env) -> tuple[int, ...]:
+    """Return the shape of an environment's actions."""
+    assert env.action_space.shape is not None
+    return env.action_space.shape
 
 
 BUILT_IN: dict[str, Callable] = {"oracle": OraclePolicy, "still": StillPolicy, "random": RandomPolicy}
@@ -93,16 +105,16 @@ BUILT_IN: dict[str, Callable] = {"oracle": OraclePolicy, "still": StillPolicy, "
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """A policy by its name and arguments; loaded in each process."""
+    """Name and arguments of a policy; every process loads it."""
 
     name: str
     arguments: dict[str, str] = field(default_factory=dict)
 
     def make(self, env: gym.Env) -> Policy:
-        """Return the policy for an environment; what it does wrong is said as one `UsageError`.
+        """Make the policy for an environment; its exceptions and invalid actions become a `UsageError`.
 
         Raises:
-            UsageError: there is no such module or callable (names what there is), or it does not make a policy.
+            UsageError: there is no such module or callable, or it does not return a policy.
         """
         maker = self._maker()
         try:
@@ -111,17 +123,17 @@ class PolicySpec:
             _fail(f"policy {self.name}: making it for {_where(env)}", error)
         if not callable(getattr(policy, "act", None)):
             raise UsageError(
-                f"policy {self.name}: what it returned ({type(policy).__name__}) has no act(observation)"
+                f"policy {self.name}: the returned {type(policy).__name__} has no act(observation)"
             )
         return _Watched(policy, self.name, env)
 
     def options(self, task: "SuiteTask") -> dict[str, Any]:
-        """Return the keyword arguments of `gym.make` that the policy wants for a task.
+        """Return the policy's keyword arguments for `gym.make` for a task.
 
         Raises:
-            UsageError: there is no such policy, or it wants to change what makes the episode.
+            UsageError: there is no such policy, or it sets an argument that defines the episode.
         """
-        wanted = getattr(self._maker(), "policy_options", {})
+        wanted: Any = getattr(self._maker(), "policy_options", {})
         if callable(wanted):
             try:
                 wanted = wanted(task, **self.arguments)
@@ -131,18 +143,18 @@ class PolicySpec:
         if wrong:
             raise UsageError(
                 f"policy {self.name}: its policy_options has {', '.join(wrong)}, which the suite decides; a policy "
-                "may ask for obs_mode, control_mode, reward_mode, cameras, sensor_configs and the like"
+                "may set obs_mode, control_mode, reward_mode, cameras, sensor_configs and the like"
             )
         return dict(wanted)
 
     def digest(self) -> str:
-        """Return a digest of its module's file and of files and folders that its arguments name.
+        """Return a digest of its module's file and of the files and folders that its arguments name.
 
-        A run that goes on tells by it whether the policy is still the one that it was begun with.
+        A continued run uses finished tasks only if the digest is unchanged.
         """
         digest = hashlib.sha256()
         if self.name not in BUILT_IN:
-            self._maker()  # its module is found from here on
+            self._maker()  # makes the module importable
             file = import_module(self.name.partition(":")[0]).__file__
             digest.update(Path(file).read_bytes() if file else b"")
         for value in self.arguments.values():
@@ -159,7 +171,7 @@ class PolicySpec:
 
 
 class _Watched:
-    """A policy whose errors and actions that cannot be are said with policy, task and step."""
+    """Wraps a policy; its errors and invalid actions are reported with policy, task and step."""
 
     def __init__(self, policy: Policy, name: str, env: gym.Env) -> None:
         self._policy, self._name, self._env = policy, name, env
@@ -168,31 +180,30 @@ class _Watched:
     def reset(self) -> None:
         """Begin an episode."""
         self._step = 0
-        if hasattr(self._policy, "reset"):
-            try:
-                self._policy.reset()
-            except Exception as error:
-                _fail(f"policy {self._name}: reset() in {_where(self._env)}", error)
+        try:
+            begin_episode(self._policy)
+        except Exception as error:
+            _fail(f"policy {self._name}: reset() in {_where(self._env)}", error)
 
     def act(self, observation: Any) -> np.ndarray:
         """Return the policy's action, float32 (k,)."""
         self._step += 1
         try:
-            answer = self._policy.act(observation)
+            answer: Any = self._policy.act(observation)
         except Exception as error:
             _fail(
                 f"policy {self._name}: act() at step {self._step} of an episode of {_where(self._env)}", error
             )
-        shape = self._env.action_space.shape
+        shape = action_shape(self._env)
         try:
             if answer is None:
                 raise TypeError
             action = np.asarray(answer.detach().cpu() if hasattr(answer, "detach") else answer, np.float32)
             wrong = "" if action.shape == shape else f"an action of shape {action.shape}"
         except (TypeError, ValueError):
-            wrong = f"what is no array of numbers ({type(answer).__name__})"
+            wrong = f"{type(answer).__name__}, not an array of numbers"
         if not wrong and not np.isfinite(action).all():
-            wrong = f"an action that is not finite ({np.array2string(action, precision=3, threshold=8)})"
+            wrong = f"a non-finite action ({np.array2string(action, precision=3, threshold=8)})"
         if wrong:
             raise UsageError(
                 f"policy {self._name}: act() returned {wrong} at step {self._step} of an episode of "
@@ -202,11 +213,11 @@ class _Watched:
 
 
 def _fail(what: str, error: Exception) -> NoReturn:
-    """Raise a policy's error as one that says where in whose code; the project's own ones go on as they are."""
+    """Raise a policy's error as a `UsageError` with its place in the code; re-raise the project's own errors."""
     if isinstance(error, SimReconError):
         raise error
     last = traceback.extract_tb(error.__traceback__)[-1]
-    theirs = os.path.isfile(last.filename) and last.filename != __file__
+    theirs = Path(last.filename).is_file() and last.filename != __file__
     at = f" ({last.filename}:{last.lineno})" if theirs else ""
     raise UsageError(
         f"{what} raised {type(error).__name__}: {error}{at}. SIMRECON_DEBUG=1 shows the whole traceback"
@@ -214,7 +225,7 @@ def _fail(what: str, error: Exception) -> NoReturn:
 
 
 def _where(env: gym.Env) -> str:
-    scene = env.unwrapped
+    scene = scene_of(env)
     return f"{scene.scene_id}, {scene.task}, {scene.robot_uids}"
 
 
@@ -224,7 +235,7 @@ def _find(name: str) -> Callable:
         raise UsageError(
             f"policy {name!r}: expected {', '.join(BUILT_IN)} or module:callable, such as my_policy:Policy"
         )
-    here = os.getcwd()
+    here = str(Path.cwd())
     if here not in sys.path:  # as `python -m` does; a console script does not
         sys.path.insert(0, here)
     try:
@@ -234,7 +245,7 @@ def _find(name: str) -> Callable:
             raise UsageError(f"policy {name}: importing {module_name} needs the module {error.name!r}, which is "
                              "not installed") from error  # fmt: skip
         raise UsageError(
-            f"policy {name}: there is no module {module_name!r} here or installed; run from the folder it is in"
+            f"policy {name}: there is no module {module_name!r} in this folder or installed; run from its folder"
         ) from error
     except Exception as error:
         _fail(f"policy {name}: importing {module_name}", error)

@@ -1,4 +1,4 @@
-"""What was done so far, kept beside the result that is on its way: a run that was killed goes on with it."""
+"""`Records`: finished pieces of work on disk, so that a killed run can continue."""
 
 import hashlib
 import json
@@ -9,24 +9,25 @@ from simrecon_envs.files import write_json
 
 
 class Records:
-    """One file a piece of work, in a folder beside the result's file."""
+    """One JSON file per piece of work, in a hidden folder beside the result's file."""
 
     def __init__(self, out: Path) -> None:
+        """Use the folder that belongs to the result `out`; nothing is created yet."""
         self.folder = out.with_name(f".{out.name}.records")
 
     def get(self, key: Any) -> dict | None:
-        """Return the record of a piece of work; None where it is absent or was cut off."""
+        """Return the record of a piece of work; None where it is absent or truncated. `key` is JSON."""
         try:
             return json.loads(self._file(key).read_text(encoding="utf-8"))
         except (FileNotFoundError, json.JSONDecodeError):
             return None
 
     def put(self, key: Any, record: dict) -> None:
-        """Keep a record."""
+        """Store the record of a piece of work."""
         write_json(self._file(key), record)
 
     def clear(self) -> None:
-        """Remove all records: the result is written."""
+        """Remove all records; to be called when the result is written."""
         if self.folder.is_dir():
             for file in self.folder.iterdir():
                 file.unlink()

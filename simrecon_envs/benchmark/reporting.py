@@ -1,24 +1,25 @@
-"""What a person sees while a suite is generated or run: a line a task, with the time left."""
+"""`Reporter`: progress messages with the estimated time left."""
 
 import sys
 import time
 
 
 class Reporter:
-    """Writes lines to standard error, or nothing."""
+    """Writes lines to standard error, or nothing if `quiet`."""
 
     def __init__(self, quiet: bool = False) -> None:
+        """Start the clock."""
         self._quiet = quiet
         self._total = self._done = 0
         self._began = time.monotonic()
 
     def start(self, total: int, label: str) -> None:
-        """Begin something of `total` parts; 0 where it is not known how many."""
+        """Begin a job of `total` parts; 0: unknown."""
         self._total, self._done, self._began = total, 0, time.monotonic()
         self.note(label)
 
     def done(self, text: str) -> None:
-        """Say that a part is done."""
+        """Report a finished part."""
         self._done += 1
         if not self._total:
             return self.note(f"  [{self._done}] {text}")

@@ -1,6 +1,6 @@
-"""What a policy did in a suite: a file that says all that is needed to compare it with another one."""
+"""`Results`: the episodes of a policy on a suite, with summary statistics, as a JSON file."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from simrecon_envs.benchmark.statistics import bootstrap_mean, wilson
 from simrecon_envs.files import read_json, write_json
 
 SCHEMA = "simrecon.results/1"
-STEP_S = 0.05  # a control step
+STEP_S = 0.05  # duration of a control step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,57 +25,50 @@ class EpisodeResult:
     scene_side: str
     object_side: str
     seed: int
-    proven: bool  # a seed of the suite, which the oracle did; else a fresh one
+    proven: bool  # the seed is one of the suite, which the oracle solved; else a fresh one
     success: bool
     steps: int
     path_m: float
-    oracle_path_m: float  # of the same seed; the median of the task's where the seed is fresh
+    oracle_path_m: float  # for the same seed; for a fresh seed, the median over the task's seeds
     oracle_steps: float
     reward: float
-    act_ms: float  # wall time of the policy a step
-    video: str = ""  # the file's name
+    act_ms: float  # wall time of the policy per step
+    video: str = ""  # file name
 
     @property
     def efficiency(self) -> float:
-        """Return success weighted by path length: the oracle's way over the longer of both, 0 without success."""
+        """Return success weighted by path length: oracle path / max(path, oracle path), or 0 without success."""
         if not self.success:
             return 0.0
         return self.oracle_path_m / max(self.path_m, self.oracle_path_m, 1e-9)
 
     @property
     def pair(self) -> tuple:
-        """Return what the same episode of another policy has, too."""
+        """Return the key that pairs the episode with the same episode of another policy."""
         return self.task, self.revision, self.seed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """Episodes in the order of the suite."""
+    """The episodes, in the order of the suite, and what they were run with."""
 
     suite: dict[str, Any]  # name, digest
-    policy: dict[str, Any]  # name, arguments, options (of gym.make, those that all tasks have in common)
+    policy: dict[str, Any]  # name, arguments, options (arguments of gym.make that all tasks share)
     selection: dict[str, Any]
     episodes: tuple[EpisodeResult, ...]
     notes: tuple[str, ...] = ()
     made_with: dict[str, str] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures of all episodes, and by kind, scene, robot and side."""
-        keys: dict[str, Callable[[EpisodeResult], str]] = {
-            "kind": lambda e: e.kind,
-            "scene": lambda e: e.scene,
-            "robot": lambda e: e.robot,
-            "object_side": lambda e: e.object_side,
-            "scene_side": lambda e: e.scene_side,
-        }
+        """Return the statistics of all episodes, and by kind, scene, robot and split."""
         out: dict[str, Any] = {"all": figures(self.episodes)}
-        for name, key in keys.items():
-            values = sorted({key(e) for e in self.episodes})
-            out[name] = {v: figures([e for e in self.episodes if key(e) == v]) for v in values}
+        for name in ("kind", "scene", "robot", "object_side", "scene_side"):
+            values = sorted({getattr(e, name) for e in self.episodes})
+            out[name] = {v: figures([e for e in self.episodes if getattr(e, name) == v]) for v in values}
         return out
 
     def save(self, path: Path) -> None:
-        """Write the results, whole or not at all."""
+        """Write the results atomically."""
         body = asdict(self)
         order = ("suite", "policy", "selection", "made_with", "notes")
         head = {"schema": SCHEMA, **{key: body[key] for key in order}}
@@ -86,7 +79,7 @@ def load_results(path: Path | str) -> Results:
     """Read results.
 
     Raises:
-        UsageError: the file is absent or no results of a version that is known here.
+        UsageError: the file is absent, damaged, or of another schema version.
     """
     path = Path(path)
     body = read_json(path, "results", SCHEMA)
@@ -100,8 +93,8 @@ def load_results(path: Path | str) -> Results:
         ) from error
 
 
-def figures(episodes: list[EpisodeResult] | tuple[EpisodeResult, ...]) -> dict[str, Any]:
-    """Return {figure: {value, interval, …}} of some episodes. Steps and times are of those that succeeded."""
+def figures(episodes: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Return {figure: {value, interval, …}} over episodes; steps and seconds are over the successful ones."""
     done = [e for e in episodes if e.success]
     rate = len(done) / len(episodes)
     return {

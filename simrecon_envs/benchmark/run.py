@@ -1,12 +1,14 @@
-"""A suite and a policy -> results."""
+"""Run a policy on a suite: `run_suite` returns `Results`."""
 
 import statistics
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from registry import SceneRegistry, UsageError
-from simrecon_envs.benchmark.episodes import run_episode
+from simrecon_envs.benchmark.episodes import Episode, run_episode
 from simrecon_envs.benchmark.parallel import Workers
 from simrecon_envs.benchmark.policies import PolicySpec
 from simrecon_envs.benchmark.records import Records
@@ -16,20 +18,21 @@ from simrecon_envs.benchmark.splits import episode_seed
 from simrecon_envs.benchmark.suite import Suite, SuiteTask
 from simrecon_envs.files import versions
 from simrecon_envs.rollout import open_video
+from simrecon_envs.unwrapped import scene_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """How a suite is run."""
+    """Settings of a run."""
 
     episodes: int | None = None
-    """Most episodes of a task; all of its seeds where None."""
+    """Greatest number of episodes per task; all of its seeds where None."""
     fresh: int = 0
-    """Episodes from seeds that are not the suite's, in place of those."""
+    """Number of episodes from seeds that are not in the suite, instead of its own; 0: its own."""
     any_revision: bool = False
-    """Run scenes that have another revision than the suite's, and note it."""
+    """Accept scenes with another revision than the suite's; the results note it."""
     videos: str | None = None
-    """Where a video of each task's first episode goes."""
+    """Folder for a video of each task's first episode."""
     video_size_px: int = 384
     registry: str | None = None
 
@@ -55,18 +58,18 @@ def run_suite(
     suite_name: str = "",
     selection: dict[str, Any] | None = None,
 ) -> Results:
-    """Run a policy.
+    """Run a policy on tasks of a suite.
 
     Args:
         suite: The suite.
-        tasks: Those of it that are run, as of `suite.select`.
-        policy: Which policy; every task gets a new one.
-        settings: How.
-        jobs: How many processes.
-        records: Where finished tasks are kept and found; a run that was killed goes on with them.
-        reporter: Is told what happens.
-        suite_name: For the results.
-        selection: For the results: how the tasks were chosen.
+        tasks: Its tasks to run, as of `suite.select`.
+        policy: The policy; every task gets a new instance.
+        settings: Settings of the run.
+        jobs: Number of processes.
+        records: Store of finished tasks; a run that was killed continues from it.
+        reporter: Receives progress messages.
+        suite_name: Recorded in the results.
+        selection: How the tasks were chosen; recorded in the results.
 
     Raises:
         UsageError: scenes are missing or of another revision (lists all), or there is no such policy.
@@ -75,7 +78,7 @@ def run_suite(
     notes = check_revisions(tasks, settings)
     for note in notes:
         reporter.note(f"note: {note}")
-    options = [policy.options(task) for task in tasks]  # what is wrong is said before anything is built
+    options = [policy.options(task) for task in tasks]  # fails before anything is built
     made_with = versions()
     frame = {
         "suite": suite.digest,
@@ -89,7 +92,7 @@ def run_suite(
         if record is not None:
             found[task.name] = [EpisodeResult(**entry) for entry in record["episodes"]]
     open_ = [task for task in tasks if task.name not in found]
-    reporter.start(len(open_), f"{policy.name}: {len(tasks)} tasks, {len(found)} of them done before")
+    reporter.start(len(open_), f"{policy.name}: {len(tasks)} tasks, {len(found)} of them from an earlier run")
     with Workers(jobs) as workers:
         for number, rows in workers.map(run_task, open_, suite.options, policy, settings, suite.settings):
             task = open_[number]
@@ -108,10 +111,10 @@ def run_suite(
 
 
 def check_revisions(tasks: list[SuiteTask], settings: RunSettings) -> list[str]:
-    """Return notes about scenes that have another revision than the suite's.
+    """Return a note for each scene with another revision than the suite's.
 
     Raises:
-        UsageError: scenes are missing, or have another revision and that was not allowed; lists all of them.
+        UsageError: scenes are missing, or have another revision without `any_revision`; lists all of them.
     """
     catalog = SceneRegistry(None if settings.registry is None else Path(settings.registry))
     known = catalog.revisions()
@@ -129,7 +132,7 @@ def check_revisions(tasks: list[SuiteTask], settings: RunSettings) -> list[str]:
     if changed and not settings.any_revision:
         raise UsageError(
             f"the registry {catalog.root} has other revisions of scenes than the suite was proven in: "
-            f"{'; '.join(changed)}. Generate the suite again, or go on with --any-revision: results then say so"
+            f"{'; '.join(changed)}. Generate the suite again, or accept them with --any-revision; the results note it"
         )
     return [f"scene {text}" for text in changed]
 
@@ -137,7 +140,7 @@ def check_revisions(tasks: list[SuiteTask], settings: RunSettings) -> list[str]:
 def run_task(
     task: SuiteTask, options: dict[str, Any], policy: PolicySpec, settings: RunSettings, made: dict[str, Any]
 ) -> list[EpisodeResult]:
-    """Run a task's episodes one after the other, in an environment of its own."""
+    """Run the episodes of a task in one environment. `made` are the settings of the suite."""
     suite = Suite(tasks=(task,), options=options)
     extra: dict[str, Any] = policy.options(task)
     if settings.videos is not None:
@@ -148,31 +151,31 @@ def run_task(
         actor = policy.make(env)
         rows = []
         for number, seed in enumerate(_seeds(task, settings, int(made.get("seed", 0)))):
-            video = f"{task.name}-{seed}.mp4" if settings.videos is not None and number == 0 else ""
-            if video:
-                with open_video(Path(settings.videos) / video, env.unwrapped.control_freq) as add:
-                    episode = run_episode(env, actor, seed, lambda *_: add(env.render()))
+            video = ""
+            if settings.videos is not None and number == 0:
+                video = f"{task.name}-{seed}.mp4"
+                with open_video(Path(settings.videos) / video, scene_of(env).control_freq) as add:
+                    episode = run_episode(env, actor, seed, lambda *_: add(np.asarray(env.render())))
             else:
                 episode = run_episode(env, actor, seed)
-            rows.append(_row(task, env.unwrapped.bundle.revision, episode, video))
+            rows.append(_row(task, scene_of(env).bundle.revision, episode, video))
         return rows
     finally:
         env.close()
 
 
 def _common(options: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the options that are the same for all tasks."""
+    """Return the options that all tasks share."""
     return {key: value for key, value in options[0].items() if all(o.get(key) == value for o in options)}
 
 
 def _seeds(task: SuiteTask, settings: RunSettings, suite_seed: int) -> list[int]:
     if settings.fresh:
-        # The suite's come from numbers that start at 0.
         return [episode_seed(suite_seed, f"{task.name}/fresh", number) for number in range(settings.fresh)]
     return list(task.seeds[: settings.episodes])
 
 
-def _row(task: SuiteTask, revision: str, episode: Any, video: str) -> EpisodeResult:
+def _row(task: SuiteTask, revision: str, episode: Episode, video: str) -> EpisodeResult:
     known = {run.seed: run for run in task.oracle}
     mine = [known[episode.seed]] if episode.seed in known else list(task.oracle)
     return EpisodeResult(

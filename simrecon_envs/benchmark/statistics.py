@@ -1,4 +1,4 @@
-"""Rates, means and their 95 % intervals. Deterministic."""
+"""Success rates, means, their 95 % intervals, and McNemar's test. Deterministic."""
 
 import math
 from collections.abc import Hashable, Sequence
@@ -6,11 +6,11 @@ from collections.abc import Hashable, Sequence
 import numpy as np
 
 Interval = tuple[float, float]
-_DRAWS = 4000
+_DRAWS = 4000  # bootstrap resamples
 
 
 def wilson(successes: int, count: int) -> Interval:
-    """Return Wilson's 95 % interval of a rate: where the true rate of these tasks may lie, episodes drawn anew."""
+    """Return the 95 % Wilson score interval of a success rate."""
     if count < 1 or not 0 <= successes <= count:
         raise ValueError(
             f"expected 0 <= successes <= count and a count of at least 1, got {successes} of {count}"
@@ -22,9 +22,10 @@ def wilson(successes: int, count: int) -> Interval:
 
 
 def bootstrap_mean(values: Sequence[float], groups: Sequence[Hashable]) -> Interval | None:
-    """Return the 95 % interval of a mean when whole groups (tasks) are drawn anew; None with fewer than two groups.
+    """Return the 95 % cluster bootstrap interval of a mean; None with fewer than two groups.
 
-    Episodes of one task are alike, so that drawing single episodes would make the interval too narrow.
+    Whole groups (tasks) are resampled: episodes of a task are correlated, so resampling single episodes would make the
+    interval too narrow.
     """
     names = list(dict.fromkeys(groups))
     if len(names) < 2:
@@ -40,7 +41,7 @@ def bootstrap_mean(values: Sequence[float], groups: Sequence[Hashable]) -> Inter
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Return the exact two-sided p of McNemar's test, from the pairs in which only one of two succeeded."""
+    """Return the p-value of McNemar's exact two-sided test from the numbers of discordant pairs."""
     count = only_first + only_second
     if count == 0:
         return 1.0

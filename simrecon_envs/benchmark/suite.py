@@ -1,4 +1,4 @@
-"""A suite of tasks as a file: what is to be done, where, from which seeds, and how the oracle did it."""
+"""`Suite`: tasks with scenes, episode seeds and the oracle's solutions, as a JSON file."""
 
 import fnmatch
 import hashlib
@@ -21,18 +21,18 @@ SPLIT_BY = ("object", "scene")
 
 @dataclass(frozen=True, kw_only=True)
 class OracleRun:
-    """How the oracle did an episode."""
+    """The oracle's solution of an episode."""
 
     seed: int
     steps: int
-    path_m: float  # way of the hand's tip, of the base where a task is about driving
+    path_m: float  # path length of the hand; of the base in navigation tasks
 
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteTask:
-    """A task of a suite; its episodes are `oracle`, one a seed."""
+    """A task of a suite, with one episode per entry of `oracle`."""
 
-    name: str  # "room-pick_mug-panda", once in a suite
+    name: str  # "room-pick_mug-panda", unique in the suite
     env_id: str  # for gym.make
     scene: str
     revision: str  # of the scene's bundle
@@ -41,9 +41,9 @@ class SuiteTask:
     robot: str
     instruction: str
     max_steps: int
-    objects: tuple[str, ...]  # "room/7": what the task is about, but for what cannot move
+    objects: tuple[str, ...]  # "room/7": the movable objects that the task is about
     scene_side: str
-    object_side: str  # "test" where any of its objects is
+    object_side: str  # "test" if any of its objects is in the test split
     oracle: tuple[OracleRun, ...]
 
     @property
@@ -52,13 +52,13 @@ class SuiteTask:
         return tuple(run.seed for run in self.oracle)
 
     def options(self) -> dict[str, Any]:
-        """Return what `gym.make` takes for this task, besides the suite's `options`."""
+        """Return the task's arguments of `gym.make`, in addition to the suite's `options`."""
         return {"robot_uids": self.robot, "max_episode_steps": self.max_steps}
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeftOut:
-    """A candidate that is no task of the suite."""
+    """A candidate that is not in the suite, and why."""
 
     scene: str
     robot: str
@@ -69,17 +69,17 @@ class LeftOut:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """Tasks with the seeds of their episodes. Holds no path and no time: the same input gives the same file."""
+    """The tasks of a suite. Contains no path and no time, so the same input gives the same file."""
 
     tasks: tuple[SuiteTask, ...]
     left_out: tuple[LeftOut, ...] = ()
-    options: dict[str, Any] = field(default_factory=dict)  # of gym.make, of every task
-    settings: dict[str, Any] = field(default_factory=dict)  # what it was generated with
+    options: dict[str, Any] = field(default_factory=dict)  # arguments of gym.make for every task
+    settings: dict[str, Any] = field(default_factory=dict)  # of its generation
     made_with: dict[str, str] = field(default_factory=dict)  # versions
 
     @property
     def digest(self) -> str:
-        """Return what identifies the episodes: 16 hexadecimal digits."""
+        """Return 16 hexadecimal digits that identify the episodes."""
         rows = [(t.env_id, t.revision, t.robot, t.max_steps, t.seeds) for t in self.tasks]
         text = json.dumps([SCHEMA, self.options, rows], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -102,13 +102,13 @@ class Suite:
 
         Args:
             split: "all", "train" or "test".
-            split_by: "object" or "scene": whose side counts.
-            tasks: Patterns of names with `*` and `?`, joined by commas.
-            kinds: Only these; all where empty.
-            robots: Only these; all where empty.
+            split_by: "object" or "scene".
+            tasks: Patterns of task names with `*` and `?`, separated by commas.
+            kinds: Only these kinds; all where empty.
+            robots: Only these robots; all where empty.
 
         Raises:
-            UsageError: there is no such split, or nothing is left.
+            UsageError: there is no such split, or no task passes.
         """
         if split not in SPLITS or split_by not in SPLIT_BY:
             raise UsageError(
@@ -127,7 +127,7 @@ class Suite:
         if not chosen:
             raise UsageError(
                 f"none of the suite's {len(self.tasks)} tasks is in the split {split!r} (by {split_by}) with the name "
-                f"{tasks!r}{_among('kind', kinds)}{_among('robot', robots)}; its tasks are like {_some(self.tasks)}"
+                f"{tasks!r}{_among('kind', kinds)}{_among('robot', robots)}; some of its tasks: {_some(self.tasks)}"
             )
         return chosen
 
@@ -135,7 +135,7 @@ class Suite:
         """Make the environment of a task, with NumPy observations.
 
         Raises:
-            UsageError: ManiSkill knows no such observations, control mode or other argument; says what it said.
+            UsageError: ManiSkill rejects an argument; quotes its message.
         """
         from simrecon_envs.registration import make_cpu
 
@@ -149,7 +149,7 @@ class Suite:
             raise UsageError(f"{task.name}: no environment can be made with {wanted}: {said}") from error
 
     def save(self, path: Path) -> None:
-        """Write the suite, whole or not at all."""
+        """Write the suite atomically."""
         body = asdict(self)
         head = {"schema": SCHEMA, "digest": self.digest}
         order = ("made_with", "settings", "options", "tasks", "left_out")
@@ -160,7 +160,7 @@ def load_suite(path: Path | str) -> Suite:
     """Read a suite.
 
     Raises:
-        UsageError: the file is absent or no suite of a version that is known here; says what is wrong.
+        UsageError: the file is absent, damaged, edited, or of another schema version.
     """
     path = Path(path)
     body = read_json(path, "suite", SCHEMA)
@@ -181,7 +181,7 @@ def load_suite(path: Path | str) -> Suite:
         raise UsageError(f"suite {path}: it has {'no tasks' if not names else 'two tasks of one name'}")
     if suite.digest != body.get("digest"):
         raise UsageError(
-            f"suite {path}: its tasks are not those that it was written with (digest {body.get('digest')!r}, now "
+            f"suite {path}: the tasks were changed after it was written (digest {body.get('digest')!r}, now "
             f"{suite.digest!r}); generate it again instead of editing it, or choose with --tasks, --kinds and --split"
         )
     return suite

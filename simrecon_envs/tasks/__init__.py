@@ -1,11 +1,10 @@
-"""Tasks that a scene's graph suggests: one module a kind, listed in `kinds.KINDS`.
+"""Tasks that the scene graph of a bundle suggests: one class per kind, listed in `KINDS`.
 
-To add a kind: write a class like those here and add it to `KINDS`; ids, listing, errors, the environment, the
-oracle and the tests take it from there.
+docs/extending.md shows how to add a kind, from this package or from another one.
 """
 
 from simrecon_envs.tasks.base import Task
-from simrecon_envs.tasks.kinds import KINDS
+from simrecon_envs.tasks.kinds import KINDS, load_installed, register_task
 from simrecon_envs.tasks.names import list_specs, parse_task, unknown_task
 from simrecon_envs.tasks.pick import PickTaskConfig
 from simrecon_envs.tasks.sequence import Sequence
@@ -25,5 +24,8 @@ __all__ = [
     "kind_of",
     "list_specs",
     "parse_task",
+    "register_task",
     "unknown_task",
 ]
+
+load_installed()  # last: these modules import this package

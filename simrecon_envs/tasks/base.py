@@ -1,4 +1,4 @@
-"""What a kind of task is. A kind is one class in one module; `simrecon_envs.tasks.KINDS` lists them."""
+"""`Task`, the base class of all kinds of tasks, and what several kinds share. docs/extending.md adds a kind."""
 
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -7,98 +7,130 @@ import numpy as np
 import torch
 
 from simrecon_envs.arrays import Array, tanh
+from simrecon_envs.oracle import Hand
 from simrecon_envs.placement import Placement
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
 
 if TYPE_CHECKING:
-    from simrecon_envs.oracle import Hand
     from simrecon_envs.scene_env import SceneEnv
 
 Info = dict[str, Array]
+Pair = tuple[int | None, int | None]  # ids of subject and place
 
 
 class Task:
-    """A task in an environment: when it is done, the reward on the way, and how a script does it.
+    """Success condition, dense reward, observations and scripted solution of one task in an environment.
 
-    Every array has the number of parallel environments first, b; they are NumPy's or torch's (`arrays`). Distances are
-    in metres, world space.
+    The first axis of every array is the number of parallel environments, b. Arrays are NumPy arrays or torch tensors
+    (see `simrecon_envs.arrays`). Positions are in world space, distances in metres.
     """
 
-    kind: ClassVar[str]
-    subjects: ClassVar[bool] = True  # names an object; "rearrange" is about the scene
-    joint: ClassVar[str] = ""  # between subject and place in the task's name
-    max_reward: ClassVar[float]
-    mobile_only: ClassVar[bool] = False
-    lasting: ClassVar[bool] = True  # a stage of a composite must still be done at its end
+    kind: ClassVar[str]  # the first word of the task's name
+    subjects: ClassVar[bool] = True  # False: the task is about the whole scene and names no object
+    joint: ClassVar[str] = ""  # between subject and place in the name, such as "_on_"; empty: no place
+    sentence: ClassVar[str]  # the instruction, with "{subject}" and "{place}" for the objects' names
+    max_reward: float  # of a step with success
+    mobile_only: ClassVar[bool] = False  # True: for robots that drive; placed by `plan`, not `interests`
+    lasting: ClassVar[bool] = True  # a stage of this kind must still hold at the end of a composite
+
+    # ---- Which tasks of this kind a scene has. These run without a simulator.
 
     @classmethod
-    def options(cls, facts: SceneFacts) -> list[tuple[int | None, int | None]]:
-        """Return the (subject, place) that the scene's graph suggests, the easiest first."""
+    def options(cls, facts: SceneFacts) -> list[Pair]:
+        """Return the candidates as pairs (subject, place), the easiest first."""
         return [(target.id, None) for target in facts.ranked]
 
     @classmethod
     def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
-        """Return why a task can hardly be done, from what the bundle says."""
+        """Return the reasons why a candidate is likely infeasible; empty where none is known."""
         return subject_problems(facts, subject)
 
     @classmethod
     def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
-        """Return places (k, 3): of each array the robot must reach at least one, besides the subject."""
+        """Return arrays of hand positions (k, 3). The robot is placed to reach the subject and one of each array."""
         return []
 
-    def __init__(self, env: "SceneEnv", spec: TaskSpec, placement: Placement) -> None:
-        """Plan for a robot at a place; nothing is built yet, so only the scene's facts may be read."""
-        self.env, self.spec, self.placement = env, spec, placement
-        self.facts: SceneFacts = env.facts
-        self._concerned = tuple(key for key in (spec.subject, spec.place) if key in self.facts.targets)
+    @classmethod
+    def things(cls, facts: SceneFacts) -> list[int]:
+        """Return the ids of the objects that a task without a subject moves, the easiest first."""
+        raise NotImplementedError
 
-    @property
-    def subject(self) -> int:
-        """Return the id of what the task is about."""
-        assert self.spec.subject is not None
-        return self.spec.subject
+    @classmethod
+    def plan(cls, facts: SceneFacts, spec: TaskSpec) -> Placement:
+        """Return where a robot that drives is placed; only for kinds that are `mobile_only`."""
+        raise NotImplementedError
 
     @classmethod
     def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
-        """Return the instruction."""
-        raise NotImplementedError
+        """Return the instruction, for any robot."""
+        names = {"subject": spec.subject, "place": spec.place}
+        return cls.sentence.format(**{k: facts.thing(key) for k, key in names.items() if key is not None})
+
+    # ---- One task in an environment.
+
+    def __init__(self, env: "SceneEnv", spec: TaskSpec, placement: Placement) -> None:
+        """Make a task for a placed robot; the simulator does not exist yet."""
+        self.env, self.spec, self.placement = env, spec, placement
+        self.facts: SceneFacts = env.facts
+        self._concerned = tuple(key for key in (spec.subject, spec.place) if key in self.facts.targets)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Compute what depends on `facts` and `placement`, such as goals within reach; called once, by `__init__`."""
+
+    @property
+    def subject(self) -> int:
+        """Return the id of the subject."""
+        return self.spec.subject_id
+
+    @property
+    def place(self) -> int:
+        """Return the id of the place."""
+        return self.spec.place_id
 
     @property
     def instruction(self) -> str:
-        """Return the task in words, as it is in this environment."""
+        """Return the instruction for this environment."""
         return self.words(self.facts, self.spec)
 
     def start(self, env_idx: torch.Tensor, rng: Any) -> None:
-        """Prepare an episode in the environments `env_idx`; things stand where the bundle has them."""
+        """Begin an episode in the environments `env_idx`; objects are at their initial poses.
+
+        Args:
+            env_idx: Indices (n,) of the environments.
+            rng: ManiSkill's batched generator, for `draw`.
+        """
 
     def evaluate(self) -> Info:
-        """Return "success" (b,) and what it depends on."""
+        """Return "success" (b,), a bool, and the quantities that it is computed from."""
         raise NotImplementedError
 
     def reward(self, info: Info) -> Array:
-        """Return the dense reward (b,) between 0 and `max_reward`, which success gives."""
+        """Return the dense reward (b,), 0 to `max_reward`; `max_reward` exactly where `info["success"]`."""
         raise NotImplementedError
 
     def observe(self, info: Info) -> dict[str, Array]:
-        """Return what an agent may know of the task, each (b, k)."""
+        """Return the task's part of the observation, arrays (b, k)."""
         return {}
 
-    def script(self, hand: "Hand") -> Iterator[np.ndarray]:
-        """Yield actions that do the task, one a control step."""
+    def script(self, hand: Hand) -> Iterator[np.ndarray]:
+        """Yield actions that solve the task, one per control step. `Oracle` runs them."""
         raise NotImplementedError
 
-    def _while_still(self, name: str, compute: Callable[[], Any]) -> Any:
-        """Return what `compute` makes of where subject and place are, computed once until one of them moves.
+    # ---- Helpers.
 
-        What else it depends on must be settled in `start`.
+    def _while_still(self, name: str, compute: Callable[[], Any]) -> Any:
+        """Return `compute()`, cached until subject or place moves.
+
+        Apart from their poses, the result may only depend on what `start` sets.
         """
         return self.env.measures.while_still((id(self), name), self._concerned, compute)
 
     def _undisturbed(self, compute: Callable[[], Info]) -> Info:
-        """Return what `compute` makes of subject and place, once while they sleep and the hand is not at the subject.
+        """Return `compute()`, cached while subject and place sleep and the hand is far from the subject.
 
-        The exception is `tcp_to_target_m`, which is that of now.
+        `tcp_to_target_m` is always current.
         """
         measures = self.env.measures
         info = measures.undisturbed((id(self), "undisturbed"), self.subject, self._concerned, compute)
@@ -109,7 +141,7 @@ class Task:
 
 
 def subject_problems(facts: SceneFacts, subject: int | None) -> list[str]:
-    """Return why the robot can hardly lift an object."""
+    """Return the reasons why the robot cannot lift an object."""
     if subject in facts.targets:
         target = facts.targets[subject]
         return [target.problem] if target.problem else []
@@ -119,11 +151,11 @@ def subject_problems(facts: SceneFacts, subject: int | None) -> list[str]:
 
 
 def draw(rng: Any, env_idx: torch.Tensor, width: int) -> np.ndarray:
-    """Return uniform draws (len(env_idx), width) of ManiSkill's batched generator, by seed."""
+    """Return uniform samples in [0, 1) (len(env_idx), width) from ManiSkill's batched generator."""
     index = env_idx.cpu().numpy()
     return np.asarray(rng[index].uniform(size=width), np.float64).reshape(len(index), width)
 
 
 def nearness(distance: Array) -> Array:
-    """Return 1 at distance 0 (m), falling to 0; half at 11 cm, as in ManiSkill's tasks."""
+    """Return 1 - tanh(5 distance): 1 at 0 m, 0.5 at 11 cm, as in ManiSkill's tasks."""
     return 1 - tanh(5.0 * distance)

@@ -1,35 +1,35 @@
-"""What placing, putting, stacking and rearranging share: an object is carried to a goal and let go there."""
+"""Base class of place, put, stack and restore: carry an object to a goal and release it."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
 
 from simrecon_envs.arrays import Array, column, norm, numpy, real, surely_not, where
+from simrecon_envs.oracle import Hand
 from simrecon_envs.tasks.base import Info, Task, draw, nearness, subject_problems
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
 
-ABOVE_GOAL_M = 0.02  # where it is let go from
-OVER_THINGS_M = 0.12  # how high it is carried over what stands about
+ABOVE_GOAL_M = 0.02  # height above the goal at which the script opens the hand
+OVER_THINGS_M = 0.12  # height above the goal at which the object is carried over obstacles
 _NEAR_GOAL_M = 0.05
-_FREE_CHOICE = 24  # goals drawn from are the roomiest of those within reach
+_FREE_CHOICE = 24  # goals are drawn from this many of the roomiest reachable ones
 
 
 class Carry(Task):
-    """Success is physical: `_arrived` says where, and in all kinds the object rests and nobody holds it.
-
-    The reward's steps: reach (0 to 1), hold and carry (2 to 4), let go at the goal (4 to 5), success (6).
-    """
+    """Success: the object is at its goal (`_arrived`), at rest, not held."""
 
     max_reward = 6.0
 
     @classmethod
     def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
-        """Return why the object cannot be lifted, or why it cannot be put down there."""
+        """Return the reasons why the object cannot be lifted, or not be put down at the place."""
         problems = subject_problems(facts, subject)
         if subject not in facts.targets:
             return problems
+        assert place is not None
         if place == subject or place in facts.above(subject):
             return [*problems, "it cannot stand on itself"]
         if not problems and not len(cls._goals(facts, TaskSpec("", "", subject, place))):
@@ -38,39 +38,41 @@ class Carry(Task):
 
     @classmethod
     def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
-        return [facts.hand_over(spec.subject, cls._goals(facts, spec))]
+        """Return the hand positions over the goals."""
+        return [facts.hand_over(spec.subject_id, cls._goals(facts, spec))]
 
     @classmethod
     def _goals(cls, facts: SceneFacts, spec: TaskSpec) -> np.ndarray:
-        """Return where the bottom of the object's box may go (k, 3), the best first."""
-        return facts.spots(spec.place, spec.subject)
+        """Return goals (k, 3) for the bottom center of the object's box, the best first."""
+        return facts.spots(spec.place_id, spec.subject_id)
 
-    def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
-        super().__init__(env, spec, placement)
-        goals = self._goals(self.facts, spec)
-        mask = placement.reaches(self.facts.hand_over(spec.subject, goals), self.facts.traits)
+    def prepare(self) -> None:
+        """Keep the goals that the placed robot reaches; all of them where it reaches none."""
+        goals = self._goals(self.facts, self.spec)
+        mask = self.placement.reaches(self.facts.hand_over(self.subject, goals), self.facts.traits)
         self.goals = (goals[mask] if mask.any() else goals)[:_FREE_CHOICE]
         if not len(self.goals):
-            self.goals = self.facts.targets[spec.subject].center[None] * [1, 1, 0]
+            self.goals = self.facts.targets[self.subject].center[None] * [1, 1, 0]
 
-    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+    def start(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Draw a goal."""
         if not hasattr(self, "goal"):
-            self.goal, self._home = self._zeros(3), self._zeros(3)
+            self.goal = self._zeros(3)
         chosen = (draw(rng, env_idx, 1)[:, 0] * len(self.goals)).astype(int)
         bottom = self.env.measures.array(self.goals[chosen])
         bottom[:, 2] += self.facts.height_m(self.subject) / 2
         self.goal[env_idx] = bottom
-        self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
 
     def live_goal(self) -> Array:
-        """Return where the object's box centre should come to rest (b, 3)."""
+        """Return the goal (b, 3) of the object's box center; it moves with the place where that can move."""
         return self.goal
 
     def _arrived(self) -> Info:
-        """Return "is_there" (b,) and what it depends on: whether the object is where it should be."""
+        """Return "is_there" (b,), whether the object is at its goal, and what it is computed from."""
         raise NotImplementedError
 
     def evaluate(self) -> Info:
+        """Return success: arrived, at rest, not held."""
         return self._undisturbed(self._judge)
 
     def _judge(self) -> Info:
@@ -88,6 +90,7 @@ class Carry(Task):
         }
 
     def reward(self, info: Info) -> Array:
+        """Return 0 to 1 for reaching the object, 2 to 4 for carrying it, 4 to 5 for releasing it at the goal."""
         near = (info["target_to_goal_m"] <= _NEAR_GOAL_M) | info["is_there"]
         if surely_not(info["is_grasped"] | near):
             return nearness(info["tcp_to_target_m"])
@@ -100,9 +103,9 @@ class Carry(Task):
         return where(info["success"], self.max_reward, reward)
 
     def _way(self) -> Array:
-        """Return how far (b,) the object has to be carried: first over the goal, then down to it.
+        """Return the length (b,) of the way to the goal: sideways at carrying height, then down.
 
-        A straight line leads through what stands in between.
+        The straight line would lead through obstacles.
         """
         position, goal = self.env.measures.position(self.subject), self.live_goal()
         aside = norm(position[:, :2] - goal[:, :2])
@@ -113,6 +116,7 @@ class Carry(Task):
         return norm(self.env.measures.position(self.subject) - self.live_goal())
 
     def observe(self, info: Info) -> dict[str, Array]:
+        """Return the object's pose, the goal, and the vectors between hand, object and goal."""
         measures = self.env.measures
         pose, goal = measures.pose(self.subject), self.live_goal()
         return {
@@ -123,7 +127,8 @@ class Carry(Task):
             "target_to_goal": self._while_still("way", lambda: goal - pose[:, :3]),
         }
 
-    def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
+    def script(self, hand: Hand) -> Iterator[np.ndarray]:
+        """Grip, lift, carry over obstacles, release, wait until it rests."""
         yield from hand.grip(self.subject)
         yield from hand.lift(OVER_THINGS_M + 0.03)
         yield from hand.carry(self.subject, lambda: numpy(self.live_goal())[0], OVER_THINGS_M, ABOVE_GOAL_M)

@@ -1,4 +1,4 @@
-"""Tasks by name: `pick_mug`, `place_box_7_on_table`, `reach_can-then-pick_can`."""
+"""Convert between task names and `TaskSpec`: `pick_mug`, `place_box_7_on_table`, `reach_can-then-pick_can`."""
 
 from registry import UsageError
 from registry.errors import did_you_mean
@@ -10,12 +10,12 @@ from simrecon_envs.tasks.spec import THEN, TaskSpec
 def list_specs(
     facts: SceneFacts, *, kinds: tuple[str, ...] | None = None, hard: bool = False
 ) -> list[TaskSpec]:
-    """Return the tasks of a scene, by kind, the easiest first.
+    """Return the tasks of a scene by kind, the easiest first.
 
     Args:
         facts: The scene, for a robot.
-        kinds: Only these.
-        hard: With those that something speaks against.
+        kinds: Only these kinds; all where None.
+        hard: Include tasks with known problems.
     """
     found = []
     for name, kind in KINDS.items():
@@ -26,10 +26,10 @@ def list_specs(
 
 
 def parse_task(facts: SceneFacts, name: str) -> TaskSpec:
-    """Return the task of a name, also of one that can hardly be done (see its `problems`).
+    """Return the task of a name; its `problems` tell whether it is likely infeasible.
 
     Raises:
-        UsageError: there is no such task; the message lists those that there are, and the nearest.
+        UsageError: there is no such task; the message lists the tasks and the closest match.
     """
     if THEN in name:
         stages = tuple(parse_task(facts, part) for part in name.split(THEN))
@@ -46,11 +46,11 @@ def parse_task(facts: SceneFacts, name: str) -> TaskSpec:
 
 
 def unknown_task(facts: SceneFacts, name: str) -> str:
-    """Return the message for a task that a scene does not have."""
+    """Return the error message for a task that a scene does not have."""
     known = [spec.name for spec in list_specs(facts)]
     every = [spec.name for spec in list_specs(facts, hard=True)]
     meant = ""
-    if name not in KINDS:  # a kind that this scene has nothing for is spelled rightly
+    if name not in KINDS:  # an existing kind without tasks in this scene needs no suggestion
         of_kind = "" if "_" in name else did_you_mean(name, KINDS)
         meant = of_kind or did_you_mean(name, every, cutoff=0.4)
     shown = ", ".join(known[:12]) + (f" and {len(known) - 12} more" if len(known) > 12 else "")
@@ -60,8 +60,8 @@ def unknown_task(facts: SceneFacts, name: str) -> str:
     )
 
 
-def _objects(facts: SceneFacts, text: str, joint: str) -> tuple[int | None, int | None] | None:
-    """Return (subject, place) of `mug_on_table`, None where the names are not in the scene."""
+def _objects(facts: SceneFacts, text: str, joint: str) -> tuple[int, int | None] | None:
+    """Return (subject, place) of a text such as `mug_on_table`; None where the scene lacks a name in it."""
     if not joint:
         return (facts.names[text], None) if text in facts.names else None
     parts = text.split(joint)

@@ -1,51 +1,50 @@
-"""Pick: grip an object, lift it by 10 cm, and keep still."""
+"""Pick: grip an object, lift it by 10 cm, and hold it still."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
 from simrecon_envs.arrays import Array, clamp, column, component, real, where
+from simrecon_envs.oracle import Hand
 from simrecon_envs.tasks.base import Info, Task, nearness
-from simrecon_envs.tasks.facts import SceneFacts
-from simrecon_envs.tasks.spec import TaskSpec
 
 
 @dataclass(frozen=True)
 class PickTaskConfig:
-    """When a target counts as picked up."""
+    """Thresholds of success."""
 
     lift_m: float = 0.10
-    """How far above its initial height the target must be."""
+    """Least height of the object above its initial height."""
     max_joint_speed: float = 0.2
-    """How still the robot must be (rad/s or m/s), as in ManiSkill's own tasks."""
+    """Greatest speed of a robot joint (rad/s or m/s), as in ManiSkill's tasks."""
     max_target_speed_m_s: float = 0.2
-    """How still the target must be."""
+    """Greatest speed of the object."""
 
 
 class Pick(Task):
-    """The object held between the fingers, 10 cm above where it stood, everything still."""
+    """Success: held between the fingers, 10 cm above its initial height, object and robot still."""
 
     kind = "pick"
+    sentence = "Pick up the {subject}."
     max_reward = 5.0
     lasting = False
-
-    @classmethod
-    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
-        return f"Pick up the {facts.thing(spec.subject)}."
 
     @property
     def config(self) -> PickTaskConfig:
         """Return the thresholds."""
         return self.env.task_config
 
-    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+    def start(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Store the initial position."""
         if not hasattr(self, "_home"):
             self._home = self._zeros(3)
         self._home[env_idx] = self.env.measures.position(self.subject)[env_idx]
 
     def evaluate(self) -> Info:
+        """Return success: held, lifted, still."""
         measures, config = self.env.measures, self.config
         lift = self._while_still("lift", self._lift_m)
         held = measures.held(self.subject)
@@ -65,6 +64,7 @@ class Pick(Task):
         return component(self.env.measures.position(self.subject), 2) - component(self._home, 2)
 
     def reward(self, info: Info) -> Array:
+        """Return 0 to 1 for reaching, plus 1 for holding, 0 to 2 for lifting, 1 for keeping still."""
         held = real(info["is_grasped"])
         lift = clamp(info["lift_m"] / self.config.lift_m, 0.0, 1.0)
         done = held * real(info["is_lifted"]) * real(info["is_still"])
@@ -72,6 +72,7 @@ class Pick(Task):
         return where(info["success"], self.max_reward, reward)
 
     def observe(self, info: Info) -> dict[str, Array]:
+        """Return the object's pose, its lift, and the vector from the hand."""
         pose = self.env.measures.pose(self.subject)
         return {
             "is_grasped": column(info["is_grasped"]),
@@ -80,7 +81,8 @@ class Pick(Task):
             "target_lift": column(info["lift_m"]),
         }
 
-    def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
+    def script(self, hand: Hand) -> Iterator[np.ndarray]:
+        """Grip, lift, wait."""
         yield from hand.grip(self.subject)
         yield from hand.lift(self.config.lift_m + 0.12)
         yield from hand.wait(30)

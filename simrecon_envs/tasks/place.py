@@ -1,19 +1,20 @@
-"""Place: put an object on another support than the one it stands on."""
+"""Place: put an object on a support other than its present one."""
 
-from simrecon_envs.tasks.base import Info
+from simrecon_envs.tasks.base import Info, Pair
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
-from simrecon_envs.tasks.spec import TaskSpec
 
 
 class Place(Carry):
-    """The support carries the object, which rests, and nobody holds it."""
+    """Success: the support carries the object, which is at rest and not held."""
 
     kind = "place"
+    sentence = "Place the {subject} on the {place}."
     joint = "_on_"
 
     @classmethod
-    def options(cls, facts: SceneFacts) -> list[tuple[int | None, int | None]]:
+    def options(cls, facts: SceneFacts) -> list[Pair]:
+        """Return each movable object with each fixed support other than its own."""
         supports = [key for key in facts.carriers if key not in facts.movable]
         return [
             (target.id, place)
@@ -22,9 +23,5 @@ class Place(Carry):
             if place not in (target.id, facts.parent.get(target.id))
         ]
 
-    @classmethod
-    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
-        return f"Place the {facts.thing(spec.subject)} on the {facts.thing(spec.place)}."
-
     def _arrived(self) -> Info:
-        return {"is_there": self.env.measures.supported(self.subject, self.spec.place)}
+        return {"is_there": self.env.measures.supported(self.subject, self.place)}

@@ -1,69 +1,73 @@
-"""Rearrange: things were moved about on their support; bring them back to where the video shows them."""
+"""Rearrange: bring objects that were displaced at reset back to their captured positions."""
 
 import functools
 import operator
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
 
 from simrecon_envs.arrays import Array, larger, norm, real, surely_not, where, whole
+from simrecon_envs.oracle import Hand
 from simrecon_envs.placement import Placement
 from simrecon_envs.robots import robot_shape
-from simrecon_envs.tasks.base import Info, Task, draw
+from simrecon_envs.tasks.base import Info, Pair, Task, draw
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
 
-WITHIN_M = 0.03
-_MOST = 3
-_MOVED_M = (0.08, 0.30)
-_UPRIGHT = 0.95
-_ROBOT_GAP_M = 0.03
+WITHIN_M = 0.03  # tolerance around the captured position, horizontally
+_MOST = 3  # objects
+_MOVED_M = (0.08, 0.30)  # least and greatest displacement
+_UPRIGHT = 0.95  # least cosine between an object's up axis and the vertical
+_ROBOT_GAP_M = 0.03  # least distance of a displaced object from the robot at rest
+_OBJECT_GAP_M = 0.03  # least distance of displaced objects from each other
 
 
 class Restore(Carry):
-    """One object back on its captured place: within 3 cm, upright, carried by its support, at rest, let go."""
+    """Success: one object within 3 cm of its captured position, upright, carried by its support, at rest, not held."""
 
     kind = "restore"
+    sentence = "Bring the {subject} back to where it was filmed."
 
     @classmethod
     def _goals(cls, facts: SceneFacts, spec: TaskSpec) -> np.ndarray:
-        target = facts.targets[spec.subject]
-        return np.array([[*target.center[:2], target.bottom_m]])
+        return _home(facts, spec.subject_id)[None]
 
-    def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
-        super().__init__(env, spec, placement)
-        self.moves = displaced(self.facts, spec.subject, placement)
+    def prepare(self) -> None:
+        """List the positions that the object may be displaced to."""
+        super().prepare()
+        self.moves = displaced(self.facts, self.subject, self.placement)
 
-    def displace(self, env_idx: torch.Tensor, rng: object, taken: list[tuple[np.ndarray, float]]) -> None:
-        """Move the object on its support by seed, clear of what was moved before (`taken`: centre, radius)."""
+    def displace(self, env_idx: torch.Tensor, rng: Any, taken: list[tuple[np.ndarray, float]]) -> None:
+        """Displace the object on its support by seed.
+
+        Args:
+            env_idx: Indices (n,) of the environments.
+            rng: ManiSkill's batched generator.
+            taken: Positions (n, 3) and radii of the objects that were displaced before; this one is added.
+        """
         key = self.subject
         draws, own = draw(rng, env_idx, 1)[:, 0], self.facts.radius_m(key)
+        home = _home(self.facts, key)
         rows = []
         for number, share in enumerate(draws):
             free = [
                 spot
                 for spot in self.moves
-                if all(np.linalg.norm(spot[:2] - p[number, :2]) > own + r + 0.03 for p, r in taken)
+                if all(np.linalg.norm(spot[:2] - p[number, :2]) > own + r + _OBJECT_GAP_M for p, r in taken)
             ]
-            choice = free or [
-                np.array([*self.facts.targets[key].center[:2], self.facts.targets[key].bottom_m])
-            ]
+            choice = free or [home]
             rows.append(choice[int(share * len(choice))])
         spots = np.array(rows)
         taken.append((spots, own))
-        shift = spots - [*self.facts.targets[key].center[:2], self.facts.targets[key].bottom_m]
-        self.env.builder.shift(key, env_idx, shift, self.env.device)
-
-    @classmethod
-    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
-        return f"Bring the {facts.thing(spec.subject)} back to where it was filmed."
+        self.env.builder.shift(key, env_idx, spots - home, self.env.device)
 
     def _arrived(self) -> Info:
         near, upright = self._while_still("at home", self._at_home)
         there = near & upright
-        if not surely_not(there):  # contacts are asked for only where they decide
+        if not surely_not(there):  # contacts are slow: read them only if they decide
             there = there & self.env.measures.rests_on(self.subject, self.facts.parent[self.subject])
         return {"is_there": there, "is_near": near, "is_upright": upright}
 
@@ -73,62 +77,65 @@ class Restore(Carry):
 
 
 class Rearrange(Task):
-    """Up to three things stand 8 to 30 cm from where they were filmed; done when all are back."""
+    """Up to three objects are displaced by 8 to 30 cm at reset. Success: all are back (see `Restore`)."""
 
     kind = "rearrange"
+    sentence = "Bring what was moved back to where it was filmed."
     subjects = False
 
     @classmethod
-    def options(cls, facts: SceneFacts) -> list[tuple[int | None, int | None]]:
+    def options(cls, facts: SceneFacts) -> list[Pair]:
+        """Return one task where anything can be displaced."""
         return [(None, None)] if chosen_things(facts) else []
 
     @classmethod
     def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
+        """Return the reason: no object can be displaced."""
         return [] if chosen_things(facts) else ["nothing here can be lifted and moved about on its support"]
 
     @classmethod
     def things(cls, facts: SceneFacts) -> list[int]:
-        """Return what can be moved about, the easiest first."""
+        """Return the objects that can be displaced, the easiest first."""
         return chosen_things(facts)
 
     @classmethod
     def interests(cls, facts: SceneFacts, spec: TaskSpec) -> list[np.ndarray]:
+        """Return the easiest object's captured position and the positions that it may be displaced to."""
         return [
             goals
             for key in chosen_things(facts)[:1]
             for goals in (facts.targets[key].center[None], _moves(facts, key))
         ]
 
-    def __init__(self, env: object, spec: TaskSpec, placement: object) -> None:
-        super().__init__(env, spec, placement)
+    def prepare(self) -> None:
+        """Choose the objects within reach; all where none is."""
         things = chosen_things(self.facts)
         near = [
             key
             for key in things
-            if placement.reaches(self.facts.targets[key].center[None], self.facts.traits)[0]
+            if self.placement.reaches(self.facts.targets[key].center[None], self.facts.traits)[0]
         ]
         stages = [
-            Restore(env, TaskSpec("restore", f"restore_{key}", key), placement) for key in (near or things)
+            Restore(self.env, TaskSpec("restore", f"restore_{key}", key), self.placement)
+            for key in (near or things)
         ]
         self.stages = [stage for stage in stages if len(stage.moves)][:_MOST]
 
     @property
     def max_reward(self) -> float:
+        """Return 1 per object."""
         return float(len(self.stages))
-
-    @classmethod
-    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
-        return "Bring what was moved back to where it was filmed."
 
     @property
     def instruction(self) -> str:
-        """Return the task with the things that this robot reaches."""
+        """Return the instruction with the objects that this robot reaches."""
         things = ", the ".join(self.facts.thing(stage.subject) for stage in self.stages)
         return (
             f"Bring the {things} back to where the video shows {'it' if len(self.stages) == 1 else 'them'}."
         )
 
-    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+    def start(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Displace the objects."""
         taken: list[tuple[np.ndarray, float]] = []
         for stage in self.stages:
             stage.start(env_idx, rng)
@@ -136,34 +143,37 @@ class Rearrange(Task):
         self.env.measures.refresh()
 
     def evaluate(self) -> Info:
+        """Return success: all objects are back."""
         self._infos = [stage.evaluate() for stage in self.stages]
         done = [info["success"] for info in self._infos]
         return {"success": functools.reduce(operator.and_, done), "things_done": sum(map(whole, done))}
 
     def reward(self, info: Info) -> Array:
-        reward, best = 0.0, None
-        for stage, one in zip(self.stages, self._infos, strict=True):
-            # What is done counts whole, of the rest only what is farthest along: one hand does one thing.
-            share = where(one["success"], 0.0, stage.reward(one) / Carry.max_reward)
-            best = share if best is None else larger(best, share)
-            reward = reward + real(one["success"])
-        return where(info["success"], self.max_reward, reward + 0.98 * best)
+        """Return the number of objects that are back plus the best progress among the others: a hand does one thing."""
+        shares = [
+            where(one["success"], 0.0, stage.reward(one) / Carry.max_reward)
+            for stage, one in zip(self.stages, self._infos, strict=True)
+        ]
+        done = sum((real(one["success"]) for one in self._infos), 0.0)
+        return where(info["success"], self.max_reward, done + 0.98 * functools.reduce(larger, shares))
 
     def observe(self, info: Info) -> dict[str, Array]:
+        """Return the observations of each object, prefixed by `thing_N_`."""
         out = {}
         for number, (stage, one) in enumerate(zip(self.stages, self._infos, strict=True)):
             out.update({f"thing_{number}_{key}": value for key, value in stage.observe(one).items()})
         return out
 
-    def script(self, hand: "Hand") -> Iterator[np.ndarray]:  # noqa: F821
-        for _ in range(2):  # once more for what was knocked away
+    def script(self, hand: Hand) -> Iterator[np.ndarray]:
+        """Carry each object back; a second pass is for objects that were knocked away."""
+        for _ in range(2):
             for stage in self.stages:
                 if not bool(stage.evaluate()["success"]):
                     yield from stage.script(hand)
 
 
 def chosen_things(facts: SceneFacts) -> list[int]:
-    """Return what can be moved about and brought back, the easiest first: things on one support."""
+    """Return the objects that can be displaced and brought back, the easiest first; all have one support."""
     liftable = [t for t in facts.ranked if not t.problem and not facts.above(t.id)]
     things = [t.id for t in liftable if len(_moves(facts, t.id))]
     if not things:
@@ -172,14 +182,14 @@ def chosen_things(facts: SceneFacts) -> list[int]:
 
 
 def displaced(facts: SceneFacts, key: int, placement: Placement) -> np.ndarray:
-    """Return where a thing may be moved to on its support (k, 3): beside the robot, within its reach if anything is."""
+    """Return the displaced positions (k, 3) clear of the robot; only those within its reach, if any."""
     moves = _beside_robot(facts, key, placement)
     within = placement.reaches(moves, facts.traits)
     return (moves[within] if within.any() else moves)[:48]
 
 
 def _beside_robot(facts: SceneFacts, key: int, placement: Placement) -> np.ndarray:
-    """Return where a thing may be moved to (k, 3) without touching the robot at rest."""
+    """Return the displaced positions (k, 3) at which an object is clear of the robot at rest."""
     moves, robot = _moves(facts, key), placement.to_world(robot_shape(facts.robot).points)
     height = robot[None, :, 2] - moves[:, 2, None]
     beside = (
@@ -189,7 +199,14 @@ def _beside_robot(facts: SceneFacts, key: int, placement: Placement) -> np.ndarr
     return moves[clear.all(axis=1)]
 
 
+def _home(facts: SceneFacts, key: int) -> np.ndarray:
+    """Return the captured position (3,) of the bottom center of an object's box."""
+    target = facts.targets[key]
+    return np.array([*target.center[:2], target.bottom_m])
+
+
 def _moves(facts: SceneFacts, key: int) -> np.ndarray:
+    """Return the free spots (k, 3) on an object's support 8 to 30 cm from its captured position."""
     target = facts.targets[key]
     spots = facts.spots(facts.parent[key], key)
     away = np.linalg.norm(spots[:, :2] - target.center[:2], axis=1)

@@ -1,25 +1,29 @@
-"""Stack: put an object on another one that can move."""
+"""Stack: put an object on another movable object."""
+
+from typing import Any
 
 import numpy as np
 import torch
 
 from simrecon_envs.arrays import Array
-from simrecon_envs.tasks.base import Info
+from simrecon_envs.tasks.base import Info, Pair
 from simrecon_envs.tasks.carry import Carry
 from simrecon_envs.tasks.facts import SceneFacts
 from simrecon_envs.tasks.spec import TaskSpec
 
-_UPRIGHT = 0.95  # cosine of how far the lower object may lean
+_UPRIGHT = 0.95  # least cosine between the lower object's up axis and the vertical
 
 
 class Stack(Carry):
-    """The lower object stands upright and at rest and carries the upper one, which rests, and nobody holds it."""
+    """Success: the lower object is upright, at rest and carries the upper one, which is at rest and not held."""
 
     kind = "stack"
+    sentence = "Stack the {subject} on the {place}."
     joint = "_on_"
 
     @classmethod
-    def options(cls, facts: SceneFacts) -> list[tuple[int | None, int | None]]:
+    def options(cls, facts: SceneFacts) -> list[Pair]:
+        """Return each movable object with each movable support that it is not in a stack with."""
         lower = [key for key in facts.carriers if key in facts.movable]
         return [
             (target.id, key)
@@ -30,7 +34,9 @@ class Stack(Carry):
 
     @classmethod
     def problems(cls, facts: SceneFacts, subject: int | None, place: int | None) -> list[str]:
+        """Return the reasons of `Carry`, or that the place is fixed or a container."""
         problems = super().problems(facts, subject, place)
+        assert place is not None
         if place not in facts.targets:
             problems.append(f"{facts.thing(place)} cannot move: use place")
         elif place in facts.containers and not problems:
@@ -39,29 +45,27 @@ class Stack(Carry):
 
     @classmethod
     def _goals(cls, facts: SceneFacts, spec: TaskSpec) -> np.ndarray:
-        spots = facts.spots(spec.place, spec.subject)
+        spots = facts.spots(spec.place_id, spec.subject_id)
         if not len(spots):
             return spots
-        # Over the middle it tips least.
-        middle = facts.targets[spec.place].center[:2]
+        # The spot nearest to the center tips least.
+        middle = facts.targets[spec.place_id].center[:2]
         return spots[np.argsort(np.linalg.norm(spots[:, :2] - middle, axis=1), kind="stable")][:1]
 
-    @classmethod
-    def words(cls, facts: SceneFacts, spec: TaskSpec) -> str:
-        return f"Stack the {facts.thing(spec.subject)} on the {facts.thing(spec.place)}."
-
     def live_goal(self) -> Array:
+        """Return the goal (b, 3), shifted with the lower object."""
         return self._while_still("live_goal", lambda: self.goal + self._moved())
 
     def _moved(self) -> Array:
-        return self.env.measures.position(self.spec.place) - self._lower_home
+        return self.env.measures.position(self.place) - self._lower_home
 
-    def start(self, env_idx: torch.Tensor, rng: object) -> None:
+    def start(self, env_idx: torch.Tensor, rng: Any) -> None:
+        """Draw a goal; store the lower object's captured position."""
         super().start(env_idx, rng)
-        self._lower_home = self.env.measures.array(self.facts.targets[self.spec.place].center)[None]
+        self._lower_home = self.env.measures.array(self.facts.targets[self.place].center)[None]
 
     def _arrived(self) -> Info:
         measures = self.env.measures
-        on_it = measures.supported(self.subject, self.spec.place)
-        upright = (measures.up(self.spec.place) >= _UPRIGHT) & measures.at_rest(self.spec.place)
+        on_it = measures.supported(self.subject, self.place)
+        upright = (measures.up(self.place) >= _UPRIGHT) & measures.at_rest(self.place)
         return {"is_there": on_it & upright, "is_on_it": on_it, "is_lower_upright": upright}

@@ -1,10 +1,10 @@
-"""Train policies in reconstructed scenes with stable-baselines3, and use what was trained.
+"""Train policies in reconstructed scenes with stable-baselines3, and load them.
 
-`simrecon train SCENE --task reach` is `train(TrainConfig(...))`. A finished run is a folder; `load_policy(folder)`
-returns its policy, a function of observations. Policies for `simrecon benchmark run --policy module:callable` are
-made by a function of the environment: `simrecon_envs.training:trained` is one.
+`simrecon train SCENE --task reach` calls `train(TrainConfig(...))`, which writes a run folder. `load_policy(folder)`
+returns the policy as a function of observations. `simrecon benchmark run --policy simrecon_envs.training:trained`
+evaluates it.
 
-Nothing heavy is imported before a policy is trained or loaded.
+torch and stable-baselines3 are imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,7 @@ _LAZY = {"TrainedPolicy": "policy", "load_policy": "policy", "trained": "policy"
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs torch on first use."""
+    """Import modules that need torch on first use."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib

@@ -1,4 +1,4 @@
-"""While a run trains: counting, showing, keeping checkpoints, and stopping where it can be gone on from."""
+"""During training: count episodes, show progress, write checkpoints, stop on signals between updates."""
 
 import contextlib
 import signal
@@ -16,33 +16,34 @@ from simrecon_envs.training.folder import RunFolder
 from simrecon_envs.training.models import save
 from simrecon_envs.training.progress import Interrupted, Progress
 
-WINDOW = 100  # episodes that the success rate is of
+WINDOW = 100  # latest episodes over which the success rate is computed
 _SAVE_EVERY_S = 60.0
-_SAVE_SHARE = 0.1  # of all steps, at most, between two checkpoints
-_POINTS = 100  # of the learning curve
+_SAVE_SHARE = 0.1  # greatest share of all steps between two checkpoints
+_POINTS = 100  # greatest number of points of the learning curve
 
 
 @dataclass
 class Tally:
-    """How training went so far; written with every checkpoint, so that a resumed run goes on counting."""
+    """Counters of a run; saved with every checkpoint so that a resumed run continues them."""
 
     steps: int = 0
     seconds: float = 0.0
     episodes: int = 0
     successes: int = 0
     curve: list[list[float]] = field(default_factory=list)
-    """[steps, success rate, mean return, mean length] of the last 100 episodes, at most 100 times a run."""
+    """Learning curve: [steps, success rate, mean return, mean length] over the latest 100 episodes."""
 
 
 class Stop:
-    """Whether somebody asked to stop: Ctrl-C or SIGTERM. The second time it is done at once."""
+    """Flag that SIGINT (Ctrl-C) or SIGTERM was received. A second signal raises KeyboardInterrupt."""
 
     def __init__(self) -> None:
+        """Begin without a signal."""
         self.asked = False
 
     @contextlib.contextmanager
     def listening(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Take the signals while the block runs."""
+        """Handle the signals inside a `with` block."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -51,7 +52,7 @@ class Stop:
             if self.asked:
                 raise KeyboardInterrupt
             self.asked = True
-            say("stopping: the update is finished and a checkpoint written (again: stop at once)")
+            say("stopping after this update and a checkpoint (again: stop at once)")
 
         before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -62,10 +63,10 @@ class Stop:
 
 
 class Watch(BaseCallback):
-    """Counts episodes, shows progress, and saves between updates, the only place where steps and weights agree."""
+    """Counts episodes, shows progress, and saves between updates, when step count and weights are consistent."""
 
     def __init__(self, folder: RunFolder, total: int, tally: Tally, stop: Stop, progress: Progress) -> None:
-        """Watch a run of `total` steps that has made `tally.steps`."""
+        """Watch a run of `total` steps, `tally.steps` of which are done."""
         super().__init__()
         self.tally = tally
         self._folder, self._total, self._stop, self._progress = folder, total, stop, progress
@@ -74,7 +75,7 @@ class Watch(BaseCallback):
         self._saved_at, self._saved_steps = self._began, tally.steps
 
     def _on_rollout_start(self) -> None:
-        """Between two updates."""
+        """Save or stop between two updates."""
         self._count()
         if self._stop.asked:
             if self.num_timesteps > self._saved_steps:
@@ -103,7 +104,7 @@ class Watch(BaseCallback):
 
     @property
     def success_rate(self) -> float | None:
-        """Return the share of the last episodes that succeeded; None before the first has ended."""
+        """Return the success rate over the latest episodes; None before the first one ends."""
         return sum(row[0] for row in self._recent) / len(self._recent) if self._recent else None
 
     def _count(self) -> None:

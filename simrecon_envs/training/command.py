@@ -1,4 +1,4 @@
-"""`simrecon train`: from parsed arguments to a run, and its results as text or JSON."""
+"""Run `simrecon train` from parsed arguments; print the results as text or JSON."""
 
 import argparse
 import json
@@ -18,8 +18,8 @@ from simrecon_envs.training.config import (
 )
 from simrecon_envs.training.folder import RunFolder
 
-_MOST_ENVS = 8
-# What a run that goes on has already, by the option's name in the arguments.
+_MOST_ENVS = 8  # default of --envs on machines with many cores
+# Arguments that --resume takes from the run and does not accept.
 _FIXED = (
     "robot",
     "obs_mode",
@@ -34,7 +34,7 @@ _FIXED = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train, or go on with a run; returns the exit code."""
+    """Train or resume; return the exit code."""
     if arguments.list_settings:
         _print(
             f"hyperparameters of {arguments.algo}, for --set name=value:\n{describe_settings(arguments.algo)}"
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _config(arguments: argparse.Namespace) -> TrainConfig:
-    """Return the configuration that the arguments mean, with the defaults of the command."""
+    """Return the configuration of a new run from the arguments and the defaults of the command."""
     given = {
         name: getattr(arguments, name)
         for name in ("robot", "obs_mode", "control_mode", "seed", "eval_episodes", "device", "steps", "envs")
@@ -83,12 +83,16 @@ def _config(arguments: argparse.Namespace) -> TrainConfig:
 
 
 def _find(arguments: argparse.Namespace) -> RunFolder:
-    """Return the run to go on with, which has to be what the arguments say."""
+    """Return the run to resume.
+
+    Raises:
+        UsageError: there is none, or an argument contradicts it.
+    """
     other = [name for name in _FIXED if getattr(arguments, name) is not None]
     if other or arguments.set:
         option = "--" + (other[0].replace("_", "-") if other else "set")
         raise UsageError(
-            f"{option}: a run goes on as it was begun; leave it out, or begin a new run without --resume"
+            f"{option}: --resume keeps the run's settings; leave the option out, or start a new run without --resume"
         )
     scene = arguments.scene.removeprefix(NAMESPACE + "/")
     if arguments.out is not None:
@@ -100,7 +104,7 @@ def _find(arguments: argparse.Namespace) -> RunFolder:
     folder = RunFolder.newest(scene, arguments.task, algo=arguments.algo)
     if folder is None:
         raise UsageError(
-            f"no run of {scene}, {arguments.task}, {arguments.algo} to go on with; name its folder with --out, or "
+            f"no run of {scene}, {arguments.task}, {arguments.algo} to resume; name its folder with --out, or "
             "leave out --resume"
         )
     return folder
@@ -108,7 +112,7 @@ def _find(arguments: argparse.Namespace) -> RunFolder:
 
 def _tell_interrupted(arguments: argparse.Namespace, results: dict[str, Any]) -> None:
     command = f"simrecon train {arguments.scene} --resume --out {results['folder']}"
-    sys.stderr.write(f"interrupted; {results['steps']:,} steps are kept. Go on with:\n  {command}\n")
+    sys.stderr.write(f"interrupted; {results['steps']:,} steps are saved. Continue with:\n  {command}\n")
 
 
 def _summary(results: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""What a training run is told: everything that its result depends on, as one value that is written to its folder."""
+"""`TrainConfig`: all settings of a training run, with hyperparameters; saved in the run's folder."""
 
 import dataclasses
 import json
@@ -10,7 +10,7 @@ from registry.errors import did_you_mean
 
 ALGORITHMS = ("ppo", "sac")
 OBS_MODES = ("state", "rgb")
-LARGEST_SEED = 10**9  # seeds of evaluation lie beyond
+LARGEST_SEED = 10**9  # larger seeds are reserved for evaluation
 _DEFAULT_STEPS = {"ppo": 50_000, "sac": 30_000}
 
 
@@ -20,36 +20,36 @@ def _setting(default: Any, doc: str, least: float = 0.0, most: float = float("in
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Hyperparameters that both algorithms have."""
+    """Hyperparameters of both algorithms."""
 
     learning_rate: float = _setting(1e-3, "step size of Adam", 1e-9, 1.0)
     gamma: float = _setting(
-        0.9, "what a reward one step (1/20 s) later counts; 0.9 looks half a second ahead", 0, 0.9999
+        0.9, "discount factor per step (1/20 s); 0.9 looks half a second ahead", 0, 0.9999
     )
-    batch_size: int = _setting(100, "transitions in a gradient step", 2, 10**6)
+    batch_size: int = _setting(100, "transitions per gradient step", 2, 10**6)
     net_arch: tuple[int, ...] = _setting((64, 64), "widths of the hidden layers, with commas", 1, 10**5)
-    horizon: int = _setting(0, "steps of an episode; 0: as many as the task's own id has", 0, 10**6)
+    horizon: int = _setting(0, "steps per episode; 0: the default of the task", 0, 10**6)
     success_bonus: bool = _setting(
-        True, "a task that is done pays at once what staying there would: an episode ends with it"
+        True, "add the discounted reward of staying successful for ever, since success ends an episode"
     )
-    normalize_observations: bool = _setting(True, "shift and scale observations to mean 0 and deviation 1")
-    normalize_rewards: bool = _setting(True, "scale rewards by the deviation of the discounted return")
-    image_px: int = _setting(64, "width and height of the pictures of --obs-mode rgb", 36, 1024)
+    normalize_observations: bool = _setting(True, "scale observations to mean 0 and standard deviation 1")
+    normalize_rewards: bool = _setting(True, "divide rewards by the deviation of the discounted return")
+    image_px: int = _setting(64, "width and height of the images of --obs-mode rgb", 36, 1024)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PpoSettings(Settings):
     """Hyperparameters of PPO."""
 
-    rollout_steps: int = _setting(1000, "steps of all environments together between two updates", 2, 10**7)
-    n_epochs: int = _setting(10, "how often an update goes through its steps", 1, 1000)
-    gae_lambda: float = _setting(0.9, "between one step's estimate (0) and the whole return (1)", 0, 1)
-    clip_range: float = _setting(0.2, "how far an update may change an action's probability", 1e-6, 10)
-    ent_coef: float = _setting(0.0, "weight of the actions' entropy", 0, 10)
-    vf_coef: float = _setting(0.5, "weight of the value's error", 0, 100)
-    max_grad_norm: float = _setting(0.5, "greatest length of a gradient", 1e-6, 10**6)
-    target_kl: float = _setting(0.05, "an update stops at this change of the policy; 0: never", 0, 100)
-    log_std_init: float = _setting(-1.0, "logarithm of the actions' deviation at the start", -20, 5)
+    rollout_steps: int = _setting(1000, "steps per update, summed over environments", 2, 10**7)
+    n_epochs: int = _setting(10, "epochs per update", 1, 1000)
+    gae_lambda: float = _setting(0.9, "lambda of generalized advantage estimation", 0, 1)
+    clip_range: float = _setting(0.2, "clipping range of the probability ratio", 1e-6, 10)
+    ent_coef: float = _setting(0.0, "weight of the entropy bonus", 0, 10)
+    vf_coef: float = _setting(0.5, "weight of the value loss", 0, 100)
+    max_grad_norm: float = _setting(0.5, "gradient norm above which it is clipped", 1e-6, 10**6)
+    target_kl: float = _setting(0.05, "KL divergence at which an update stops; 0: never", 0, 100)
+    log_std_init: float = _setting(-1.0, "logarithm of the initial standard deviation of actions", -20, 5)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,13 +57,13 @@ class SacSettings(Settings):
     """Hyperparameters of SAC."""
 
     learning_rate: float = _setting(7e-4, "step size of Adam", 1e-9, 1.0)
-    batch_size: int = _setting(256, "transitions in a gradient step", 2, 10**6)
+    batch_size: int = _setting(256, "transitions per gradient step", 2, 10**6)
     net_arch: tuple[int, ...] = _setting((128, 128), "widths of the hidden layers, with commas", 1, 10**5)
-    normalize_rewards: bool = _setting(False, "scale rewards by the deviation of the discounted return")
-    buffer_size: int = _setting(100_000, "transitions that are remembered", 100, 10**8)
+    normalize_rewards: bool = _setting(False, "divide rewards by the deviation of the discounted return")
+    buffer_size: int = _setting(100_000, "transitions in the replay buffer", 100, 10**8)
     learning_starts: int = _setting(1000, "random steps before the first update", 1, 10**8)
-    gradient_steps: int = _setting(1, "gradient steps after one step of all environments", 1, 1000)
-    tau: float = _setting(0.01, "how fast the target networks follow", 1e-6, 1)
+    gradient_steps: int = _setting(1, "gradient steps per step of all environments", 1, 1000)
+    tau: float = _setting(0.01, "update rate of the target networks", 1e-6, 1)
 
 
 SETTINGS: dict[str, type[Settings]] = {"ppo": PpoSettings, "sac": SacSettings}
@@ -71,10 +71,10 @@ SETTINGS: dict[str, type[Settings]] = {"ppo": PpoSettings, "sac": SacSettings}
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """What to train where; `settings` are the algorithm's hyperparameters.
+    """Scene, task, robot, algorithm and settings of a run.
 
     Raises:
-        UsageError: a value that cannot be; one sentence says which, and what could be.
+        UsageError: a value is out of range; says which, and the range.
     """
 
     scene: str
@@ -82,7 +82,7 @@ class TrainConfig:
     algo: str = "ppo"
     robot: str = "panda"
     obs_mode: str = "state"
-    control_mode: str = "auto"  # the hand's shifts where the robot has them, else its joints'
+    control_mode: str = "auto"  # hand displacements where the robot has that mode, else joint displacements
     steps: int = 0  # 0: the algorithm's default
     envs: int = 1
     seed: int = 0
@@ -90,10 +90,10 @@ class TrainConfig:
     randomize: str | dict[str, float] | None = "start"
     registry: str | None = None
     device: str = "cpu"
-    settings: Settings | None = None  # None: the algorithm's defaults
+    settings: Settings = None  # pyright: ignore[reportAssignmentType] - the algorithm's defaults
 
     def __post_init__(self) -> None:
-        """Check, and put defaults in."""
+        """Fill in defaults and check ranges."""
         _one_of("--algo", self.algo, ALGORITHMS)
         _one_of("--obs-mode", self.obs_mode, OBS_MODES)
         if self.settings is None:
@@ -112,32 +112,32 @@ class TrainConfig:
                 raise UsageError(f"--{name} {value}: expected a whole number between {least} and {most}")
         if self.steps < self.block:
             raise UsageError(
-                f"--steps {self.steps}: less than the {self.block} steps between two updates; give more steps"
+                f"--steps {self.steps}: less than the {self.block} steps between two updates; increase it"
                 + (", or --set rollout_steps=..." if self.algo == "ppo" else "")
             )
 
     @property
     def block(self) -> int:
-        """Return how many steps are made between two updates; runs end at whole blocks."""
+        """Return the steps between two updates, summed over environments; runs end at whole blocks."""
         if isinstance(self.settings, PpoSettings):
             return max(self.settings.rollout_steps // self.envs, 2) * self.envs
         return self.envs
 
     @property
     def total_steps(self) -> int:
-        """Return how many steps are made: the most whole blocks within `steps`."""
+        """Return the steps of the run: the whole blocks within `steps`."""
         return self.steps // self.block * self.block
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON's types."""
+        """Return a dict of JSON types."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, entry: dict[str, Any]) -> "TrainConfig":
-        """Return what `to_json` wrote.
+        """Return the configuration that `to_json` wrote.
 
         Raises:
-            UsageError: it was not.
+            UsageError: the entry is not one.
         """
         try:
             entry = dict(entry)
@@ -149,10 +149,10 @@ class TrainConfig:
 
 
 def parse_settings(algo: str, texts: list[str]) -> Settings:
-    """Return an algorithm's hyperparameters, with `name=value` put in the defaults' place.
+    """Return an algorithm's hyperparameters from texts `name=value`, and defaults for the others.
 
     Raises:
-        UsageError: unknown name (with the nearest), or a value that cannot be.
+        UsageError: unknown algorithm or name (with the closest match), or a value out of range.
     """
     _one_of("--algo", algo, ALGORITHMS)
     kind = SETTINGS[algo]
@@ -170,17 +170,17 @@ def parse_settings(algo: str, texts: list[str]) -> Settings:
 
 
 def describe_settings(algo: str) -> str:
-    """Return the hyperparameters of an algorithm with defaults and meanings, one a line."""
+    """Return the hyperparameters of an algorithm with defaults and meanings, one per line."""
     rows = [(f"{f.name}={_shown(f.default)}", f.metadata["doc"]) for f in dataclasses.fields(SETTINGS[algo])]
     width = max(len(left) for left, _ in rows)
     return "\n".join(f"  {left:<{width}}  {doc}" for left, doc in rows)
 
 
 def parse_randomize(text: str) -> str | dict[str, float] | None:
-    """Return what --randomize means: none, start, all, or a JSON object of `Randomization`'s fields.
+    """Parse --randomize: none, start, all, or a JSON object of `Randomization`'s fields.
 
     Raises:
-        UsageError: it is none of them.
+        UsageError: the text is none of these.
     """
     from simrecon_envs.randomization import Randomization
 

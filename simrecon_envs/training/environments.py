@@ -1,4 +1,4 @@
-"""The environments that a run trains and is evaluated in: one process each, plain NumPy, what a learner needs."""
+"""Make the environments for training and evaluation: NumPy, in one process each for training."""
 
 import functools
 import multiprocessing
@@ -12,13 +12,14 @@ import numpy as np
 from registry import UsageError
 from simrecon_envs.registration import episode_steps, make_cpu
 from simrecon_envs.training.config import TrainConfig
+from simrecon_envs.unwrapped import scene_of
 
-_ONE_TARGET = ("reach", "navigate")  # all that matters is in the observation without the other things' poses
-_PREFERRED = ("pd_ee_delta_pos", "pd_joint_delta_pos")  # to control by, the first that a robot has
+_ONE_TARGET = ("reach", "navigate")  # kinds that need no poses of other objects in the observation
+_PREFERRED = ("pd_ee_delta_pos", "pd_joint_delta_pos")  # control modes, the first that a robot has is used
 
 
 def env_kwargs(config: TrainConfig) -> dict[str, Any]:
-    """Return how an environment is made (`simrecon_envs.make`), but for scene and registry."""
+    """Return the arguments of `simrecon_envs.make` without scene and registry."""
     kwargs: dict[str, Any] = {
         "task": config.task,
         "robot_uids": config.robot,
@@ -35,17 +36,17 @@ def env_kwargs(config: TrainConfig) -> dict[str, Any]:
 
 
 def make_plain(config: TrainConfig, **more: Any) -> gym.Env:
-    """Make the environment of a run as it is, to evaluate in.
+    """Make one environment without training wrappers, for evaluation.
 
     Args:
-        config: Of the run, with a control mode that the robot has.
-        **more: As for `simrecon_envs.make`.
+        config: Of the run; `control_mode` is resolved.
+        **more: More arguments of `simrecon_envs.make`.
     """
     return make_cpu(config.scene, registry=config.registry, **(env_kwargs(config) | more))
 
 
 def make_one(config: TrainConfig) -> gym.Env:
-    """Make one environment to train in."""
+    """Make one environment for training."""
     env = make_plain(config)
     if config.obs_mode != "state":
         env = FlatPictures(env)
@@ -54,13 +55,13 @@ def make_one(config: TrainConfig) -> gym.Env:
 
 
 def make_several(config: TrainConfig) -> Any:
-    """Make the vector environment of a run, without normalization; one process each where there are several."""
+    """Make the vector environment for training, without normalization; several environments have a process each."""
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
     makers = [functools.partial(_in_worker, config)] * config.envs
     if config.envs == 1:
         return DummyVecEnv(makers)
-    # Ctrl-C reaches every process of a terminal: workers, which inherit this, leave it to the one that trains.
+    # Ctrl-C reaches all processes of a terminal. Workers inherit SIG_IGN and leave it to the training process.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _is_main_thread() else None
     try:
         return SubprocVecEnv(makers, start_method="spawn")
@@ -70,22 +71,22 @@ def make_several(config: TrainConfig) -> Any:
 
 
 def resolve(config: TrainConfig) -> tuple[TrainConfig, dict[str, Any]]:
-    """Make the environment once, to say before anything is trained what is wrong.
+    """Make the environment once to check a configuration and to resolve its defaults.
 
     Returns:
-        The configuration with the control mode and the task's name that hold, and what is known of the scene:
-        {"revision", "target_id", "instruction", "task_note"}.
+        The configuration with scene id, task name, control mode and registry path resolved, and facts of the scene:
+        {"scene_id", "revision", "target_id", "instruction", "task_note"}.
 
     Raises:
         SceneNotFound, EnvNotFound, UsageError: the scene, task, robot or control mode do not exist.
-        EnvironmentMissing: pictures are to be observed, and nothing can render here.
+        EnvironmentMissing: images are to be observed, and nothing can render here.
     """
     import dataclasses
 
     env = make_cpu(config.scene, registry=config.registry, **env_kwargs(config) | {"control_mode": None})
     try:
-        scene = env.unwrapped
-        if scene.task_object is None:
+        scene = scene_of(env)
+        if scene.task_object is None or scene.agent is None:
             raise UsageError(f"scene {scene.scene_id}: no task to train: {scene.task_note or config.task}")
         modes = list(scene.agent.supported_control_modes)
         mode = config.control_mode
@@ -110,14 +111,14 @@ def resolve(config: TrainConfig) -> tuple[TrainConfig, dict[str, Any]]:
 
 
 class EpisodeInfo(gym.Wrapper):
-    """Says at an episode's end how it went, in stable-baselines3's words, and nothing in between.
+    """Reports return, length and success at an episode's end, in the format of stable-baselines3.
 
-    A dense reward pays for being near at every step, and an episode ends with success: a policy that hovers short
-    of it would earn more. `bonus` is what staying there would be worth, so that success is never a loss.
+    Adds a bonus to the reward at success. Success ends an episode, so without a bonus hovering near the goal would
+    collect more dense reward. The bonus is the discounted reward of staying successful for ever.
     """
 
     def __init__(self, env: gym.Env, bonus: float = 0.0) -> None:
-        """Wrap one environment; `bonus` is added to the reward (not to what is told) at success."""
+        """Wrap one environment; the reported return excludes `bonus`."""
         super().__init__(env)
         self._bonus = bonus
         self._return, self._length, self._began = 0.0, 0, time.time()
@@ -129,8 +130,9 @@ class EpisodeInfo(gym.Wrapper):
         return obs, {"instruction": info.get("instruction", "")}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
-        """Step; `info` is empty but for the last step: {"episode": {"r", "l", "t"}, "is_success"}."""
+        """Step; `info` is empty except at the last step: {"episode": {"r", "l", "t"}, "is_success"}."""
         obs, reward, terminated, truncated, info = self.env.step(action)
+        reward = float(reward)
         self._return += reward
         self._length += 1
         success = bool(info.get("success", False))
@@ -142,18 +144,16 @@ class EpisodeInfo(gym.Wrapper):
 
 
 class FlatPictures(gym.ObservationWrapper):
-    """Nested observations with pictures -> {"state": (k,) float32, "CAMERA_rgb": (h, w, 3) uint8 ...}."""
+    """Flattens image observations to {"state": (k,) float32, "CAMERA_rgb": (h, w, 3) uint8 ...}."""
 
     def __init__(self, env: gym.Env) -> None:
-        """Wrap one environment whose observations are a dict."""
+        """Wrap one environment with nested observations."""
         super().__init__(env)
         spaces: dict[str, gym.Space] = {}
-        sensors = env.observation_space["sensor_data"]
-        for name in sensors:
-            spaces[f"{name}_rgb"] = gym.spaces.Box(0, 255, sensors[name]["rgb"].shape, np.uint8)
-        parts = [
-            env.observation_space[key] for key in ("agent", "extra") if key in env.observation_space.spaces
-        ]
+        nested: Any = env.observation_space  # Dicts of Dicts of Boxes
+        for name, sensor in nested["sensor_data"].items():
+            spaces[f"{name}_rgb"] = gym.spaces.Box(0, 255, sensor["rgb"].shape, np.uint8)
+        parts = [nested[key] for key in ("agent", "extra") if key in nested.spaces]
         size = sum(gym.spaces.flatdim(part) for part in parts)
         spaces["state"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.observation_space = gym.spaces.Dict(spaces)
@@ -164,7 +164,7 @@ class FlatPictures(gym.ObservationWrapper):
 
 
 def flat_pictures(observation: dict) -> dict[str, np.ndarray]:
-    """Return an observation with pictures as `FlatPictures` has it; joints and touch in the order they come."""
+    """Return an image observation in the format of `FlatPictures`."""
     flat = {f"{name}_rgb": np.asarray(of["rgb"]) for name, of in observation["sensor_data"].items()}
     leaves = [np.ravel(leaf) for key in ("agent", "extra") for leaf in _leaves(observation.get(key, {}))]
     flat["state"] = np.concatenate(leaves, dtype=np.float32, casting="unsafe")

@@ -1,9 +1,11 @@
-"""How well a policy does: the same seeds for every run, none of which was trained on; and a video of it."""
+"""Evaluate a policy on fixed seeds that training does not use, and record a video."""
 
 from collections.abc import Callable
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
+
+import numpy as np
 
 from registry import EnvironmentMissing
 from simrecon_envs.benchmark.episodes import run_episode
@@ -12,11 +14,12 @@ from simrecon_envs.benchmark.statistics import wilson
 from simrecon_envs.rollout import open_video
 from simrecon_envs.training.config import LARGEST_SEED, TrainConfig
 from simrecon_envs.training.environments import make_plain
+from simrecon_envs.unwrapped import scene_of
 
 FIRST_SEED = LARGEST_SEED + 1
 VIDEO_EPISODES = 4
 _VIDEO_PX = 384
-_LAST_FRAMES = 8  # of an episode's last picture
+_LAST_FRAMES = 8  # repetitions of an episode's last frame
 
 
 def evaluate(
@@ -25,18 +28,19 @@ def evaluate(
     episodes: int,
     on_episode: Callable[[int, int], None] = lambda done, successes: None,
 ) -> dict[str, Any]:
-    """Let a policy act in one environment for episodes with the seeds FIRST_SEED, FIRST_SEED + 1 …
+    """Run a policy for episodes with the seeds FIRST_SEED, FIRST_SEED + 1, and so on.
 
     Args:
         config: Of the run.
-        policy: Acts.
-        episodes: How many, at least one.
-        on_episode: Called after every episode with how many are done and how many succeeded.
+        policy: The policy.
+        episodes: Number of episodes, at least one.
+        on_episode: Called after every episode with the numbers of episodes and of successes so far.
 
     Returns:
         {"episodes", "successes", "success_rate", "wilson_95": [low, high], "return_mean", "steps_mean",
         "steps_to_success_median" (None without success), "seeds": [first, last], "per_episode": [{"seed",
-        "success", "return", "steps"}]}; steps are 1/20 s, returns are the environment's own.
+        "success", "return", "steps"}]}; steps are 1/20 s, returns are undiscounted
+        and without bonus.
     """
     env = make_plain(config)
     rows: list[dict[str, Any]] = []
@@ -65,10 +69,10 @@ def evaluate(
 
 
 def record(config: TrainConfig, policy: Policy, path: Path, episodes: int = VIDEO_EPISODES) -> str:
-    """Film the first episodes of the evaluation.
+    """Record the first episodes of the evaluation as a video.
 
     Returns:
-        "" or why there is no video: nothing can render here.
+        An empty text, or the reason why there is no video: nothing can render here.
     """
     size = {"width": _VIDEO_PX, "height": _VIDEO_PX}
     try:
@@ -76,11 +80,11 @@ def record(config: TrainConfig, policy: Policy, path: Path, episodes: int = VIDE
     except EnvironmentMissing as error:
         return str(error)
     try:
-        with open_video(path, env.unwrapped.control_freq) as add:
+        with open_video(path, scene_of(env).control_freq) as add:
             for seed in range(FIRST_SEED, FIRST_SEED + episodes):
-                run_episode(env, policy, seed, lambda *_: add(env.render()))
+                run_episode(env, policy, seed, lambda *_: add(np.asarray(env.render())))
                 for _ in range(_LAST_FRAMES):
-                    add(env.render())
+                    add(np.asarray(env.render()))
     finally:
         env.close()
     return ""

@@ -1,12 +1,13 @@
-"""A run's folder: its configuration, its checkpoints and its results. Whatever is in it is whole.
+"""`RunFolder`: configuration, checkpoints and results of a run on disk. All files are written atomically.
 
-config.json              what was asked for, versions, the scene's revision
-checkpoints/step_.../    weights and optimizer, statistics of normalization, random states, SAC's memory
+config.json              configuration, versions, the scene's revision
+checkpoints/step_.../    weights, optimizer, normalization statistics, random states, SAC's replay buffer
 tensorboard/             for `tensorboard --logdir`
-results.json, video.mp4  the evaluation at the end
+results.json, video.mp4  final evaluation
 """
 
 import contextlib
+import itertools
 import os
 import shutil
 from collections.abc import Iterator
@@ -18,11 +19,11 @@ from registry.locks import LockHeld, file_lock
 from simrecon_envs.files import read_json
 
 SCHEMA = "simrecon.training/1"
-_KEPT = 2  # checkpoints
+_KEPT = 2  # latest checkpoints; older ones are deleted
 
 
 def runs_root() -> Path:
-    """Return where runs are kept unless told otherwise: `runs` beside the default registry."""
+    """Return the default folder of runs: `runs` beside the default registry."""
     return default_registry_root().parent / "runs"
 
 
@@ -30,53 +31,52 @@ class RunFolder:
     """The folder of one run."""
 
     def __init__(self, path: Path | str) -> None:
-        """Name a folder; nothing is read or written."""
+        """Refer to a folder; nothing is read or written."""
         self.path = Path(path).expanduser().absolute()
 
     @classmethod
     def create(cls, path: Path | None, name: str) -> "RunFolder":
-        """Make a new folder: `path`, or `name-N` among the runs.
+        """Create a folder: `path`, or the first free `name-N` in `runs_root()`.
 
         Raises:
-            UsageError: `path` is there and holds something.
+            UsageError: `path` exists and is not an empty folder.
         """
         if path is not None:
             folder = cls(path)
             if folder.path.exists() and (not folder.path.is_dir() or any(folder.path.iterdir())):
-                hint = ", or go on with it: --resume" if folder.config_file.is_file() else ""
+                hint = ", or continue it with --resume" if folder.config_file.is_file() else ""
                 raise UsageError(f"--out {path}: exists and is not an empty folder; name another one{hint}")
             folder.path.mkdir(parents=True, exist_ok=True)
             return folder
-        root, number = runs_root(), 1
-        root.mkdir(parents=True, exist_ok=True)
-        while True:
-            try:
-                (root / f"{name}-{number}").mkdir()
-                return cls(root / f"{name}-{number}")
-            except FileExistsError:
-                number += 1
+        runs_root().mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(1):
+            folder = cls(runs_root() / f"{name}-{number}")
+            with contextlib.suppress(FileExistsError):
+                folder.path.mkdir()
+                return folder
+        raise AssertionError  # the numbers do not end
 
     @classmethod
     def open(cls, path: Path | str) -> "RunFolder":
-        """Open a folder that a run wrote.
+        """Open the folder of an existing run.
 
         Raises:
-            UsageError: there is no run in it.
+            UsageError: the folder has no run.
         """
         folder = cls(path)
         if not folder.config_file.is_file():
-            raise UsageError(f"{path}: no training run is in there (config.json is missing)")
+            raise UsageError(f"{path}: there is no training run in this folder (config.json is missing)")
         return folder
 
     @classmethod
     def newest(cls, scene: str, task: str, *, usable: bool = False, **other: str) -> "RunFolder | None":
-        """Return the last begun of the runs of a scene and a task (or kind of task).
+        """Return the latest run of a scene and a task in `runs_root()`; None where there is none.
 
         Args:
             scene: A scene's id.
             task: A task's name, or a kind of task.
-            usable: Only of those with a checkpoint.
-            **other: What else the configuration has to say, such as algo="ppo", robot="panda".
+            usable: Only runs with a checkpoint.
+            **other: Other required values of the configuration, such as algo="ppo", robot="panda".
         """
         found = []
         for path in runs_root().glob("*"):
@@ -91,28 +91,28 @@ class RunFolder:
 
     @property
     def config_file(self) -> Path:
-        """Return what was asked for."""
+        """Return the configuration file."""
         return self.path / "config.json"
 
     @property
     def results_file(self) -> Path:
-        """Return what came out; it is there when the run is done."""
+        """Return the results file; it exists when the run is done."""
         return self.path / "results.json"
 
     def read_config(self) -> dict[str, Any]:
-        """Return what `config.json` holds.
+        """Return the content of `config.json`.
 
         Raises:
-            UsageError: it is damaged, or of another version.
+            UsageError: the file is damaged, or of another schema version.
         """
         return read_json(self.config_file, "training run", SCHEMA)
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other processes from training into the same folder.
+        """Lock the folder against other training processes.
 
         Raises:
-            UsageError: one does.
+            UsageError: another process holds the lock.
         """
         try:
             with file_lock(self.path / ".lock", blocking=False):
@@ -123,28 +123,28 @@ class RunFolder:
     # ---- Checkpoints.
 
     def checkpoints(self) -> list[tuple[int, Path]]:
-        """Return (steps, folder) of every whole checkpoint, the oldest first."""
+        """Return (steps, folder) of every complete checkpoint, the oldest first."""
         found = [p for p in (self.path / "checkpoints").glob("step_*") if p.name[5:].isdigit()]
         return sorted((int(path.name[5:]), path) for path in found)
 
     @contextlib.contextmanager
     def new_checkpoint(self, steps: int) -> Iterator[Path]:
-        """Yield a folder to write a checkpoint into; it takes its place when all of it is on the disk."""
+        """Yield a temporary folder for a checkpoint; synchronize and rename it at the end; delete old checkpoints."""
         parent = self.path / "checkpoints"
         parent.mkdir(exist_ok=True)
-        for left in parent.glob(".writing-*"):  # by somebody who was killed: the folder is held by us
+        for left in parent.glob(".writing-*"):  # of a process that was killed; we hold the lock
             shutil.rmtree(left)
         partial = parent / f".writing-{steps}"
         partial.mkdir()
         try:
             yield partial
             for file in partial.iterdir():
-                with open(file, "rb") as handle:
+                with file.open("rb") as handle:
                     os.fsync(handle.fileno())
             final = parent / f"step_{steps:09d}"
             if final.exists():
                 shutil.rmtree(final)
-            os.replace(partial, final)
+            partial.replace(final)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
         for _, old in self.checkpoints()[:-_KEPT]:

@@ -1,4 +1,4 @@
-"""stable-baselines3's algorithms: made from a configuration, written to a checkpoint, read back."""
+"""Build stable-baselines3 algorithms from a configuration; save and load checkpoints."""
 
 import pickle
 import random
@@ -13,17 +13,17 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from registry import EnvironmentMissing, UsageError
-from simrecon_envs.training.config import PpoSettings, TrainConfig
+from simrecon_envs.training.config import PpoSettings, SacSettings, TrainConfig
 
 _CLASSES: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC}
 
 
 def check_device(device: str) -> None:
-    """Make sure that torch can compute on a device ("cpu", "cuda", "cuda:1" …).
+    """Check that torch can use a device ("cpu", "cuda", "cuda:1" …).
 
     Raises:
-        UsageError: torch does not know such a device.
-        EnvironmentMissing: it is not here.
+        UsageError: it is not a CPU or CUDA device.
+        EnvironmentMissing: this machine has no CUDA.
     """
     try:
         kind = torch.device(device).type
@@ -38,7 +38,7 @@ def check_device(device: str) -> None:
 
 
 def normalized(config: TrainConfig, vec: VecEnv) -> VecNormalize:
-    """Wrap a run's environments with the statistics of normalization, which are empty yet."""
+    """Wrap environments with new running normalization statistics."""
     settings = config.settings
     keys = ["state"] if config.obs_mode != "state" else None
     return VecNormalize(
@@ -51,7 +51,7 @@ def normalized(config: TrainConfig, vec: VecEnv) -> VecNormalize:
 
 
 def build(config: TrainConfig, vec: VecEnv) -> BaseAlgorithm:
-    """Make the learner of a run."""
+    """Build the algorithm of a new run."""
     settings = config.settings
     policy = "MlpPolicy" if config.obs_mode == "state" else "MultiInputPolicy"
     common: dict[str, Any] = {
@@ -63,7 +63,7 @@ def build(config: TrainConfig, vec: VecEnv) -> BaseAlgorithm:
     }
     shape: dict[str, Any] = {"net_arch": list(settings.net_arch)}
     if isinstance(settings, PpoSettings):
-        with warnings.catch_warnings():  # that the last batch of an epoch is smaller, which is fine
+        with warnings.catch_warnings():  # an epoch's last batch may be smaller
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             return PPO(
                 policy,
@@ -79,6 +79,7 @@ def build(config: TrainConfig, vec: VecEnv) -> BaseAlgorithm:
                 policy_kwargs=shape | {"log_std_init": settings.log_std_init},
                 **common,
             )
+    assert isinstance(settings, SacSettings)
     return SAC(
         policy,
         vec,
@@ -92,9 +93,11 @@ def build(config: TrainConfig, vec: VecEnv) -> BaseAlgorithm:
 
 
 def save(model: BaseAlgorithm, folder: Path) -> None:
-    """Write all that training goes on from: weights, optimizers, statistics, random states, SAC's memory."""
+    """Write a checkpoint: weights, optimizers, normalization statistics, random states, SAC's replay buffer."""
     model.save(folder / "model.zip")
-    model.get_vec_normalize_env().save(str(folder / "normalization.pkl"))
+    statistics = model.get_vec_normalize_env()
+    assert statistics is not None  # see `normalized`
+    statistics.save(str(folder / "normalization.pkl"))
     if isinstance(model, SAC):
         model.save_replay_buffer(folder / "replay.pkl")
     states = {"torch": torch.get_rng_state(), "numpy": np.random.get_state(), "python": random.getstate()}
@@ -104,10 +107,10 @@ def save(model: BaseAlgorithm, folder: Path) -> None:
 
 
 def load(config: TrainConfig, folder: Path, vec: VecEnv) -> BaseAlgorithm:
-    """Read a checkpoint to train on in fresh environments, whose episodes begin anew.
+    """Load a checkpoint to resume training in new environments; episodes start anew.
 
     Raises:
-        UsageError: it does not fit the environments, or is damaged.
+        UsageError: the checkpoint does not fit the environments, or is damaged.
     """
     try:
         vec = VecNormalize.load(str(folder / "normalization.pkl"), vec)
@@ -124,14 +127,13 @@ def load(config: TrainConfig, folder: Path, vec: VecEnv) -> BaseAlgorithm:
     random.setstate(states["python"])
     if "cuda" in states and torch.cuda.is_available():
         torch.cuda.set_rng_state_all(states["cuda"])
-    # Other episodes than those of before: the first seeds are used up.
+    # A seed that depends on the step, so that the first episodes are not repeated.
     vec.seed((config.seed + 7919 * (model.num_timesteps + 1)) % 2**31)
     return model
 
 
 def load_for_use(algo: str, folder: Path, device: str = "cpu") -> tuple[Any, VecNormalize]:
-    """Return a checkpoint's policy network and statistics, without environments."""
-    with open(folder / "normalization.pkl", "rb") as handle:
-        statistics: VecNormalize = pickle.load(handle)
+    """Return a checkpoint's policy network and normalization statistics, for inference."""
+    statistics: VecNormalize = pickle.loads((folder / "normalization.pkl").read_bytes())
     statistics.training = False
     return _CLASSES[algo].load(folder / "model.zip", device=device).policy, statistics

@@ -1,4 +1,4 @@
-"""What was trained, as a policy: observation -> action."""
+"""`TrainedPolicy`: the policy of a training run, a function from observation to action."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,28 +11,24 @@ from simrecon_envs.training.config import TrainConfig
 from simrecon_envs.training.environments import env_kwargs, flat_pictures
 from simrecon_envs.training.folder import RunFolder, runs_root
 
-_HOW = (
-    "obs_mode",
-    "control_mode",
-    "observe_objects",
-    "sensor_configs",
-)  # of env_kwargs: the rest makes the episode
+# The part of env_kwargs that defines observations and actions; the rest defines the episode.
+_INTERFACE = ("obs_mode", "control_mode", "observe_objects", "sensor_configs")
 
 
 class TrainedPolicy:
     """The policy of a run. Call it, or `act`, with an observation of an environment made with `env_kwargs`.
 
     Attributes:
-        folder: The run's.
-        steps: After how many steps of training.
-        config: The run's.
+        folder: The run's folder.
+        steps: Training steps of the checkpoint.
+        config: The run's configuration.
     """
 
     def __init__(self, folder: Path | str, device: str = "cpu") -> None:
         """Load the newest checkpoint of a run.
 
         Raises:
-            UsageError: there is no run in the folder, or no checkpoint yet.
+            UsageError: the folder has no run, or no checkpoint yet.
         """
         from simrecon_envs.training.models import load_for_use
 
@@ -47,22 +43,22 @@ class TrainedPolicy:
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
-        """Return what `simrecon_envs.make(scene, **kwargs)` needs for an environment of this policy."""
+        """Return the arguments of `simrecon_envs.make(scene, **kwargs)` with which the policy was trained."""
         return env_kwargs(self.config)
 
     @property
     def observation_shape(self) -> tuple[int, ...] | None:
-        """Return the shape of one observation; None where it is a dict."""
+        """Return the shape of one observation; None for dicts."""
         return self._network.observation_space.shape
 
     def reset(self) -> None:
-        """Begin an episode; the policy remembers nothing."""
+        """Begin an episode; the policy has no state."""
 
     def act(self, observation: Any) -> np.ndarray:
-        """Return the action (k,), or (b, k) for a batch, without noise.
+        """Return the deterministic action (k,), or (b, k) for a batch.
 
         Args:
-            observation: As the environment gives it: a vector or a dict, NumPy or torch, batched or not.
+            observation: Of the environment: a vector or a dict, NumPy or torch, batched or not.
         """
         observation = _numpy(observation)
         if isinstance(observation, dict) and "sensor_data" in observation:
@@ -78,26 +74,26 @@ def load_policy(run_dir: Path | str, device: str = "cpu") -> TrainedPolicy:
     """Return the policy of a training run: a function of observations.
 
     Args:
-        run_dir: The run's folder. It holds pickles: load only what you trained or trust.
-        device: Where to compute.
+        run_dir: The run's folder. It contains pickles: load only folders that you trust.
+        device: torch device.
 
     Raises:
-        UsageError: there is no run in the folder, or no checkpoint yet.
+        UsageError: the folder has no run, or no checkpoint yet.
     """
     return TrainedPolicy(run_dir, device)
 
 
 def trained(env: Any, run: str | None = None) -> TrainedPolicy:
-    """Return the policy that was trained for an environment, for `simrecon benchmark run`:
+    """Return the policy that was trained for an environment, for `simrecon benchmark run`.
 
         simrecon benchmark run ... --policy simrecon_envs.training:trained --policy-option run=FOLDER
 
     Args:
-        env: What it shall act in.
-        run: The run's folder; the newest of the environment's scene, task and robot where None.
+        env: The environment to act in.
+        run: The run's folder; the latest of the environment's scene, task and robot where None.
 
     Raises:
-        UsageError: no run fits, or the environment was made in another way than the one it was trained in.
+        UsageError: there is no such run, or the environment's robot, control mode or observations differ.
     """
     scene = env.unwrapped
     policy = TrainedPolicy(run or _newest(scene.scene_id, scene.task, scene.robot_uids).path)
@@ -118,13 +114,13 @@ def trained(env: Any, run: str | None = None) -> TrainedPolicy:
 
 
 def options_of_run(config: TrainConfig) -> dict[str, Any]:
-    """Return how an environment observes and acts in which a run's policy can be used, whatever the task."""
+    """Return the arguments of `gym.make` that define a run's observations and actions, for any task."""
     kwargs = env_kwargs(config)
-    return {key: kwargs[key] for key in _HOW if key in kwargs}
+    return {key: kwargs[key] for key in _INTERFACE if key in kwargs}
 
 
 def _options(task: Any, run: str | None = None) -> dict[str, Any]:
-    """Return what `trained` needs of `gym.make` for a suite's task."""
+    """Return the arguments of `gym.make` for `trained` on a suite's task."""
     folder = RunFolder.open(run) if run else _newest(task.scene, task.task, task.robot)
     return options_of_run(TrainConfig.from_json(folder.read_config()["config"]))
 
@@ -143,7 +139,7 @@ def _newest(scene: str, task: str, robot: str) -> RunFolder:
 
 
 def _numpy(value: Any) -> Any:
-    """Return tensors as NumPy's; a batch of one environment stays a batch."""
+    """Convert tensors to NumPy arrays of the same shape."""
     if isinstance(value, Mapping):
         return {key: _numpy(part) for key, part in value.items()}
     return value.cpu().numpy() if hasattr(value, "cpu") else np.asarray(value)

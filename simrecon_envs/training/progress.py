@@ -1,4 +1,4 @@
-"""What a person sees while a run trains: one line that is written over on a terminal, a line now and then elsewhere."""
+"""`Progress`: one status line, overwritten on a terminal; a line every 15 s elsewhere."""
 
 import sys
 import time
@@ -11,11 +11,11 @@ _RATE_OVER_S = 30.0
 
 
 class Interrupted(Exception):
-    """Training was asked to stop, and did where it can be gone on from."""
+    """Training stopped between two updates on request; a checkpoint was saved."""
 
 
 class Progress:
-    """Shows how far a run is, how fast it goes, how well it does and how long it takes yet."""
+    """Shows progress, speed, success rate and remaining time of a run."""
 
     def __init__(self, total: int, *, quiet: bool = False, stream: TextIO | None = None) -> None:
         """Begin a run of `total` steps."""
@@ -28,7 +28,7 @@ class Progress:
         self._width = 0
 
     def training(self, steps: int, success: float | None) -> None:
-        """Show the line of training, where it is time to."""
+        """Show the training status, if the last line is old enough."""
         if self._quiet:
             return
         now = time.perf_counter()
@@ -51,7 +51,7 @@ class Progress:
         )
 
     def evaluating(self, done: int, total: int, successes: int) -> None:
-        """Show the line of evaluation, where it is time to."""
+        """Show the evaluation status, if the last line is old enough."""
         now = time.perf_counter()
         if self._quiet or now - self._shown < (_TERMINAL_EVERY_S if self._terminal else _LOG_EVERY_S):
             return
@@ -59,14 +59,14 @@ class Progress:
         self._write(f"evaluating: {done} of {total} episodes, {successes} succeeded")
 
     def say(self, text: str) -> None:
-        """Show a line that stays."""
+        """Write a permanent line."""
         if not self._quiet:
             self.clear()
             self._stream.write(text + "\n")
             self._stream.flush()
 
     def clear(self) -> None:
-        """Remove the line that is written over."""
+        """Erase the status line."""
         if self._width:
             self._stream.write("\r" + " " * self._width + "\r")
             self._width = 0

@@ -1,4 +1,4 @@
-"""A training run from its configuration to its results; whatever stops it, it can be gone on with."""
+"""Train, evaluate, record: `train` begins a run, `resume` continues an interrupted one."""
 
 import datetime
 import json
@@ -22,20 +22,20 @@ def train(
     quiet: bool = True,
     video: bool = True,
 ) -> dict[str, Any]:
-    """Train, evaluate, film; see `resume` for what was interrupted.
+    """Begin a run: train, evaluate, record a video.
 
     Args:
-        config: What to train.
-        out: The run's folder; a new one among `runs_root()` where None.
+        config: Configuration of the run.
+        out: The run's folder; a new one in `runs_root()` where None.
         quiet: Show no progress.
-        video: Film the policy at the end, where something can render.
+        video: Record a video at the end, if this machine can render.
 
     Returns:
-        What `results.json` holds; {"interrupted": True, "folder", "steps"} where it was interrupted.
+        The content of `results.json`, or {"interrupted": True, "folder", "steps"}.
 
     Raises:
-        UsageError: something is wrong with what was asked for; nothing was begun.
-        EnvironmentMissing: no CUDA, or nothing to render with.
+        UsageError: the configuration is wrong; no folder was made.
+        EnvironmentMissing: there is no CUDA, or images are observed and nothing can render.
     """
     from simrecon_envs.training.models import check_device
 
@@ -59,19 +59,19 @@ def train(
 def resume(
     folder: RunFolder, *, steps: int | None = None, quiet: bool = True, video: bool = True
 ) -> dict[str, Any]:
-    """Go on with a run from its newest checkpoint, or its beginning where there is none.
+    """Continue a run from its latest checkpoint, or from its beginning.
 
     Args:
-        folder: The run's.
-        steps: Train up to more steps than the run was begun with.
+        folder: The run's folder.
+        steps: A new, greater total number of steps.
         quiet: Show no progress.
-        video: Film the policy at the end, where something can render.
+        video: Record a video at the end, if this machine can render.
 
     Returns:
         As `train`.
 
     Raises:
-        UsageError: the scene has changed, fewer steps were asked for, or a checkpoint is damaged.
+        UsageError: the scene has another revision, `steps` is less than before, or a checkpoint is damaged.
     """
     import dataclasses
 
@@ -91,16 +91,15 @@ def resume(
         _, scene = resolve(config)
         if scene["revision"] != entry["scene"]["revision"]:
             raise UsageError(
-                f"{folder.path}: was trained in revision {entry['scene']['revision']} of {config.scene}, which is "
-                f"{scene['revision']} by now; begin a new run"
+                f"{folder.path}: was trained in revision {entry['scene']['revision']} of {config.scene}, which now has "
+                f"revision {scene['revision']}; start a new run"
             )
         return _go(config, folder, entry, quiet=quiet, video=video)
 
 
 def _go(config: TrainConfig, folder: RunFolder, entry: dict, *, quiet: bool, video: bool) -> dict[str, Any]:
-    """Train what is left to train, then evaluate."""
-    checkpoints = folder.checkpoints()
-    done = checkpoints[-1][0] if checkpoints else 0
+    """Train the remaining steps, then evaluate."""
+    done = _steps_done(folder)
     progress = Progress(config.total_steps, quiet=quiet)
     progress.say(_headline(config, entry["scene"], folder, done))
     try:
@@ -109,20 +108,27 @@ def _go(config: TrainConfig, folder: RunFolder, entry: dict, *, quiet: bool, vid
         return _finish(config, folder, entry, progress, video)
     except (Interrupted, KeyboardInterrupt):
         progress.clear()
-        checkpoints = folder.checkpoints()
-        steps = checkpoints[-1][0] if checkpoints else 0
-        return {"interrupted": True, "folder": str(folder.path), "steps": steps}
+        return {"interrupted": True, "folder": str(folder.path), "steps": _steps_done(folder)}
+
+
+def _steps_done(folder: RunFolder) -> int:
+    return max((steps for steps, _ in folder.checkpoints()), default=0)
 
 
 def _learn(config: TrainConfig, folder: RunFolder, progress: Progress) -> None:
-    """Train up to the whole number of steps, or up to where it was interrupted; a checkpoint is written."""
+    """Train the remaining steps and save a checkpoint.
+
+    Raises:
+        Interrupted: a signal asked to stop; a checkpoint was saved.
+        SimReconError: an environment's process died.
+    """
     import torch
     from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
     from simrecon_envs.training import models
     from simrecon_envs.training.callbacks import Stop, Tally, Watch
 
-    torch.set_num_threads(1)  # small networks; and sums come out the same on every machine of a kind
+    torch.set_num_threads(1)  # small networks; reproducible sums
     checkpoints = folder.checkpoints()
     vec = make_several(config)
     try:
@@ -147,8 +153,8 @@ def _learn(config: TrainConfig, folder: RunFolder, progress: Progress) -> None:
         progress.say(f"trained: {tally.steps:,} steps, {tally.episodes:,} episodes, {tally.seconds:.0f} s")
     except (EOFError, ConnectionError) as error:
         raise SimReconError(
-            f"an environment's process ended unexpectedly ({error!r}); too little memory? Fewer --envs need less. "
-            f"Go on from the last checkpoint: simrecon train {config.scene} --resume --out {folder.path}"
+            f"an environment's process ended unexpectedly ({error!r}), perhaps for lack of memory; use fewer --envs. "
+            f"Continue from the last checkpoint: simrecon train {config.scene} --resume --out {folder.path}"
         ) from error
     finally:
         _close(vec)
@@ -157,7 +163,7 @@ def _learn(config: TrainConfig, folder: RunFolder, progress: Progress) -> None:
 def _finish(
     config: TrainConfig, folder: RunFolder, entry: dict, progress: Progress, video: bool
 ) -> dict[str, Any]:
-    """Evaluate, film and write the results."""
+    """Evaluate, record a video, and write the results."""
     from simrecon_envs.training.evaluate import evaluate, record
     from simrecon_envs.training.policy import TrainedPolicy
 
@@ -199,7 +205,7 @@ def _finish(
 
 
 def _close(vec: Any) -> None:
-    """End the environments' processes, also those that are gone already."""
+    """Close the environments, even if processes have died."""
     import contextlib
 
     with contextlib.suppress(EOFError, ConnectionError):
@@ -211,7 +217,7 @@ def _headline(config: TrainConfig, scene: dict, folder: RunFolder, done: int) ->
     how = (
         f"{config.algo.upper()}, {config.total_steps:,} steps, {config.envs} environments, seed {config.seed}"
     )
-    lines = [what, how + (f", going on at {done:,}" if done else ""), f"run folder: {folder.path}"]
+    lines = [what, how + (f", continuing at {done:,}" if done else ""), f"run folder: {folder.path}"]
     if scene["task_note"]:
         lines.insert(1, f"note: {scene['task_note']}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""One room for all tests of the ruler: its truth is written once."""
+"""Fixtures: one generated room for all tests of the metrics."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,13 +13,13 @@ POINTS = 40_000
 
 @pytest.fixture(scope="session")
 def truth(tmp_path_factory) -> Truth:
-    """The room's truth on disk."""
+    """The room's ground-truth folder."""
     return write_truth(tmp_path_factory.mktemp("truth"))
 
 
 @pytest.fixture
 def evaluate(truth, tmp_path) -> Callable[..., Evaluation]:
-    """Return a function that evaluates the truth, changed as asked, against the truth."""
+    """Return a function that evaluates the truth with a change against the truth."""
 
     def run(change: Change | None = None, folder: Path | None = None) -> Evaluation:
         bundle = write_bundle(truth, folder or tmp_path / "bundle", change)
@@ -30,6 +30,6 @@ def evaluate(truth, tmp_path) -> Callable[..., Evaluation]:
 
 @pytest.fixture(scope="session")
 def perfect(truth, tmp_path_factory) -> Evaluation:
-    """The truth against itself."""
+    """The evaluation of the truth against itself."""
     bundle = write_bundle(truth, tmp_path_factory.mktemp("perfect") / "bundle")
     return evaluate_scene(bundle, truth.folder, video=truth.frames, composition_points=POINTS)

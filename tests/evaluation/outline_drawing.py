@@ -1,4 +1,4 @@
-"""The outlines that a careful person would draw: around what a generated room truly shows, in three file formats."""
+"""Outlines of the true id maps of a generated room, written in three file formats."""
 
 import json
 from dataclasses import dataclass, field
@@ -12,19 +12,19 @@ FRAMES = (0, 10, 20)
 
 
 def pieces(mask: np.ndarray) -> list[np.ndarray]:
-    """Return polygons (k, 2) through the centers of a mask's border pixels: filled, they are the mask without holes."""
+    """Return the outer contours (k, 2) of a mask through the centers of its border pixels."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return [contour[:, 0] + 0.5 for contour in contours if len(contour) > 2]
 
 
 def true_ids(truth: Truth, index: int) -> np.ndarray:
-    """Return the true entity ids uint16 (h, w) of a frame."""
+    """Read the true entity ids uint16 (h, w) of a frame."""
     return cv2.imread(str(truth.folder / "instances" / f"{index:05d}.png"), cv2.IMREAD_UNCHANGED)
 
 
 @dataclass
 class Drawing:
-    """Outlines by frame, back to front, as [(name, polygon), …], and what the contract's format says besides."""
+    """Outlines by frame, back to front, as [(name, polygon), …], with parents and ignored regions."""
 
     size: tuple[int, int]
     frames: dict[int, list[tuple[str, np.ndarray]]]
@@ -52,7 +52,7 @@ class Drawing:
         return path
 
     def coco(self, path: Path) -> Path:
-        """Write COCO: a category a thing, an annotation a thing and picture."""
+        """Write COCO: one category per object, one annotation per object and image."""
         categories = {name: number for number, name in enumerate([*self.parents, "ignore"], start=1)}
         width, height = self.size
         images = [
@@ -75,7 +75,7 @@ class Drawing:
         return path
 
     def labelme(self, folder: Path) -> Path:
-        """Write labelme: a file a picture."""
+        """Write labelme: one file per image."""
         folder.mkdir()
         for index, shapes in self.frames.items():
             found = [
@@ -90,7 +90,7 @@ class Drawing:
 
 
 def draw(truth: Truth, ids: dict[int, np.ndarray] | None = None) -> Drawing:
-    """Outline every thing of the room in FRAMES, larger ones first; `ids` stand for the true ids of frames."""
+    """Outline all objects of the room in FRAMES, larger ones first; `ids` replaces the true id maps."""
     ids = ids or {index: true_ids(truth, index) for index in FRAMES}
     frames = {}
     for index, shown in ids.items():

@@ -1,4 +1,4 @@
-"""Facts of true objects by hand: boxes at known places. Shares and intervals against worked numbers."""
+"""Facts of true objects with boxes at known places; proportions and intervals against computed values."""
 
 import json
 
@@ -24,7 +24,7 @@ THINGS = {
 
 
 def write_truth(folder, things=THINGS):
-    """Write a truth folder of boxes on a floor and a wall; return it read again."""
+    """Write a ground-truth folder of boxes on a floor and a wall, and read it."""
     entities = []
     boxes = {
         "floor": trimesh.creation.box(
@@ -64,7 +64,7 @@ def write_truth(folder, things=THINGS):
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory) -> GroundTruth:
-    """The seven things above."""
+    """The seven objects above."""
     return write_truth(tmp_path_factory.mktemp("truth"))
 
 
@@ -141,7 +141,7 @@ def test_records_say_what_was_found_at_which_overlap(truth):
 
 
 def record(side_cm, support, gap_cm, found_25=True, found_50=True, pixels=50_000):
-    """Return what the breakdown reads of a record."""
+    """Return the keys of a record that the breakdown reads."""
     return {
         "longest_side_cm": side_cm,
         "support": support,
@@ -237,7 +237,7 @@ def test_boxes_of_the_stage_are_in_the_true_world_and_reach_their_support(truth)
 
 
 def test_a_picture_is_as_thick_as_the_stage_says_and_its_back_is_on_the_wall():
-    """Its surface is a cloud from 1 to 5 cm before the wall at x = 0; the stage says 2 cm."""
+    """Its surface points are 1 to 5 cm from the wall at x = 0; the stage's estimate is 2 cm."""
     from reconstruction.core.types import Instance, InstanceSet
     from reconstruction.measure.alignment import Alignment
 

@@ -1,4 +1,4 @@
-"""`simrecon evaluate` as people and programs call it."""
+"""`simrecon evaluate`: table and JSON."""
 
 import json
 
@@ -13,7 +13,7 @@ from registry.errors import UsageError
 
 @pytest.fixture(scope="module")
 def registry(truth, tmp_path_factory):
-    """A registry that holds the truth as a scene."""
+    """A registry with the truth as a scene."""
     root = tmp_path_factory.mktemp("home") / "registry"
     staging = tmp_path_factory.mktemp("staging") / "bundle"
     write_bundle(truth, staging)

@@ -1,4 +1,4 @@
-"""The ruler itself: the truth is perfect, and each known fault moves the figures that it should, by what it should."""
+"""The metrics: the truth scores perfectly, and each known fault changes the expected metrics by known amounts."""
 
 import numpy as np
 import pytest
@@ -81,7 +81,7 @@ def test_the_truth_against_itself_is_perfect(perfect):
 
 
 def test_another_world_only_shows_in_the_scale(evaluate, perfect):
-    """A similarity between the worlds is aligned away; physics alone lives in the bundle's own metres."""
+    """Alignment removes a similarity between the worlds; physics is simulated in the bundle's metres."""
     change = Change(
         estimated_from_true=np.diag([1.25, 1.25, 1.25, 1.0]) @ rigid(rotation(2, 40), [0.3, -1.2, 0.0])
     )
@@ -113,7 +113,7 @@ def test_cameras_turned_in_place(evaluate, perfect):
 
 
 def test_one_object_shifted(evaluate, perfect, truth):
-    """The carton moves 3 cm along the table: its box, surface and pictures, nothing else."""
+    """The carton is shifted by 3 cm: only its box, surface and the renderings change."""
     found = evaluate(Change(moved={"carton": shifted(x=0.03)}))
     mesh = truth.entity("carton").mesh()
     low, high = mesh.bounds
@@ -130,7 +130,7 @@ def test_one_object_shifted(evaluate, perfect, truth):
 
 
 def test_a_thin_thing_off_its_wall_is_missed(evaluate, perfect):
-    """4 cm before the wall the picture's thin box has nothing in common with the true one any more."""
+    """4 cm from the wall the picture's thin box does not overlap the true one."""
     found = evaluate(Change(moved={"picture": shifted(y=-0.04)}))
     assert score_of(found, "picture")["match"] is None
     assert found.metrics["object_recall_25"] == pytest.approx(1 - 1 / len(KINDS))
@@ -140,7 +140,7 @@ def test_a_thin_thing_off_its_wall_is_missed(evaluate, perfect):
 
 
 def test_chamfer_of_a_plane_moved_off_itself(evaluate, perfect):
-    """4 mm before the wall each point of the picture's front and back is at most 4 mm from the truth."""
+    """4 mm from the wall each point of the picture's front and back is at most 4 mm from the truth."""
     found = evaluate(Change(moved={"picture": shifted(y=-0.004)}))
     assert score_of(found, "picture")["center_error_cm"] == pytest.approx(0.4, abs=1e-2)
     assert 0.25 < score_of(found, "picture")["cd_cm"] < 0.401 + 0.25  # 50,000 points lie millimetres apart
@@ -171,8 +171,8 @@ def test_one_object_missing(evaluate, perfect, truth):
     )
 
 
-def test_a_carrier_missing_takes_its_relations_along(evaluate, truth):
-    """Without the book, the tin on it hangs on what is not there: its edge is wrong, though it is found."""
+def test_a_missing_support_makes_relations_wrong(evaluate, truth):
+    """Without the book the edge of the tin on it is wrong, although the tin is found."""
     found = evaluate(Change(missing=("book",), parent={"tin": "table"}))
     assert found.metrics["graph_f1_matched"] < 1
     assert score_of(found, "tin")["relation_right"] is False
@@ -197,7 +197,7 @@ def test_one_object_inside_its_support(evaluate, perfect):
 
 
 def test_one_object_tipping_over(evaluate, perfect, truth):
-    """A carton that leans 30 degrees falls: unstable at every threshold on angles."""
+    """A leaning carton falls: unstable at every threshold."""
     low, high = truth.entity("carton").mesh().bounds
     edge = np.array([high[0], 0.5 * (low + high)[1], low[2]])
     lean = shifted(*edge) @ rigid(rotation(1, 50.0)) @ shifted(*-edge)

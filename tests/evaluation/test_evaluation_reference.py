@@ -1,4 +1,4 @@
-"""The contract's geometry once more, written independently: exact rays instead of drawn triangles, other samples."""
+"""Independent reference of the contract's geometry metrics: exact rays instead of rasterization, other samples."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ POINTS = 300_000
 
 
 def seen_by_rays(mesh: trimesh.Trimesh, points: np.ndarray, truth) -> np.ndarray:
-    """Tell which points on a mesh some true camera sees within 5 m."""
+    """Return which points on a mesh are visible to some true camera within 5 m."""
     rays = trimesh.ray.ray_pyembree.RayMeshIntersector(mesh)
     k, seen = truth.camera, np.zeros(len(points), bool)
     for pose in truth.poses:
@@ -50,7 +50,7 @@ def reference(found: trimesh.Trimesh, true: trimesh.Trimesh, truth) -> dict[str,
 
 
 def test_geometry_agrees_within_one_percent(truth):
-    """Both sides draw their own points: what is unchanged then has the distance between samples on both."""
+    """Independent samples of one surface have the sample spacing as distance."""
     moved = {
         "carton": rigid(translation=np.array([0.12, -0.1, 0.05])),
         "shelf": rigid(translation=np.array([0.25, -0.2, 0.0])),

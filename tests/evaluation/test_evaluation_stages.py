@@ -1,4 +1,4 @@
-"""Figures of single stages: known faults of single artifacts show in the figures of just those stages."""
+"""Figures per stage: a known fault of one artifact changes the figures of its stage only."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ KINDS = ["table", "carton", "can", "book"]
 
 @pytest.fixture(scope="module")
 def capture() -> SyntheticCapture:
-    """A short film of a small room with its true cameras and depth."""
+    """A short capture of a small room with true cameras and depth."""
     return make_test_capture(18, 200, 150, seed=2, objects=KINDS, step_m=0.2, density=0.1)
 
 
@@ -162,7 +162,7 @@ def test_oracle_instances_are_perfect_and_merged_ones_are_not(capture, truth, su
 
 
 def test_oracle_instances_without_a_floor_in_view_keep_walls_and_floor_apart(capture, truth, surface):
-    """No vertex is of the floor: one is assumed, and the walls keep ids of their own."""
+    """Without floor vertices a floor is assumed, and the walls keep distinct ids."""
     high = surface.vertices[:, 2] > 0.2
     keep = high[surface.faces].all(axis=1)
     number = np.cumsum(high) - 1

@@ -1,4 +1,4 @@
-"""Two small generated rooms through everything: filmed, reconstructed, evaluated, reported."""
+"""End to end on two small generated rooms: render, reconstruct, evaluate, report."""
 
 import json
 import os
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def simrecon(home: Path, *arguments: object) -> subprocess.CompletedProcess:
-    """Run the command line in a process of its own."""
+    """Run the command line in a separate process."""
     line = [sys.executable, "-m", "reconstruction.cli", *map(str, arguments)]
     environment = {**os.environ, "SIMRECON_HOME": str(home)}
     done = subprocess.run(line, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=900)

@@ -1,4 +1,4 @@
-"""Labels as `simrecon evaluate` and `simrecon report` take them."""
+"""`simrecon evaluate` and `simrecon report` with labels."""
 
 import base64
 import html
@@ -15,7 +15,7 @@ from reconstruction.cli import main
 from reconstruction.commands.truth import split_truth
 from reconstruction.measure import evaluate_scene
 from reconstruction.measure.outlines import measure_outlines
-from reconstruction.measure.report.collect import gather
+from reconstruction.measure.report.collect import Gathered
 from reconstruction.measure.report.outline_section import outline_section
 from reconstruction.measure.scene import placed_meshes
 from reconstruction.measure.stage_results import StageResults
@@ -25,7 +25,7 @@ from registry.errors import UsageError
 
 @pytest.fixture(scope="module")
 def registry(truth, tmp_path_factory):
-    """A registry that holds the truth without its carton as a scene."""
+    """A registry with the truth without its carton as a scene."""
     root = tmp_path_factory.mktemp("home") / "registry"
     staging = tmp_path_factory.mktemp("staging") / "bundle"
     write_bundle(truth, staging, Change(missing=("carton",)))
@@ -107,13 +107,13 @@ def test_report_shows_outlines_over_ids(registry, labels, tmp_path):
 
 
 def test_the_drawn_lines_say_what_was_found(registry, truth, labels):
-    """Red lines only where a thing was missed, gray ones only where it is ignored."""
+    """Red lines for missed objects only, gray ones for ignored ones only."""
     data = json.loads(labels.read_text())
     data["ignore"] = ["table"]
     bundle, stages = SceneRegistry(registry).load("room"), StageResults({}, {})
     labels.write_text(json.dumps(data))
     scores = measure_outlines(bundle, placed_meshes(bundle), labels, stages)
-    g = gather(bundle, stages, outlines=scores)
+    g = Gathered(bundle, stages, outlines=scores)
     section = outline_section(g)
     pictures = next(block for block in section.blocks if block.kind == "pictures").items
     assert len(pictures) == len(FRAMES)
@@ -136,4 +136,4 @@ def test_the_drawn_lines_say_what_was_found(registry, truth, labels):
     verdicts = {row[0].text: row[1].text for row in table.rows}
     assert verdicts["carton"] == "missed"
     assert "table" not in verdicts
-    assert outline_section(gather(bundle, stages)) is None
+    assert outline_section(Gathered(bundle, stages)) is None

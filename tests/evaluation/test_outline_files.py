@@ -1,4 +1,4 @@
-"""Malformed labels are one clear error: what, where, what to do."""
+"""Malformed labels give one error with file, place and remedy."""
 
 import json
 import re
@@ -69,8 +69,8 @@ THING = {"name": "mug", "polygon": SQUARE}
         (coco(annotation={"category_id": 5}), "category 5"),
         (coco(annotation={"image_id": 5}), "image 5"),
         (coco(twice=True), "two annotations of 'mug'"),
-        (coco(picture="kitchen.jpg"), "kitchen.jpg is cannot be told; name pictures by the number"),
-        (coco(picture="take2_00010.jpg"), "take2_00010.jpg is cannot be told"),
+        (coco(picture="kitchen.jpg"), "kitchen.jpg is unknown; name images by the number"),
+        (coco(picture="take2_00010.jpg"), "take2_00010.jpg is unknown"),
         (labelme(shape(shape_type="circle", points=SQUARE[:2])), "'mug' is a circle"),
         (labelme(shape(), shape()), "two shapes are 'mug'"),
         (labelme(shape(group_id=1), shape(group_id=2)), "two shapes are 'mug'"),
@@ -85,24 +85,24 @@ def test_malformed_labels(tmp_path, data, message):
 
 
 @pytest.mark.parametrize(("content", "message"), [(b"{", "not JSON"), (b"\xff\xfe\x00", "not a text file")])
-def test_a_file_that_is_no_json(tmp_path, content, message):
+def test_a_file_that_is_not_json(tmp_path, content, message):
     path = tmp_path / "labels.json"
     path.write_bytes(content)
     with pytest.raises(UsageError, match=message):
         load_outlines(path)
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_a_missing_file(tmp_path):
     with pytest.raises(UsageError, match="no such file"):
         load_outlines(tmp_path / "labels.json")
     with pytest.raises(UsageError, match="no JSON file"):
         load_outlines(tmp_path)
 
 
-def test_what_the_formats_allow_is_read(tmp_path):
+def test_optional_features_of_the_formats(tmp_path):
     path = tmp_path / "labels.json"
     edge = contract(frame={"things": [THING | {"polygon": [[-0.5, 0], [40.5, 0], [40, 30]]}]})
-    path.write_text(json.dumps(edge))  # people draw past the border
+    path.write_text(json.dumps(edge))  # slightly outside of the image
     assert load_outlines(path).frames[0].label_map(["mug"])[0, 20] == 0
     box = {"shape_type": "rectangle", "points": [[2, 3], [9, 8]]}
     path.write_text(json.dumps(labelme(shape(**box), shape(label="Ignore"), picture="f-00010.png")))
@@ -113,7 +113,7 @@ def test_what_the_formats_allow_is_read(tmp_path):
     assert len(load_outlines(path).frames[0].ignored) == 1
 
 
-def test_the_example_of_the_docs_is_legal(tmp_path):
+def test_the_example_in_the_docs_is_valid(tmp_path):
     page = (Path(__file__).resolve().parents[2] / "docs" / "evaluation.md").read_text()
     (shown,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
     path = tmp_path / "labels.json"
@@ -127,10 +127,10 @@ def test_the_example_of_the_docs_is_legal(tmp_path):
     ("change", "message"),
     [
         ({"index": 9000}, "frame 9000 does not exist, room.mp4 has 21 frames"),
-        ({"width": 180, "height": 240}, "frame 0 is 180x240, but the film is 240x180"),
+        ({"width": 180, "height": 240}, "frame 0 is 180x240, but the video is 240x180"),
     ],
 )
-def test_labels_of_another_film_are_refused(truth, tmp_path, change, message):
+def test_labels_of_another_video_are_refused(truth, tmp_path, change, message):
     path = draw(truth).contract(tmp_path / "labels.json")
     data = json.loads(path.read_text())
     data["frames"][0].update(change, things=[], ignore_regions=[])
@@ -140,7 +140,7 @@ def test_labels_of_another_film_are_refused(truth, tmp_path, change, message):
         score_outlines(bundle, [], load_outlines(path))
 
 
-def test_labels_that_ask_for_nothing_are_refused(truth, tmp_path):
+def test_labels_without_evaluated_objects_are_refused(truth, tmp_path):
     drawing = draw(truth)
     bundle = write_bundle(truth, tmp_path / "bundle")
     drawing.ignore = list(drawing.parents)
@@ -148,5 +148,5 @@ def test_labels_that_ask_for_nothing_are_refused(truth, tmp_path):
         if change == "nothing outlined":
             drawing.frames, drawing.parents, drawing.ignore = {0: []}, {}, []
         path = drawing.contract(tmp_path / "labels.json")
-        with pytest.raises(UsageError, match="nothing that is asked for"):
+        with pytest.raises(UsageError, match="no object that is evaluated"):
             score_outlines(bundle, [], load_outlines(path))

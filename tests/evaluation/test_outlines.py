@@ -1,4 +1,4 @@
-"""Outlines drawn by hand: true ones are perfect, each known fault moves the figures that it should."""
+"""Outline metrics: true outlines score perfectly, each known fault changes the expected metrics."""
 
 import json
 
@@ -19,7 +19,7 @@ RATES = ("outline_recall_25", "outline_recall_50", "outline_precision_25", "outl
 
 @pytest.fixture(scope="module")
 def room(truth, tmp_path_factory):
-    """Return the truth as a bundle."""
+    """Write the truth as a bundle."""
     return write_bundle(truth, tmp_path_factory.mktemp("room") / "bundle")
 
 
@@ -32,7 +32,7 @@ def of(scores, name: str) -> dict:
 
 
 def asked(truth) -> list[str]:
-    """Return the things that some labelled frame shows."""
+    """Return the objects visible in some labelled frame."""
     return sorted({name for shapes in draw(truth).frames.values() for name, _ in shapes})
 
 
@@ -110,7 +110,7 @@ def test_an_object_that_nobody_outlined_lowers_precision_unless_it_is_ignored(tr
 
 
 def test_a_region_under_an_outline_is_judged(truth, room, tmp_path):
-    """Regions count outside of things only: where all is one region, objects on outlined things still count."""
+    """Outlines cover ignored regions: objects on outlines count even if the whole frame is one region."""
     drawing = draw(truth)
     width, height = drawing.size
     whole = np.array([[0, 0], [width, 0], [width, height], [0, height]])
@@ -140,7 +140,7 @@ def test_a_relation_to_what_was_not_found_is_not_asked(truth, tmp_path):
 
 
 def test_iou_is_summed_over_frames(truth, room, tmp_path):
-    """An outline that is shifted in one frame and right in another: intersections and unions add up."""
+    """With an outline shifted in one of two frames, intersections and unions are summed over both."""
     drawing, (first, second) = draw(truth), FRAMES[:2]
     masks = [true_ids(truth, index) == truth.entity("carton").id for index in (first, second)]
     assert all(mask.sum() > 60 for mask in masks)
@@ -190,7 +190,7 @@ def test_no_labelled_frame_with_a_camera_lists_those_that_have_one(truth, tmp_pa
 
 
 def test_the_lens_bends_the_scene_as_the_film(truth, room, tmp_path):
-    """Outlines drawn on a film with barrel distortion fit the scene only where the lens is known."""
+    """Outlines on a video with barrel distortion match the scene only with the lens."""
     width, height = truth.camera.width, truth.camera.height
     side = float(max(width, height))
     center = [width / 2, height / 2]
@@ -207,7 +207,7 @@ def test_the_lens_bends_the_scene_as_the_film(truth, room, tmp_path):
 
 
 def test_a_film_that_shows_more_than_its_straightened_frames_is_drawn_to_its_borders(truth, room, tmp_path):
-    """A lens that only zooms out by 0.8 gives the picture of a camera with 0.8 of the focal length."""
+    """A lens that scales by 0.8 gives the image of a camera with 0.8 of the focal length."""
     width, height = truth.camera.width, truth.camera.height
     zoom = 0.8 * max(width, height)
     lens = Lens(width, height, np.array([zoom, zoom, width / 2, height / 2, 0, 0, 0, 0]))
@@ -270,7 +270,7 @@ def test_images_of_a_folder_are_found_by_their_place_in_name_order(truth, tmp_pa
 
 
 def test_outlines_alone_are_enough(truth, room, tmp_path):
-    """A file without `things` and `ignore` is read: nothing but names and polygons is needed."""
+    """A file without `things` and `ignore` is valid: only names and polygons are required."""
     path = draw(truth).contract(tmp_path / "labels.json")
     data = json.loads(path.read_text())
     for key in ("things", "ignore", "capture"):

@@ -1,4 +1,4 @@
-"""Viewpoints measured by the truth: hidden shares, what is seen, where no camera can be."""
+"""Viewpoints in the true scene: occluded shares, visible points, invalid camera positions."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""A generated room as a ground-truth folder, and as a scene bundle that is the truth but for what a test changes."""
+"""Write a generated room as a ground-truth folder, and as a scene bundle with known changes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ FIXED = ("table", "shelf", "picture")
 
 @dataclass(frozen=True)
 class Truth:
-    """A room, its cameras, and where its ground truth is written."""
+    """A room, its cameras and its ground-truth folder."""
 
     folder: Path  # ground truth; the frames are in `frames/` beside it
     room: Room
@@ -32,11 +32,11 @@ class Truth:
 
     @property
     def frames(self) -> Path:
-        """The pictures that the cameras take of the truth itself, one per frame."""
+        """Folder of the renderings of the true room, one per frame."""
         return self.folder.parent / "frames"
 
     def entity(self, name: str) -> Entity:
-        """Return a true thing."""
+        """Return a true entity."""
         return self.room.entity(name)
 
 
@@ -54,7 +54,7 @@ class Change:
 
 
 def write_truth(folder: Path, frames: int = 21, width: int = 240, height: int = 180) -> Truth:
-    """Furnish a room, write its truth and the pictures that its cameras take of it."""
+    """Build a room, write its ground truth and the renderings at its cameras."""
     room = build_room(3, KINDS, step_m=0.3, density=0.05)
     camera, poses = phone_camera(width, height), handheld_path(frames, seed=1)
     truth = Truth(folder / "ground_truth", room, camera, np.asarray(poses))
@@ -64,17 +64,13 @@ def write_truth(folder: Path, frames: int = 21, width: int = 240, height: int = 
     for number, pose in enumerate(truth.poses):
         if number % 10 == 0:
             picture, depth = render_textured(meshes, camera, pose)
-            picture[depth == 0] = (
-                200,
-                30,
-                90,
-            )  # what lies outside of the scene is not the renderer's background
+            picture[depth == 0] = (200, 30, 90)  # differs from the renderer's background
         cv2.imwrite(str(truth.frames / f"{number:05d}.png"), picture[..., ::-1])
     return truth
 
 
 def textured(entity: Entity, brighter: int = 0) -> TexturedMesh:
-    """Return the true mesh in world space with smooth colors of its own."""
+    """Return the true mesh in world space with a smooth random texture."""
     mesh = entity.mesh()
     rng = np.random.default_rng(entity.id)
     texture = cv2.resize(
@@ -109,7 +105,7 @@ def write_bundle(truth: Truth, folder: Path, change: Change | None = None) -> Sc
         reshape = change.reshaped.get(entity.name, lambda points: points)
 
         def to_object(points: np.ndarray, pose=pose, entity=entity, reshape=reshape) -> np.ndarray:
-            """Take true world points of the unmoved thing to the space of its mesh file."""
+            """Transform true world points of the unmoved entity to the space of its mesh file."""
             points = reshape(np.asarray(points, np.float64))
             if entity.base:
                 return transform_points(change.estimated_from_true, points)

@@ -55,7 +55,7 @@ def room(with_panel=True):
     eyes = [np.array([x, -1.3, 0.5]) for x in np.linspace(-0.3, 0.3, 5)]
     poses = np.stack([look_at(eye, BOX_CENTER, 80.0) for eye in eyes])
     vertices = packed[:, :3].astype(np.float32)
-    zeros = np.zeros((len(vertices), 3))
+    zeros = np.zeros_like(vertices)
     surface = Surface(
         vertices,
         np.zeros((0, 3), np.int32),

@@ -50,7 +50,8 @@ class _Writer:
         write_glb(_textured(trimesh.util.concatenate(parts)), self.folder / visual)
         names = [f"{stem}collision_{k:03d}.obj" for k in range(len(parts))]
         for name, part in zip(names, parts, strict=True):
-            write_obj(ConvexPart(part.vertices, part.faces), self.folder / name)
+            vertices, faces = part.vertices.astype(np.float32), part.faces.astype(np.int32)
+            write_obj(ConvexPart(vertices, faces), self.folder / name)
         return names
 
     def add_base(self, key: int, label: str, slab: trimesh.Trimesh, plane: list) -> None:

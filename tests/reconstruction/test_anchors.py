@@ -92,11 +92,8 @@ def test_clicks_in_held_out_and_in_skipped_frames(first):
     points = first.surface.vertices[first.found.vertex_instance == table.id]
     held = int(posed.held_out_indices[-1])
     skipped = int(posed.indices[5])
-    without = replace(
-        posed,
-        indices=np.delete(posed.indices, 5),
-        world_from_camera=np.delete(posed.world_from_camera, 5, axis=0),
-    )
+    per_frame = ("images", "indices", "times_s", "world_from_camera", "sharpness")
+    without = replace(posed, **{name: np.delete(getattr(posed, name), 5, axis=0) for name in per_frame})
     for frame, pose, footage in (
         (held, posed.held_out_world_from_camera[-1], first.footage),
         (skipped, posed.world_from_camera[5], replace(first.footage, posed=without)),

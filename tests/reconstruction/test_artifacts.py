@@ -62,6 +62,23 @@ def test_arrays_keep_dtype_shape_and_bits(tmp_path):
     assert isinstance(again.depth, np.memmap), "a large array must not be read whole"
 
 
+@pytest.mark.parametrize(
+    ("depth", "confidence", "message"),
+    [
+        (
+            np.zeros((2, 3, 4)),
+            np.zeros((2, 3, 4), np.uint8),
+            r"DepthMaps\.depth: expected float32 .*got float64",
+        ),
+        (np.zeros((3, 4), np.float32), np.zeros((3, 4), np.uint8), r"DepthMaps\.depth: expected .*\(3, 4\)"),
+        (np.zeros((2, 3, 4), np.float32), np.zeros((5, 3, 4), np.uint8), r"DepthMaps\.confidence: .*n = 2"),
+    ],
+)
+def test_wrong_arrays_are_refused_by_class_and_field(depth, confidence, message):
+    with pytest.raises(ValueError, match=message):
+        DepthMaps(Camera(4, 3, 1, 1, 1, 1), depth, confidence)
+
+
 def test_non_finite_plain_numbers_are_refused(tmp_path):
     grid = SpaceGrid(np.zeros(3), float("nan"), np.zeros((1, 1, 1), np.uint8))
     empty = np.zeros((0, 3), np.float32)

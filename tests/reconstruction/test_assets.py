@@ -1,4 +1,4 @@
-"""The stage on a generated room with true depth and ids: closed, placed, hollow, robust."""
+"""The assets stage on a generated room with true depth and ids: closed, posed, hollow and robust objects."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from registry.geometry import transform_points
 CONFIG = AssetsConfig(
     cells_along_longest=40, max_voxels=150_000, texture_max_px=128, texture_frames=4, base_texel_m=0.05
 )
-EMPTY = Surface(*(np.zeros(0),) * 5, voxel_size_m=0.01, space=None)
+EMPTY = Surface(*(np.zeros((0, 3), kind) for kind in ("f4", "i4", "f4", "u1")), np.zeros(0, "f4"), 0.01, None)
 
 
 def instances_of(capture, names):
@@ -58,14 +58,14 @@ def test_every_glb_is_valid_gltf(built, tmp_path):
     assert not any(issue["severity"] < 2 for found in issues.values() for issue in found), issues
 
 
-def test_the_validator_sees_what_is_wrong(built, tmp_path):
+def test_the_validator_rejects_a_truncated_file(built, tmp_path):
     whole, torn = tmp_path / "whole.glb", tmp_path / "torn.glb"
     write_glb(built[0].objects[0].visual, whole)
     torn.write_bytes(whole.read_bytes()[:-400])
     assert any(issue["severity"] == 0 for issue in gltf_issues([torn])[str(torn)])
 
 
-def test_objects_are_closed_and_where_they_are(built, small_capture):
+def test_objects_are_closed_and_at_their_true_poses(built, small_capture):
     from scipy.spatial import cKDTree
 
     assets, _ = built
@@ -100,7 +100,7 @@ def test_the_bowl_is_hollow(built, small_capture):
     assert world[middle, 2].max() < low[2] + 0.6 * (high - low)[2]
 
 
-def test_the_floor_carries_everything_and_faces_up(built):
+def test_the_floor_extends_below_all_objects_and_faces_up(built):
     assets, _ = built
     (floor,) = assets.base
     corner = floor.visual.vertices[floor.visual.faces]
@@ -112,7 +112,7 @@ def test_the_floor_carries_everything_and_faces_up(built):
         assert (world[:, :2] <= floor.visual.vertices[:, :2].max(axis=0)).all()
 
 
-def test_what_was_never_seen_becomes_a_noted_box(built, small_capture):
+def test_an_unseen_object_becomes_a_box_with_a_note(built, small_capture):
     _, found = built
     ghost = replace(
         found.objects[0], id=999, center=np.array([0.5, 0.5, 0.5]), extents_m=np.array([0.1, 0.2, 0.3])
@@ -132,7 +132,7 @@ def test_what_was_never_seen_becomes_a_noted_box(built, small_capture):
     np.testing.assert_allclose(np.ptp(item.visual.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-6)
 
 
-def test_same_input_same_bits(built, small_capture):
+def test_results_are_deterministic(built, small_capture):
     assets, found = built
     again = build_assets(small_capture.posed, small_capture.depth, EMPTY, found, CONFIG)
     np.testing.assert_array_equal(again.objects[0].visual.vertices, assets.objects[0].visual.vertices)

@@ -1,4 +1,4 @@
-"""Undersides of boards on legs: as far below the top as the rim says, and legs go on to the floor."""
+"""Undersides of table tops: the rim gives the thickness, and legs reach the floor."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def _box_distance(points, low, high):
 
 
 def _table(apron=False):
-    """Return the volume and frame of a table seen from above: what lies below its top is unknown."""
+    """Return the volume and frame of a table seen from above: the space below its top is unknown."""
     low = np.array([*(-_HALF - 0.06), -2 * _VOXEL])
     shape = tuple(np.ceil((np.array([*(_HALF + 0.06), _TOP + 0.05]) - low) / _VOXEL).astype(int))
     centers = low + (np.stack(np.indices(shape), -1).reshape(-1, 3) + 0.5) * _VOXEL
@@ -37,7 +37,7 @@ def _table(apron=False):
     beneath = (np.abs(centers[:, :2]) < _HALF).all(axis=1) & (centers[:, 2] < _TOP - 0.3 * _THICK)
     unknown = (distance < -_BAND) | (beneath & (np.min(parts[1:], axis=0) > 0.03))
     known = ~unknown
-    if apron:  # seen from outside, so that what lies between passes for enclosed
+    if apron:  # seen from outside, so that the space between counts as enclosed
         inset = np.abs(centers[:, :2]) - (_HALF - 0.05)
         known |= (np.abs(inset.max(axis=1)) < 0.01) & (centers[:, 2] > _TOP - 0.08)
         distance = np.where(known & unknown, -0.005, distance)
@@ -55,14 +55,14 @@ def _table(apron=False):
     return volume, ObjectFrame(np.eye(4), points, normals, on_support=True, wall_y=None)
 
 
-def test_the_rim_says_how_thick_a_board_is():
+def test_thickness_is_measured_at_the_rim():
     board = find_board(*_table())
     assert board.top_m == pytest.approx(_TOP, abs=0.003)
     assert board.thickness_m == pytest.approx(_THICK, abs=0.005)
     assert board.plan.sum() * _VOXEL**2 == pytest.approx(np.prod(2 * _HALF), rel=0.1)
 
 
-def test_nothing_is_decided_for_what_goes_on_below_its_rim():
+def test_a_block_that_continues_below_its_rim_is_no_board():
     volume, frame = _table()
     walls = frame.points.copy()
     walls[4000:, 2] = np.random.default_rng(1).uniform(0.0, _TOP, len(walls) - 4000)
@@ -70,7 +70,7 @@ def test_nothing_is_decided_for_what_goes_on_below_its_rim():
 
 
 @pytest.mark.parametrize("apron", [False, True])
-def test_a_table_ends_where_its_rim_does_and_stands_on_its_legs(apron):
+def test_a_table_top_ends_at_its_rim_and_legs_reach_the_floor(apron):
     volume, frame = _table(apron)
     body = extract(complete(volume, frame, AssetsConfig(symmetry=False), furniture=True))
     a, b, c = (body.vertices[body.faces[:, k]] for k in range(3))
@@ -85,7 +85,7 @@ def test_a_table_ends_where_its_rim_does_and_stands_on_its_legs(apron):
     assert (corners > _HALF - _LEG - 0.01).all()
 
 
-def test_what_is_known_stays():
+def test_known_voxels_stay():
     volume, frame = _table()
     solid = np.zeros(volume.known.shape, bool)
     decided, left = with_underside(volume, solid, find_board(volume, frame))

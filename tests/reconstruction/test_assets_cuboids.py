@@ -1,4 +1,4 @@
-"""Boxes of which some sides were seen become boxes; what was seen within, or is round, does not."""
+"""Boxes of which some sides were seen; free space inside, and round objects, are rejected."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ _HALF, _HEIGHT, _VOXEL = np.array([0.1, 0.06]), 0.12, 0.005
 
 
 def _volume(free_inside=False):
-    """Nothing is known within the box, all is free outside of it."""
+    """A volume that is unknown inside the box and free outside."""
     shape = (60, 44, 34)
     low = np.array([-0.15, -0.11, -0.02])
     centers = low + (np.stack(np.indices(shape), -1) + 0.5) * _VOXEL
@@ -44,12 +44,12 @@ def test_two_upright_sides_make_a_box():
     np.testing.assert_allclose(body.vertices.min(axis=0), [*-_HALF, 0.0], atol=0.004)
 
 
-def test_one_side_says_nothing_of_how_deep_a_thing_is():
+def test_one_side_does_not_determine_the_depth():
     assert unfreed_cuboid(_volume(), _frame([(1, -1)]), 0.003) is None
     assert unfreed_cuboid(_volume(), _frame([(1, -1), (1, 1)]), 0.003) is None
 
 
-def test_what_was_seen_free_is_no_box():
+def test_free_space_inside_is_no_box():
     sides = [(0, 1), (0, -1), (1, -1), (1, 1)]
     assert unfreed_cuboid(_volume(), _frame(sides), 0.003) is not None
     assert unfreed_cuboid(_volume(free_inside=True), _frame(sides), 0.003) is None

@@ -1,4 +1,4 @@
-"""What the picture's edge cuts off goes on as far as it says itself; what was seen whole ends there."""
+"""Objects cropped by the image border are extended; objects seen whole are not."""
 
 from dataclasses import replace
 
@@ -9,14 +9,7 @@ from facing import CAMERA, frames
 from reconstruction.assets.cut_off import Room, continued, cut_off_sides, lone_front, with_copies
 from reconstruction.assets.views import SeenPoints
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume
-from reconstruction.core.types import (
-    BaseEntity,
-    InstanceSet,
-    Plane,
-    PosedFrames,
-    SpaceGrid,
-    Surface,
-)
+from reconstruction.core.types import BaseEntity, InstanceSet, Plane, PosedFrames, SpaceGrid, Surface
 from registry.geometry import invert_rigid, rigid, transform_points
 
 THING, FLOOR, WALL = 3, 1, 2
@@ -42,7 +35,7 @@ def front() -> tuple[np.ndarray, np.ndarray]:
 
 
 class Scene:
-    """A thing in front of a wall, as `posed` see it; what lies out of every frame is not seen."""
+    """An object in front of a wall with the points that `posed` see of it."""
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, posed: PosedFrames) -> None:
         maps = np.full((len(posed.images), 240, 320), WALL, np.uint16)
@@ -72,7 +65,7 @@ class Scene:
         return cut_off_sides(THING, self.frame, self.seen, self.room)
 
     def with_free(self, low, high) -> "Scene":
-        """Let rays have passed through a box."""
+        """Return the scene with free space in a box."""
         space = self.room.surface.space
         state = space.state.copy()
         index = [
@@ -97,7 +90,7 @@ def surface(state: np.ndarray | None = None) -> Surface:
 LOW = frames((0.0, 0.0, 0.1), (0.1, 0.0, 0.1))
 
 
-def test_boards_go_on_to_the_next_one():
+def test_a_shelf_is_extended_to_the_next_board():
     scene = Scene(*shelf(), LOW)
     (side,) = scene.sides()
     assert (side.axis, side.sign) == (2, 1)
@@ -105,16 +98,16 @@ def test_boards_go_on_to_the_next_one():
     assert side.period == pytest.approx(0.3, abs=0.02)
 
 
-def test_what_was_seen_whole_does_not_go_on():
+def test_an_object_seen_whole_is_not_extended():
     assert Scene(*shelf(), frames((0, -0.5, 0.7), (0.1, -0.5, 0.7))).sides() == []
 
 
-def test_free_space_stops_what_goes_on():
+def test_free_space_stops_the_extension():
     assert Scene(*shelf(), LOW).with_free((-0.6, 1.9, 1.05), (0.6, 2.4, 2.0)).sides() == []
 
 
-def test_a_cut_side_becomes_as_long_as_the_thing_is_deep():
-    """Of a chest 0.6 m deep little lies in the picture, which ends at x = 1.1 in its middle."""
+def test_a_cropped_side_becomes_as_long_as_the_object_is_deep():
+    """The images end at x = 1.1 and show little of a chest 0.6 m deep."""
     top = plate((0.9, 1.6, 0.4), (1.8, 2.2, 0.405), (0, 0, 1), 8000)
     side = plate((0.9, 1.6, 0.0), (0.905, 2.2, 0.4), (-1, 0, 0), 6000)
     points, normals = (np.concatenate(parts) for parts in zip(top, side))
@@ -123,7 +116,7 @@ def test_a_cut_side_becomes_as_long_as_the_thing_is_deep():
     assert found.end == pytest.approx(0.9 + 0.6, abs=0.04)
 
 
-def test_points_and_volume_are_copied_from_one_board_before():
+def test_points_and_volume_are_copied_from_the_previous_board():
     scene = Scene(*shelf(), LOW)
     (side,) = sides = scene.sides()
     frame = with_copies(scene.frame, sides)
@@ -148,14 +141,14 @@ def test_points_and_volume_are_copied_from_one_board_before():
     assert not out.free[1:].any()
 
 
-def test_a_lone_front_is_that_of_a_chest():
+def test_a_lone_front_becomes_a_box():
     scene = Scene(*front(), frames((0, -0.5, 0.4), (0.1, -0.5, 0.4)))
     body = lone_front(THING, scene.frame, scene.seen, scene.room)
     np.testing.assert_allclose(np.ptp(body.vertices, axis=0), [0.5, 0.5, 0.5], atol=0.03)
     assert body.vertices[:, 1].min() == pytest.approx(0.0, abs=0.01)  # the front stays where it was seen
 
 
-def test_a_chest_is_no_deeper_than_the_space_before_the_wall_or_what_rays_left():
+def test_a_box_ends_at_the_wall_or_at_free_space():
     posed = frames((0, -0.5, 0.4), (0.1, -0.5, 0.4))
     scene = Scene(*front(), posed)
     wall = replace(scene.room.found.base[0], surface=Plane(np.array([0, -1.0, 0, 2.3]), np.zeros((3, 3))))
@@ -167,14 +160,14 @@ def test_a_chest_is_no_deeper_than_the_space_before_the_wall_or_what_rays_left()
     assert np.ptp(body.vertices[:, 1]) == pytest.approx(0.2, abs=0.06)
 
 
-def test_a_sheet_that_rays_passed_behind_is_a_sheet():
+def test_a_sheet_with_free_space_behind_is_no_front():
     scene = Scene(*front(), frames((0, -0.5, 0.4), (0.1, -0.5, 0.4))).with_free(
         (-0.5, 2.0, 0.0), (0.5, 3.0, 1.0)
     )
     assert lone_front(THING, scene.frame, scene.seen, scene.room) is None
 
 
-def test_what_is_round_or_has_two_sides_is_no_front():
+def test_round_or_two_sided_objects_are_no_front():
     points, normals = shelf()
     scene = Scene(points, normals, LOW)
     assert lone_front(THING, scene.frame, scene.seen, scene.room) is None

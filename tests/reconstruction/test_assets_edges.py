@@ -1,4 +1,4 @@
-"""Meshes stay watertight for readers that know vertices by their positions."""
+"""Meshes stay watertight for readers that merge vertices by position."""
 
 import numpy as np
 import pytest
@@ -20,12 +20,12 @@ def joined(*solids: Solid) -> Solid:
 
 
 def is_watertight(solid: Solid) -> bool:
-    """As a reader sees it that merges vertices at one place."""
+    """Merge vertices by position, as readers do."""
     return trimesh.Trimesh(solid.vertices.astype(np.float32), solid.faces, process=True).is_watertight
 
 
 def test_two_boxes_that_touch_along_an_edge():
-    """The second one stands beside the first one's edge, 10 cm of which both have."""
+    """They share 10 cm of an edge."""
     first = box_solid(np.zeros(3), np.array([0.1, 0.1, 0.2]))
     second = box_solid(np.array([0.1, 0.1, 0.0]), np.array([0.2, 0.2, 0.2]))
     touching = joined(first, second)
@@ -39,7 +39,7 @@ def test_two_boxes_that_touch_along_an_edge():
     np.testing.assert_array_equal(again.faces.shape, mended.faces.shape)
 
 
-def test_faces_back_to_back_and_faces_without_area_go():
+def test_opposite_and_degenerate_faces_are_dropped():
     box = box_solid(np.zeros(3), np.full(3, 0.1))
     fin = np.array([[0, 3, 5], [0, 5, 3], [2, 2, 7], [2, 7, 2]], np.int32)
     mended = with_simple_edges(Solid(box.vertices, np.concatenate([box.faces, fin])))
@@ -48,14 +48,14 @@ def test_faces_back_to_back_and_faces_without_area_go():
     assert mended.volume == pytest.approx(1e-3)
 
 
-def test_what_is_watertight_keeps_its_surface_and_what_is_open_comes_back():
+def test_watertight_meshes_keep_their_surface_and_open_ones_are_returned():
     box = box_solid(np.zeros(3), np.full(3, 0.1))
     assert with_simple_edges(box).volume == pytest.approx(1e-3)
     opened = Solid(box.vertices, box.faces[:-1])
     assert with_simple_edges(opened) is opened
 
 
-def test_what_a_cut_left_in_the_same_place_is_one_in_the_file(tmp_path):
+def test_corners_at_one_position_are_merged_in_the_file(tmp_path):
     """A hull keeps corners that float32 does not tell apart; the file has them once, and no hole between them."""
     box = box_solid(np.zeros(3), np.array([0.3, 0.2, 0.1]))
     corner = box.vertices[-1]

@@ -1,4 +1,4 @@
-"""What the fused surface says of a thing: which depth strays from it, and what stands out from a wall."""
+"""The fused surface of an object: rejection of depth pixels, reliefs on walls."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ BOX = Instance(2, "box", 0.5, np.array([0, 0, 0.1]), 0.0, np.array([0.3, 0.3, 0.
 
 @pytest.fixture(scope="module")
 def room():
-    """A box on a floor, drawn into frames; every vertex above the floor is the box's."""
+    """A box on a floor, drawn into frames; all vertices above the floor are the box's."""
     surface = surface_from(
         merged(
             sheet((-1, -1, 0), (2, 0, 0), (0, 2, 0), (90, 90, 90)),
@@ -35,7 +35,7 @@ def room():
     return surface, posed, depth, InstanceSet(owner, (), (BOX,), ids)
 
 
-def test_depth_off_the_surface_of_its_thing_is_not_believed(room):
+def test_depth_off_the_fused_surface_is_dropped(room):
     surface, posed, depth, found = room
     pixels = prepare_pixels(posed, depth, found.id_maps)
     shown = (pixels.ids == 2) & (pixels.depth > 0)
@@ -43,14 +43,14 @@ def test_depth_off_the_surface_of_its_thing_is_not_believed(room):
     assert (without_strays(pixels, posed, depth.camera, surface, found).depth[shown] > 0).mean() > 0.97
     flying = np.argwhere(shown)[::7]
     smeared = pixels.depth.copy()
-    smeared[tuple(flying.T)] += 0.5  # behind the box, as at an outline
+    smeared[tuple(flying.T)] += 0.5  # behind the box, as flying pixels
     kept = without_strays(replace(pixels, depth=smeared), posed, depth.camera, surface, found).depth
     assert (kept[tuple(flying.T)] == 0).mean() > 0.97
     others = pixels.ids != 2
     np.testing.assert_array_equal(kept[others], smeared[others])
 
 
-def test_a_surface_that_is_elsewhere_does_not_judge(room):
+def test_a_displaced_surface_drops_nothing(room):
     surface, posed, depth, found = room
     pixels = prepare_pixels(posed, depth, found.id_maps)
     moved = replace(surface, vertices=surface.vertices + np.float32(0.5))
@@ -59,7 +59,7 @@ def test_a_surface_that_is_elsewhere_does_not_judge(room):
     )
 
 
-def test_samples_cover_a_thing_evenly_whatever_its_triangles(room):
+def test_samples_are_even_whatever_the_triangles(room):
     surface, _, _, found = room
     samples = sample_surface(2, surface, found)
     on_top = np.abs(samples[:, 2] - 0.2) < 1e-4
@@ -70,7 +70,7 @@ def test_samples_cover_a_thing_evenly_whatever_its_triangles(room):
     assert len(sample_surface(7, surface, found)) == 0
 
 
-def test_a_relief_reaches_from_the_wall_to_what_was_seen():
+def test_a_relief_reaches_from_the_wall_to_the_seen_points():
     """A shelf: a board 60 cm wide and 20 cm deep seen from above, and a front edge 4 cm high."""
     rng = np.random.default_rng(0)
     top = np.column_stack([rng.uniform(-0.3, 0.3, 4000), rng.uniform(-0.2, 0, 4000), np.full(4000, 0.04)])
@@ -84,7 +84,7 @@ def test_a_relief_reaches_from_the_wall_to_what_was_seen():
     assert (uses == 2).all()
 
 
-def test_parts_of_a_relief_stand_out_as_far_as_they_were_seen():
+def test_parts_of_a_relief_have_their_own_depths():
     """A board 3 cm thick with a peg 9 cm long."""
     rng = np.random.default_rng(0)
     board = np.column_stack([rng.uniform(-0.2, 0.2, 6000), np.full(6000, -0.03), rng.uniform(0, 0.1, 6000)])
@@ -95,7 +95,7 @@ def test_parts_of_a_relief_stand_out_as_far_as_they_were_seen():
     assert relief(np.zeros((0, 3)), 0.0, AssetsConfig()) is None
 
 
-def test_a_mound_reaches_from_the_support_to_what_was_seen():
+def test_a_mound_reaches_from_the_support_to_the_seen_points():
     """A plate whose rim rises from 1 to 2 cm."""
     rng = np.random.default_rng(0)
     radius, turn = 0.12 * np.sqrt(rng.uniform(0, 1, 8000)), rng.uniform(0, 2 * np.pi, 8000)
@@ -108,7 +108,7 @@ def test_a_mound_reaches_from_the_support_to_what_was_seen():
 
 
 def shown_beyond(room, low_m):
-    """Return the room's things with id maps that show the box only where x and y are at least `low_m`."""
+    """Return the instances with id maps that show the box only where x and y are at least `low_m`."""
     _, posed, depth, found = room
     camera = depth.camera
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
@@ -123,8 +123,8 @@ def shown_beyond(room, low_m):
 @pytest.mark.parametrize(
     ("furniture_m", "how"), [(0.5, "observed+relief"), (0.15, "box-fallback")], ids=["small", "furniture"]
 )
-def test_a_thing_of_which_id_maps_leave_little_is_as_large_as_its_surface(room, furniture_m, how):
-    """Borders that snap to edges of color take most of what is a few pixels in each frame."""
+def test_an_object_with_few_pixels_is_as_large_as_its_fused_surface(room, furniture_m, how):
+    """Borders that snap to color edges remove most of an object of few pixels."""
     surface, posed, depth, _ = room
     config = AssetsConfig(furniture_m=furniture_m)
     scene = gather_evidence(posed, depth, surface, shown_beyond(room, 0.05), config, NO_PROGRESS)

@@ -1,4 +1,4 @@
-"""Mesh files: axes, texture orientation, round trip, equal bytes."""
+"""Mesh files: axes, texture orientation, round trips, determinism."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_glb_bytes_are_deterministic(mesh, tmp_path):
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
 
 
-def test_a_damaged_glb_is_named(tmp_path):
+def test_the_error_of_a_damaged_glb_names_the_file(tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"glTF nonsense")
     with pytest.raises(BundleError, match=r"bad\.glb"):
         read_glb(tmp_path / "bad.glb")

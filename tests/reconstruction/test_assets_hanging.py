@@ -1,4 +1,4 @@
-"""Flat things on walls become slabs; what the image's edge cut goes on, what was seen whole does not."""
+"""Flat objects on walls become slabs; cropped sides are extended, seen ones are not."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ WALL = BaseEntity(1, "wall", Plane(np.array([0, -1.0, 0, 2.0]), np.zeros((3, 3))
 
 
 def slab(frame: ObjectFrame, posed: PosedFrames, config: AssetsConfig | None = None, blind_rows: int = 0):
-    """Ask for the slab; instance maps show wall all over but in the uppermost `blind_rows`, where nothing is known."""
+    """Fit the slab; instance maps show wall everywhere but in the uppermost `blind_rows`, where nothing is known."""
     maps = np.ones((len(posed.images), 240, 320), np.uint16)
     maps[:, :blind_rows] = 0
     found = InstanceSet(np.zeros(0, np.int32), (WALL,), (), maps)
@@ -51,8 +51,8 @@ def test_a_picture_seen_whole_is_a_slab_of_its_size():
     assert found.body.volume == pytest.approx(np.prod(size_of(found)))
 
 
-def test_a_picture_cut_at_the_top_goes_on_to_a_square():
-    """The camera is at z = 0.66: the image ends at z = 1.51, just above what was seen of the picture."""
+def test_a_picture_cropped_at_the_top_becomes_square():
+    """The camera is at z = 0.66: the image ends at z = 1.51, just above the seen part of the picture."""
     low_eye = (0.0, 0.0, 0.655)
     found = slab(seen(), frames(low_eye, low_eye))
     assert found.completed
@@ -60,8 +60,8 @@ def test_a_picture_cut_at_the_top_goes_on_to_a_square():
     assert found.body.vertices[:, 2].min() == pytest.approx(0.0, abs=0.02)  # only the unseen side moves
 
 
-def test_what_few_frames_saw_belongs_to_it():
-    """The upper third is at the image's edge, in one of fifty frames: it is as much part of the picture."""
+def test_a_part_in_few_frames_belongs_to_the_picture():
+    """The upper third is at the image border, in one of fifty frames."""
     frame = seen(height=0.3)
     rare = frame.points[:, 2] > 0.2
     keep = ~rare | (np.random.default_rng(1).random(len(rare)) < 0.3)
@@ -73,13 +73,13 @@ def test_what_few_frames_saw_belongs_to_it():
     assert size_of(found) == pytest.approx([0.8, 0.03, 0.3], abs=0.03)
 
 
-def test_two_frames_that_saw_wall_beyond_end_it():
+def test_wall_in_two_frames_stops_the_extension():
     found = slab(seen(), frames((0.0, 0.0, 0.655), *TWICE))
     assert not found.completed
 
 
-def test_an_image_that_goes_on_without_depth_is_no_wall():
-    """Along the image's edge depth is missing: nothing is known there, though the camera looked."""
+def test_unknown_pixels_beyond_a_side_are_no_wall():
+    """Depth is missing along the image border, though the camera sees it."""
     found = slab(seen(), frames(*TWICE), blind_rows=100)
     assert found.completed
 
@@ -90,7 +90,7 @@ def test_a_flush_print_gets_the_least_thickness():
     assert size_of(found)[1] == pytest.approx(config.flat_thickness_m)
 
 
-def test_what_is_thick_or_bent_or_stands_is_no_slab():
+def test_thick_bent_or_standing_objects_are_no_slabs():
     assert slab(seen(thickness=0.25), frames(*TWICE)) is None
     assert slab(seen(noise=0.05), frames(*TWICE)) is None
     standing = ObjectFrame(np.eye(4), seen().points, seen().normals, True, None)
@@ -120,14 +120,14 @@ def front(posed: PosedFrames) -> float | None:
 
 
 @pytest.mark.parametrize("thickness", [0.015, 0.035])
-def test_the_images_tell_how_far_a_picture_stands_out(thickness):
+def test_the_images_measure_the_thickness(thickness):
     def waves(x, z):
         return 120 + 60 * np.sin(x * 90) * np.sin(z * 70)
 
     assert front(filmed(waves, thickness, EYES)) == pytest.approx(thickness, abs=0.004)
 
 
-def test_where_views_nearly_agree_on_several_planes_the_nearest_is_the_front():
+def test_the_nearest_of_several_minima_is_the_front():
     near = np.linspace(5, 9, 13)
     curve = np.concatenate([near[::-1], [5.2, 6, 5.4, 4.9, 5.6, 6.5, 8, 9, 10, 11, 12, 13]])
     assert _first_minimum(curve) == 12
@@ -135,13 +135,13 @@ def test_where_views_nearly_agree_on_several_planes_the_nearest_is_the_front():
     assert _first_minimum(curve) == int(np.argmin(curve))
 
 
-def test_a_plain_picture_or_a_still_camera_tell_nothing():
+def test_a_plain_picture_or_a_still_camera_give_no_thickness():
     assert front(filmed(lambda x, z: 180.0, 0.03, EYES)) is None
     assert front(filmed(lambda x, z: 120 + 60 * np.sin(x * 90), 0.03, ((0.0, 0.0, 1.3),) * 6)) is None
 
 
-def test_a_plain_middle_taken_for_the_wall_does_not_shrink_the_picture():
-    """Depth found the frame 3 cm before the wall, and the plain middle on the wall."""
+def test_a_plain_middle_at_the_wall_does_not_shrink_the_picture():
+    """Depth has the frame 3 cm before the wall, and the plain middle on the wall."""
     frame = seen(noise=0.002)
     x, z = frame.points[:, 0], frame.points[:, 2]
     middle = (np.abs(x) < 0.32) & (z > 0.06) & (z < 0.24)
@@ -149,7 +149,7 @@ def test_a_plain_middle_taken_for_the_wall_does_not_shrink_the_picture():
     assert size_of(slab(frame, frames(*TWICE)))[[0, 2]] == pytest.approx([0.8, 0.3], abs=0.02)
 
 
-def test_what_only_its_outline_is_known_of_is_the_box_of_that_with_its_back_on_the_wall():
+def test_an_object_known_by_its_outline_is_a_box_on_the_wall():
     turn = np.radians(30)
     normal = np.array([np.cos(turn), np.sin(turn), 0.0])
     center = np.array([1.0, 2.0, 1.4]) + 0.1 * normal
@@ -168,4 +168,4 @@ def test_what_only_its_outline_is_known_of_is_the_box_of_that_with_its_back_on_t
         [0.2, 0.8, 0.3]
     )
     assert world.mean(axis=0) == pytest.approx(center)
-    assert frame.world_from_grid[:3, 1] == pytest.approx(-normal)  # its grid looks into the wall
+    assert frame.world_from_grid[:3, 1] == pytest.approx(-normal)  # +y of its grid points into the wall

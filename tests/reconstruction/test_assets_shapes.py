@@ -1,4 +1,4 @@
-"""Mass, materials, collision shapes of analytic solids."""
+"""Mass, materials and collision shapes of analytic solids."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_mass_of_a_box_is_exact():
 
 
 def test_inertia_of_a_shell_is_exact():
-    """Against a fine cloud of points on the surface of a bowl, which is thicker on one side than on the other."""
+    """Compared with dense points on the surface of an asymmetric bowl."""
     solid = bowl()
     area, center, inertia = shell_properties(solid)
     a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
@@ -83,7 +83,7 @@ def test_a_package_is_between_empty_and_full():
     assert 0.6 < high < 0.8
 
 
-def test_the_last_word_of_a_label_names_the_thing():
+def test_the_last_word_of_a_label_decides():
     extents = np.array([0.1, 0.1, 0.2])
     assert choose_material("milk carton", 0.9, np.zeros(3), extents).name == "paper"
     assert choose_material("mug", 0.9, np.zeros(3), extents).name == "ceramic"
@@ -97,7 +97,7 @@ def test_a_box_collides_as_one_hull_with_its_own_bounds():
     np.testing.assert_allclose(part.vertices.max(axis=0), [0.1, 0.2, 0.05], atol=1e-6)
 
 
-def test_a_cup_stays_hollow_and_ends_where_it_is_seen_to():
+def test_a_cup_stays_hollow_and_keeps_its_bounds():
     solid = bowl()
     parts = collision_parts(solid, AssetsConfig())
     every = np.concatenate([p.vertices for p in parts])
@@ -126,7 +126,7 @@ def test_decimation_keeps_the_solid_closed():
     assert light.volume == pytest.approx(ball.volume, rel=0.03)
 
 
-def test_decimation_does_not_eat_what_is_thinner_than_its_tolerance():
+def test_decimation_keeps_parts_thinner_than_its_tolerance():
     manifold3d = pytest.importorskip("manifold3d")
     ball = from_manifold(manifold3d.Manifold.sphere(0.002, 128))
     light = _simplify_manifold(ball, 100, 0.01)
@@ -180,7 +180,7 @@ def _field_of(boxes, voxel_m=0.01):
     return SimpleNamespace(distance=distance.astype(np.float32), origin=np.full(3, -0.05), voxel_m=voxel_m)
 
 
-def test_legs_that_lost_their_joint_stay_and_reach_the_top():
+def test_detached_legs_stay_and_reach_the_top():
     from reconstruction.assets.solid import extract
 
     top = ((0.0, 0.0, 0.40), (1.0, 0.6, 0.46))
@@ -194,8 +194,8 @@ def test_legs_that_lost_their_joint_stay_and_reach_the_top():
     assert near_leg[:, 2].max() >= 0.395  # no gap of 3 cm below the top
 
 
-def test_the_rail_of_a_back_whose_posts_were_not_seen_is_no_crumb():
-    """It has less than a hundredth of the thing's volume, but much of what was seen of the thing lies on it."""
+def test_a_detached_rail_with_many_seen_points_is_no_crumb():
+    """It has less than a hundredth of the volume, but many of the seen points."""
     from reconstruction.assets.solid import extract
 
     seat, rail = ((0.0, 0.0, 0.0), (1.0, 0.6, 0.30)), ((0.05, 0.0, 0.44), (0.95, 0.03, 0.49))

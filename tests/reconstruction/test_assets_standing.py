@@ -1,4 +1,4 @@
-"""Things on a carrier: at which height they stand, and what of the carrier is only their smeared depth."""
+"""Contacts of objects with their carriers, and removal of depth bleeding from the carrier."""
 
 from dataclasses import replace
 
@@ -45,20 +45,20 @@ def carrier(height_at) -> SeenPoints:
     return seen(points[away.ravel() > 0])
 
 
-def test_a_plate_stands_at_the_foot_of_the_slope_that_its_depth_smears_onto_the_table():
+def test_a_plate_stands_at_the_foot_of_the_slope_of_its_depth_bleeding():
     table = carrier(lambda away: TOP_M + np.clip(0.016 - 0.6 * away, 0, None))
     level = support_height(PLATE, disc(0.11, TOP_M + 0.02), table, NOTHING)
     assert level == pytest.approx(TOP_M, abs=1e-3)
 
 
-def test_a_thing_on_a_tray_stands_on_it_and_not_on_what_is_around_the_tray():
+def test_an_object_on_a_tray_stands_on_the_tray():
     # The rim rises from 2 cm off the thing on; the tray's bottom beside it counts.
     tray = carrier(lambda away: np.where(away < 0.02, TOP_M, TOP_M + 0.04))
     level = support_height(PLATE, disc(0.11, TOP_M + 0.003), tray, NOTHING)
     assert level == pytest.approx(TOP_M, abs=1e-3)
 
 
-def test_a_thing_on_a_narrow_step_stays_on_the_step():
+def test_an_object_on_a_narrow_step_stays_on_the_step():
     # Two boards of one carrier, 6 cm apart in height: the lower one shows all around.
     steps = carrier(lambda away: np.where(away < 0.024, TOP_M, TOP_M - 0.06))
     level = support_height(PLATE, disc(0.11, TOP_M + 0.003), steps, NOTHING)
@@ -100,7 +100,7 @@ def stand(volume: ObjectVolume) -> ObjectVolume:
     return without_children(volume, frame, (Standing(5, 4, 0.0, True, outline, 0.1),), 0.01)
 
 
-def test_a_rise_that_is_only_around_a_thing_is_not_its_carrier():
+def test_a_rise_around_an_object_only_is_depth_bleeding():
     smeared = slab_with(lambda r: r < 0.12)
     made = stand(smeared)
     assert raised_columns(smeared) > 400
@@ -109,13 +109,13 @@ def test_a_rise_that_is_only_around_a_thing_is_not_its_carrier():
     assert (made.distance[20:60, 20:60, 10] < 0).all()
 
 
-def test_a_rim_that_goes_on_and_a_rim_with_nothing_beyond_it_stay():
+def test_a_wide_rim_and_a_rim_at_the_edge_stay():
     for ring in (lambda r: (r > 0.11) & (r < 0.2), lambda r: r > 0.11):
         rimmed = slab_with(ring)
         assert raised_columns(stand(rimmed)) == raised_columns(rimmed)
 
 
-def test_what_reaches_beyond_the_edge_of_its_carrier_makes_that_no_larger():
+def test_an_overhanging_object_does_not_enlarge_its_carrier():
     # A plate of 32 cm on a box of 12 cm that only one side of was seen, its top hidden.
     volume = slab_with(lambda r: r < 0)
     unknown = np.zeros(volume.distance.shape, bool)
@@ -139,24 +139,24 @@ def standing_at(*levels: float) -> dict[int, Standing]:
     return {k: Standing(k, 1, level, True, none, level + 0.1) for k, level in enumerate(levels, start=2)}
 
 
-def test_what_seems_to_sink_into_its_board_stands_where_the_others_do():
+def test_an_object_measured_too_low_is_raised_to_the_common_level():
     levels = [s.level_m for s in _agreed(standing_at(0.80, 0.802, 0.778, 0.801)).values()]
     assert levels == pytest.approx([0.8005] * 4, abs=1e-3)
 
 
-def test_what_stands_higher_or_on_another_board_keeps_its_level():
+def test_objects_at_other_levels_keep_theirs():
     agreed = _agreed(standing_at(0.80, 0.802, 0.825, 0.60))
     assert [agreed[k].level_m for k in (4, 5)] == [0.825, 0.60]
 
 
-def test_a_foot_that_a_rim_hides_is_on_the_floor_of_the_container():
+def test_an_occluded_foot_is_on_the_floor_of_the_container():
     can = Instance(6, "can", 0.5, np.array([0, 0, 0.46]), 0.0, np.array([0.07, 0.07, 0.11]), 4, False)
     assert _hidden_foot(can, 0.46, 0.515) == pytest.approx(0.405)
     assert _hidden_foot(can, 0.41, 0.515) is None  # its foot was seen
     assert _hidden_foot(can, 0.50, 0.515) is None  # hardly any of it was seen: the box may be wrong
 
 
-def test_nothing_of_a_thing_lies_behind_a_wall():
+def test_volume_behind_a_wall_is_free():
     volume = slab_with(lambda r: r < 0)
     frame = ObjectFrame(
         rigid(translation=np.array([1.0, 0, 0])), np.zeros((0, 3)), np.zeros((0, 3)), True, None
@@ -178,7 +178,7 @@ def test_nothing_of_a_thing_lies_behind_a_wall():
 
 
 def flat_on_its_support(rim) -> tuple[ObjectVolume, ObjectFrame]:
-    """7 mm of thing all over a support at z = 0, and 5 cm of it where `rim` of x and y says so."""
+    """7 mm of object all over a support at z = 0, and 5 cm of it where `rim` of x and y says so."""
     voxel = 0.005
     x, z = -0.2 + (np.arange(80) + 0.5) * voxel, -0.02 + (np.arange(20) + 0.5) * voxel
     a, b = np.meshgrid(x, x, indexing="ij")
@@ -194,12 +194,12 @@ def flat_on_its_support(rim) -> tuple[ObjectVolume, ObjectFrame]:
 
 
 def lowest_layer(volume: ObjectVolume, frame: ObjectFrame) -> np.ndarray:
-    """Where (nx, ny) the thing is solid just above its support."""
+    """Columns (nx, ny) where the object is solid just above its support."""
     made = _settle_on_support(volume, frame)
     return made.distance[:, :, int(np.searchsorted(made.centers(2), 0.0))] < 0
 
 
-def test_a_thin_floor_within_a_rim_stays_and_what_lies_as_flat_around_it_goes():
+def test_a_thin_floor_within_a_rim_stays_and_skirts_are_dropped():
     tray = flat_on_its_support(lambda x, y: (np.hypot(x, y) > 0.1) & (np.hypot(x, y) < 0.11))
     solid = lowest_layer(*tray)
     assert solid[40, 40]
@@ -208,7 +208,7 @@ def test_a_thin_floor_within_a_rim_stays_and_what_lies_as_flat_around_it_goes():
     assert not solid[40, 70:].any()
 
 
-def test_a_thin_floor_stays_below_what_stands_on_it_where_its_rim_was_seen_on_two_sides_only():
+def test_a_thin_floor_below_a_child_stays_with_half_a_rim():
     volume, frame = flat_on_its_support(
         lambda x, y: ((x > 0.1) & (x < 0.11) & (y < 0.11)) | ((y > 0.1) & (y < 0.11) & (x < 0.11))
     )
@@ -223,7 +223,7 @@ def test_a_thin_floor_stays_below_what_stands_on_it_where_its_rim_was_seen_on_tw
     assert not solid[2:10, :55].any()
 
 
-def test_a_thing_that_covers_its_carrier_stands_on_top_of_what_is_seen_of_its_sides():
+def test_an_object_that_covers_its_carrier_stands_on_top_of_the_seen_sides():
     outline = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
     x, z = np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(0.4, 0.44, 20))
     side = np.column_stack([x.ravel(), np.full(x.size, -0.098), z.ravel()])

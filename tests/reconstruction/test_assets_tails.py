@@ -1,4 +1,4 @@
-"""What seems to be behind a thing's far rim, because depth and ids err at outlines."""
+"""Removal of false surface behind the far rim of an object, where depth and ids err at outlines."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def reach(volume: ObjectVolume) -> float:
     return float(volume.centers(1)[inside.any(axis=(0, 2))].max())
 
 
-def test_what_a_few_frames_draw_out_behind_the_far_rim_is_not_there():
+def test_surface_behind_the_far_rim_in_few_frames_is_dropped():
     _, good = fused(())
     frame, volume = fused(WRONG)
     assert frame.points[:, 1].max() > HALF + 0.03
@@ -77,7 +77,7 @@ def test_what_a_few_frames_draw_out_behind_the_far_rim_is_not_there():
     assert len(kept) > 0.95 * len(frame.points)
 
 
-def test_what_most_frames_see_behind_the_far_rim_stays():
+def test_surface_behind_the_far_rim_in_most_frames_stays():
     _, volume = fused(tuple(range(VIEWS)))
     assert reach(volume) > HALF + 0.03
 
@@ -87,7 +87,7 @@ def facing_y(*angles_deg: float) -> np.ndarray:
     return np.array([invert_rigid(rigid(translation=np.array(eye))) for eye in eyes])
 
 
-def test_away_is_known_of_cameras_on_one_side_only():
+def test_directions_need_cameras_on_one_side():
     away = away_directions(facing_y(-30, 0, 30), np.zeros(3))
     np.testing.assert_allclose(away[2], [0, 1], atol=1e-12)
     assert (away[:, 1] > 0.49).all()
@@ -95,7 +95,7 @@ def test_away_is_known_of_cameras_on_one_side_only():
 
 
 @pytest.mark.parametrize("change", ["seen by many", "seen inside the outline", "a large part"])
-def test_a_part_of_the_thing_is_no_tail(change):
+def test_a_part_of_the_object_is_no_tail(change):
     near = np.zeros((40, 40, 10), bool)
     near[:, :20] = True
     support, inner = np.where(near, 30, 0), np.where(near, 20, 0)
@@ -121,7 +121,7 @@ def test_a_part_of_the_thing_is_no_tail(change):
         np.testing.assert_array_equal(behind_rims(near, support, inner, shadowed, away), tail)
 
 
-def test_whiskers_go_and_handles_stay():
+def test_whiskers_are_cut_and_handles_stay():
     field = np.full((60, 60, 40), 0.01, np.float32)
     field[10:50, 10:40, 5:35] = -0.01
     whole = field.copy()
@@ -133,7 +133,7 @@ def test_whiskers_go_and_handles_stay():
     np.testing.assert_array_equal(without_whiskers(handle, 0.005, top=False), handle)
 
 
-def test_only_what_carries_nothing_else_may_end_in_a_tip():
+def test_tips_at_the_top_are_cut_on_request_only():
     field = np.full((60, 60, 40), 0.01, np.float32)
     field[10:50, 10:40, 5:30] = -0.01
     field[30:32, 20:22, 30:36] = -0.01

@@ -357,9 +357,9 @@ def test_inpainting_fills_holes_and_nothing_else():
 
 
 def test_wrong_names_and_values_are_said():
-    with pytest.raises(UsageError, match="no strategy 'best'"):
+    with pytest.raises(UsageError, match=r"avo\.strategy=best: there is no such backend"):
         load_strategy("best")
-    with pytest.raises(UsageError, match="no inpainter"):
+    with pytest.raises(UsageError, match=r"avo\.inpainting=magic: there is no such backend"):
         load_inpainter("magic")
     with pytest.raises(ValueError, match=r"avo\.views"):
         AvoConfig(views=0)

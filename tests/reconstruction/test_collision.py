@@ -1,4 +1,4 @@
-"""Collision shapes of hollow things and furniture: what is dropped into them stays, and rests on their true floor."""
+"""Collision shapes of hollow objects and furniture: dropped marbles stay and rest on the true floor."""
 
 import os
 import signal
@@ -119,7 +119,7 @@ def test_a_table_is_its_slab_and_its_legs():
     assert sum(hulls) == pytest.approx(solid.volume, rel=0.01)
 
 
-def test_a_ring_is_told_from_a_cup_and_a_slab():
+def test_a_ring_is_distinguished_from_a_cup_and_a_slab():
     tube = manifold3d.Manifold.cylinder(0.1, 0.05, 0.05, 48) - manifold3d.Manifold.cylinder(
         0.3, 0.04, 0.04, 48
     ).translate((0, 0, -0.1))
@@ -141,13 +141,13 @@ def decomposer():
     made.close()
 
 
-def test_a_crash_of_the_decomposer_costs_only_its_part(decomposer):
+def test_a_crash_of_the_decomposer_affects_one_part(decomposer):
     solid = box_solid(np.zeros(3), np.ones(3))
     assert decomposer.run(solid.vertices, solid.faces + 1_000_000, OPTIONS) is None
     assert len(decomposer.run(solid.vertices, solid.faces, OPTIONS)) == 1
 
 
-def test_a_decomposer_that_does_not_end_is_ended(decomposer):
+def test_a_hanging_decomposer_is_killed(decomposer):
     solid = box_solid(np.zeros(3), np.ones(3))
     decomposer.run(solid.vertices, solid.faces, OPTIONS)
     decomposer._limit_s = 0.3
@@ -165,7 +165,7 @@ def test_the_decomposer_starts_where_nothing_is_installed_but_coacd(decomposer, 
     assert len(decomposer.run(solid.vertices, solid.faces, OPTIONS)) == 1
 
 
-def test_a_machine_without_coacd_is_told_so(tmp_path, monkeypatch):
+def test_missing_coacd_is_an_error(tmp_path, monkeypatch):
     (tmp_path / "coacd.py").write_text("raise ImportError('libgomp.so.1 is not there')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     solid = box_solid(np.zeros(3), np.ones(3))
@@ -176,14 +176,14 @@ def test_a_machine_without_coacd_is_told_so(tmp_path, monkeypatch):
             Decomposer(python=python).run(solid.vertices, solid.faces, OPTIONS)
 
 
-def test_parts_are_kept_by_mesh_and_options(tmp_path, monkeypatch):
+def test_parts_are_cached_by_mesh_and_options(tmp_path, monkeypatch):
     _, bowl = made("bowl", 0)
     config, make = AssetsConfig(), {"levels": (), "progress": NO_PROGRESS, "name": "bowl"}
     first = kept_parts(tmp_path, bowl, config, **make)
     (file,) = tmp_path.glob("*.npz")
     for part, fresh in zip(first, collision_parts(bowl, config), strict=True):
         np.testing.assert_array_equal(part.vertices, fresh.vertices)
-    monkeypatch.setattr(part_cache, "collision_parts", None)  # nothing is cut again
+    monkeypatch.setattr(part_cache, "collision_parts", None)  # nothing is computed again
     for now, before in zip(
         kept_parts(tmp_path, bowl, replace(config, texture_min_px=64), **make), first, strict=True
     ):
@@ -197,7 +197,7 @@ def test_parts_are_kept_by_mesh_and_options(tmp_path, monkeypatch):
     assert len(kept_parts(tmp_path, bowl, config, **make)) == len(first)
 
 
-def test_what_failed_is_not_kept(tmp_path, monkeypatch):
+def test_failures_are_not_cached(tmp_path, monkeypatch):
     _, bookcase = made("bookcase", 0)
     monkeypatch.setattr(build, "decompose", lambda *arguments: None)
     monkeypatch.setattr(build, "_sorted_out", lambda pieces, *arguments: ([], pieces))
@@ -207,7 +207,7 @@ def test_what_failed_is_not_kept(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.npz"))
 
 
-def test_what_was_not_used_longest_is_forgotten_first(tmp_path, monkeypatch):
+def test_the_least_recently_used_parts_are_deleted(tmp_path, monkeypatch):
     monkeypatch.setattr(part_cache, "_MOST_KEPT", 2)
     make = {"levels": (), "progress": NO_PROGRESS, "name": "box"}
     boxes = [box_solid(np.zeros(3), np.full(3, size)) for size in (1.0, 1.1, 1.2)]
@@ -264,7 +264,7 @@ def _primitive_meshes():
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.0008])
 @pytest.mark.parametrize("name", ["box", "can", "lying can", "ball", "sausage"])
-def test_what_fits_a_primitive_collides_as_it(name, noise_m):
+def test_a_solid_that_fits_a_primitive_collides_as_it(name, noise_m):
     trimesh = pytest.importorskip("trimesh")
     mesh, lying, shape, size = _primitive_meshes()[name]
     solid = _turned(mesh, noise_m, lying)
@@ -281,7 +281,7 @@ def test_what_fits_a_primitive_collides_as_it(name, noise_m):
     assert max(gaps) < BOUND_M + 0.0015  # the points lie up to that far apart
 
 
-def test_what_fits_no_primitive_is_none():
+def test_other_solids_are_no_primitives():
     trimesh = pytest.importorskip("trimesh")
     egg = trimesh.creation.icosphere(3, 0.04).apply_scale((1.0, 1.0, 1.3))
     others = [egg, trimesh.creation.cone(0.05, 0.1), trimesh.creation.cylinder(0.05, 0.1, sections=6)]
@@ -292,7 +292,7 @@ def test_what_fits_no_primitive_is_none():
         assert fitted_primitive(made(name, 0)[1]) is None
 
 
-def test_a_primitive_ends_where_things_stand_on_it():
+def test_a_primitive_ends_at_contact_levels():
     solid = _turned(_fine_box((0.2, 0.12, 0.07)))
     assert fitted_primitive(solid, (0.069,)) is not None
     assert fitted_primitive(solid, (0.06,)) is None

@@ -2,17 +2,13 @@
 
 import importlib.metadata
 import json
-import os
-import subprocess
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 from chat_server import Server
 
-from reconstruction import doctor, doctor_learned
-from reconstruction.doctor import Check, format_checks, run_checks
+from reconstruction.doctor import Check, format_checks, learned, machine, packages, process, run_checks
 
 
 @pytest.fixture(scope="module")
@@ -42,24 +38,19 @@ def test_checks_are_json(checks: dict[str, Check]) -> None:
     assert {"name", "ok", "detail", "fix", "required"} == set(json.loads(text)[0])
 
 
-def test_rendering_is_absent_without_a_vulkan_driver(tmp_path: Path) -> None:
-    hidden = dict.fromkeys(("VK_ICD_FILENAMES", "VK_DRIVER_FILES"), str(tmp_path / "none.json"))
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", doctor._RENDER_CODE],
-        env={**os.environ, **hidden},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert run.returncode != 0
-    assert "render" in run.stderr
+def test_rendering_is_absent_without_a_vulkan_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
+        monkeypatch.setenv(name, str(tmp_path / "none.json"))
+    code, _, err = process.wait(process.start_call("reconstruction.doctor.trials", "rendering"))
+    assert code != 0
+    assert "render" in err
 
 
 def test_unwritable_registry_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("a file where a folder should be")
     monkeypatch.setenv("SIMRECON_HOME", str(blocked))
-    check = doctor._registry()
+    check = machine.registry_check()
     assert not check.ok
     assert check.required
     assert str(blocked) in check.fix
@@ -69,27 +60,27 @@ def test_damaged_index_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     (tmp_path / "registry").mkdir()
     (tmp_path / "registry" / "index.sqlite").write_bytes(b"not a database at all" * 100)
     monkeypatch.setenv("SIMRECON_HOME", str(tmp_path))
-    check = doctor._registry()
+    check = machine.registry_check()
     assert not check.ok
     assert "damaged" in check.detail
 
 
 def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_TIME_LIMIT_S", 0.5)
-    check = doctor._finish("slow", doctor._start("import time; time.sleep(30)"), "wait", True)
+    monkeypatch.setattr(process, "TIME_LIMIT_S", 0.5)
+    check = process.finish("slow", process.start("import time; time.sleep(30)"), "wait", True)
     assert not check.ok
     assert "no answer" in check.detail
 
 
 def test_a_process_that_crashes_is_reported() -> None:
-    check = doctor._finish("crash", doctor._start("import os; os.kill(os.getpid(), 11)"), "repair", False)
+    check = process.finish("crash", process.start("import os; os.kill(os.getpid(), 11)"), "repair", False)
     assert not check.ok
     assert "signal 11" in check.detail
 
 
 def test_versions_compare_as_numbers() -> None:
-    assert doctor._numbers("2.13.0+cpu") > doctor._numbers("2.3")
-    assert doctor._numbers("0.61") < doctor._numbers("0.100.1")
+    assert packages.numbers("2.13.0+cpu") > packages.numbers("2.3")
+    assert packages.numbers("0.61") < packages.numbers("0.100.1")
 
 
 def test_table_names_what_is_missing_and_what_to_do() -> None:
@@ -107,7 +98,7 @@ def test_weights_are_looked_for_in_the_cache_of_the_hub(
 ) -> None:
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
     monkeypatch.setenv("HF_HOME", str(tmp_path))
-    checks = {check.name: check for check in doctor_learned.learned_checks()}
+    checks = {check.name: check for check in learned.learned_checks()}
     sam = checks["instances.masks=sam2"]
     assert not sam.ok
     assert not sam.required
@@ -115,9 +106,9 @@ def test_weights_are_looked_for_in_the_cache_of_the_hub(
     snapshot = tmp_path / "hub" / "models--facebook--sam2.1-hiera-small" / "snapshots" / "abc"
     snapshot.mkdir(parents=True)
     (snapshot / "config.json").write_text("{}")
-    assert not doctor_learned.has_weights("facebook/sam2.1-hiera-small")
+    assert not learned.has_weights("facebook/sam2.1-hiera-small")
     (snapshot / "model.safetensors").write_bytes(b"1")
-    assert doctor_learned.has_weights("facebook/sam2.1-hiera-small")
+    assert learned.has_weights("facebook/sam2.1-hiera-small")
     assert {"instances.masks=sam3", "instances.masks=mask2former", "instances.labels=clip"} <= set(checks)
 
 
@@ -126,9 +117,7 @@ def test_without_transformers_one_line_says_so(monkeypatch: pytest.MonkeyPatch) 
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    (check,) = (
-        c for c in doctor_learned.learned_checks() if "vlm" not in c.name and "generator" not in c.name
-    )
+    (check,) = (c for c in learned.learned_checks() if "vlm" not in c.name and "generator" not in c.name)
     assert "simrecon[models]" in check.fix
 
 
@@ -136,19 +125,19 @@ def test_the_endpoint_is_asked_for_its_models(monkeypatch: pytest.MonkeyPatch) -
     with Server() as server:
         monkeypatch.setenv("SIMRECON_VLM_URL", server.url)
         monkeypatch.setenv("SIMRECON_VLM_MODEL", "tiny-vl")
-        assert doctor_learned._endpoint().ok
+        assert learned._endpoint().ok
         monkeypatch.setenv("SIMRECON_VLM_MODEL", "large-vl")
-        other = doctor_learned._endpoint()
+        other = learned._endpoint()
         assert not other.ok
         assert "serves tiny-vl, not large-vl" in other.detail
         monkeypatch.setenv("SIMRECON_VLM_URL", server.url + "/nothing")
-        assert "does not list its models" in doctor_learned._endpoint().detail
+        assert "does not list its models" in learned._endpoint().detail
     monkeypatch.delenv("SIMRECON_VLM_URL")
-    assert "SIMRECON_VLM_URL" in doctor_learned._endpoint().fix
+    assert "SIMRECON_VLM_URL" in learned._endpoint().fix
 
 
 def test_packages_too_broken_to_look_are_no_crash() -> None:
-    (check,) = doctor._learned(doctor._start("import no_such_package"))
+    (check,) = process.finish_checks("learned", process.start("import no_such_package"))
     assert not check.ok
     assert not check.required
     assert "no_such_package" in check.detail

@@ -1,4 +1,4 @@
-"""What all formats share: bodies, folders, the command."""
+"""All export formats: bodies, folders, the command."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""The URDF export in PyBullet: every object with its size, mass, inertia and friction, at its place."""
+"""The URDF export in PyBullet: size, mass, inertia, friction and pose of every object."""
 
 import numpy as np
 import pytest

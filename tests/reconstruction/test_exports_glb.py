@@ -1,4 +1,4 @@
-"""The GLB export: valid glTF, named nodes with their facts, everything at its place."""
+"""The GLB export: valid glTF, named nodes with extras, correct poses."""
 
 import json
 import struct
@@ -63,7 +63,7 @@ def test_nodes_carry_their_facts(bundle, file):
 
 
 def test_files_of_others_keep_their_own_nodes(bundle, file, tmp_path):
-    """A .glb with two nodes and no texture, as other tools write them, goes below the named node."""
+    """The nodes of a .glb with two nodes and no texture become children of the named node."""
     from dataclasses import replace
 
     from reconstruction.exports.glb import write_glb_scene
@@ -90,7 +90,7 @@ def test_khronos_validator_finds_nothing(file):
 
 @pytest.fixture(scope="module")
 def in_blender(file):
-    """What Blender finds in the file: in a Python of its own, as its wheel wants an older NumPy than this one."""
+    """Blender reads the file, in a separate Python, since its wheel needs an older NumPy."""
     python = blender_python()
     if python is None:
         pytest.skip("Blender as a module is not installed (tools/setup_blender.sh)")

@@ -1,4 +1,4 @@
-"""The MJCF export in MuJoCo itself: what is there, where, how heavy, and that it rests."""
+"""The MJCF export in MuJoCo: bodies, poses, masses, and stability."""
 
 import itertools
 
@@ -61,7 +61,7 @@ def _box(model, data, body, group):
 
 
 def _rest(model, seconds):
-    """Return {name: (moved m, turned deg)} of all moving bodies after a time without damping."""
+    """Simulate without damping; return {name: (moved m, turned deg)} of all moving bodies."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     bodies = [b for b in range(1, model.nbody) if model.body_weldid[b] != 0]
@@ -146,7 +146,7 @@ def test_generated_rooms_with_stacks_and_containers_rest_for_ten_seconds(seed, o
 
 
 def test_a_pushed_mug_slides_and_then_stops(bundle, model):
-    """Friction brakes: from 1 m/s it comes to rest within v^2 / 2 mu g, about 13 cm, and not at once."""
+    """From 1 m/s friction stops it after v^2 / 2 mu g, about 13 cm."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mug = model.body(names(bundle)[MUG])

@@ -1,4 +1,4 @@
-"""The URDF export in yourdfpy: one file an object, and the scene."""
+"""The URDF export in yourdfpy: one file per object, and the scene."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def scene(folder):
 
 
 def _box(scene, name):
-    """Return the world box (2, 3) of the meshes under a link."""
+    """Return the world bounding box (2, 3) of the meshes of a link."""
     below = [n for n in scene.graph.nodes_geometry if scene.graph.transforms.parents[n] == name]
     boxes = [
         scene.geometry[scene.graph[n][1]].copy().apply_transform(scene.graph[n][0]).bounds for n in below

@@ -1,4 +1,4 @@
-"""The USD export read by usd-core: valid, physical, and where the bundle says."""
+"""The USD export in usd-core: valid stage, physics schemas, correct poses."""
 
 import itertools
 
@@ -42,7 +42,7 @@ def test_metres_kilograms_z_up_and_gravity(stage):
 
 
 def _points(prim):
-    """Return the points of a mesh, or the corners of a box, in the space of its parent."""
+    """Return the points of a mesh or the corners of a box, in the parent's space."""
     if not prim.IsA(UsdGeom.Cube):
         return np.asarray(UsdGeom.Mesh(prim).GetPointsAttr().Get())
     low, high = np.array(UsdGeom.Cube(prim).GetExtentAttr().Get())

@@ -195,7 +195,7 @@ def test_evaluation_forgives_exposure_and_nothing_else(small_capture):
 
 
 def test_unknown_backend_is_wrong_use_and_missing_gsplat_is_said():
-    with pytest.raises(UsageError, match="cpu and gsplat"):
+    with pytest.raises(UsageError, match="Built in: cpu, gsplat"):
         load_backend("opengl")
     import importlib.util
 

@@ -1,4 +1,4 @@
-"""The clients of generation services against servers that speak each protocol, and break it in every way."""
+"""Clients of generation services against servers that follow each protocol, or violate it."""
 
 import json
 import re
@@ -9,7 +9,6 @@ import pytest
 from generation_servers import HunyuanServer, RodinServer, as_glb, thing_mesh
 from local_server import reply
 
-from reconstruction import doctor_learned
 from reconstruction.assets import AssetsConfig
 from reconstruction.assets.generation import (
     GenerationError,
@@ -27,6 +26,7 @@ from reconstruction.assets.generation.pictures import _without_specks
 from reconstruction.assets.generation.records import Records
 from reconstruction.assets.generation.rodin import Rodin
 from reconstruction.assets.generation.service import ServiceLimits
+from reconstruction.doctor.learned import generator_checks
 from registry.errors import EnvironmentMissing, UsageError
 from synthetic.containers import make_mug
 
@@ -86,7 +86,7 @@ def test_rodin_is_sent_pictures_of_the_object_alone(rodin):
     assert set(rodin.keys) == {"Bearer secret-key"}
 
 
-def test_specks_beside_an_object_are_no_part_of_its_picture():
+def test_specks_are_removed_from_pictures():
     mask = np.zeros((40, 60), bool)
     mask[5:25, 5:25] = mask[5:25, 40:50] = mask[35:37, 55:58] = True
     kept = _without_specks(mask)
@@ -118,7 +118,7 @@ def test_rodins_cost_is_that_of_its_tier(rodin):
         ("/files/mesh?signature=1", [(503, {}, b"")]),
     ],
 )
-def test_a_busy_service_is_asked_again(rodin, path, answers):
+def test_a_busy_service_gets_a_second_request(rodin, path, answers):
     rodin.broken[path] = list(answers)
     assert rodin_client(rodin).generate(pictures(), Job()) == MESH
 
@@ -151,7 +151,7 @@ def test_a_busy_service_is_asked_again(rodin, path, answers):
         ("/files/mesh?signature=1", (200, {}, b"glTF" + bytes(3 << 20)), GenerationError, "more than 2 MB"),
     ],
 )
-def test_what_goes_wrong_with_rodin_is_said_in_a_line(rodin, path, answer, error, message):
+def test_errors_of_rodin_are_one_line(rodin, path, answer, error, message):
     rodin.broken[path] = [answer]
     client = rodin_client(rodin, ServiceLimits(timeout_s=0.4, max_bytes=2 << 20, pause_s=0.01, poll_s=0.01))
     with pytest.raises(error, match=f"(?s){message}") as caught:
@@ -162,7 +162,7 @@ def test_what_goes_wrong_with_rodin_is_said_in_a_line(rodin, path, answer, error
     assert len(rodin.sent("/api/v2/rodin")) == 1
 
 
-def test_a_task_that_takes_too_long_is_gone_on_with_by_the_next_run(rodin, tmp_path):
+def test_a_late_task_is_resumed_by_the_next_run(rodin, tmp_path):
     rodin.states = ["Generating"]
     limits = ServiceLimits(timeout_s=0.15, max_bytes=2 << 20, pause_s=0.01, poll_s=0.02)
     first = Records(tmp_path, rodin_client(rodin, limits))
@@ -176,7 +176,7 @@ def test_a_task_that_takes_too_long_is_gone_on_with_by_the_next_run(rodin, tmp_p
     assert not list(tmp_path.glob("*.pending.json"))
 
 
-def test_a_task_that_the_service_forgot_is_given_up(rodin, tmp_path):
+def test_a_task_unknown_to_the_service_is_dropped(rodin, tmp_path):
     records = Records(tmp_path, rodin_client(rodin))
     rodin.broken["/api/v2/status"] = [(404, {}, b"no such subscription")]
     with pytest.raises(GenerationError, match="no such subscription"):
@@ -192,7 +192,7 @@ def test_hunyuan_answers_with_the_file(hunyuan):
     assert (body["texture"], body["seed"], body["type"]) == (True, 7, "glb")
 
 
-def test_hunyuan_can_be_asked_until_it_is_done(hunyuan):
+def test_hunyuan_is_polled_until_done(hunyuan):
     job = Job()
     assert hunyuan_client(hunyuan, poll=True).generate(pictures(), job) == MESH
     assert [path for _, path, _ in hunyuan.requests] == ["/send"] + ["/status/7"] * 3
@@ -207,7 +207,7 @@ def test_hunyuan_can_be_asked_until_it_is_done(hunyuan):
         ("hang", "no answer in time"),
     ],
 )  # fmt: skip
-def test_what_goes_wrong_with_hunyuan_is_said_in_a_line(hunyuan, answer, message):
+def test_errors_of_hunyuan_are_one_line(hunyuan, answer, message):
     hunyuan.broken["/generate"] = [answer]
     client = hunyuan_client(
         hunyuan, ServiceLimits(timeout_s=0.3, max_bytes=2 << 20, pause_s=0.01, poll_s=0.01)
@@ -226,13 +226,13 @@ def test_what_goes_wrong_with_hunyuan_is_said_in_a_line(hunyuan, answer, message
         (reply({"status": "completed"}), r"no \.glb"),
     ],
 )
-def test_what_goes_wrong_while_asking_hunyuan(hunyuan, answer, message):
+def test_errors_while_polling_hunyuan(hunyuan, answer, message):
     hunyuan.broken["/status/7"] = [answer]
     with pytest.raises(GenerationError, match=message):
         hunyuan_client(hunyuan, poll=True).generate(pictures(), Job())
 
 
-def test_nobody_at_the_address():
+def test_an_unreachable_service():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{free.getsockname()[1]}"
@@ -241,7 +241,7 @@ def test_nobody_at_the_address():
         client.generate(pictures(), Job())
 
 
-def test_what_is_kept_is_neither_asked_nor_paid_again(rodin, tmp_path, monkeypatch):
+def test_recorded_meshes_are_not_requested_or_paid_again(rodin, tmp_path, monkeypatch):
     records = Records(tmp_path, rodin_client(rodin))
     assert records.generate(pictures()) == MESH
     rodin.close()
@@ -264,7 +264,7 @@ def test_what_is_kept_is_neither_asked_nor_paid_again(rodin, tmp_path, monkeypat
     assert (tmp_path / record["pictures"][0]).is_file()
 
 
-def test_records_differ_by_what_shapes_the_mesh(rodin, tmp_path):
+def test_records_differ_by_the_inputs_of_the_mesh(rodin, tmp_path):
     mine = Records(tmp_path, rodin_client(rodin))
     mine.generate(pictures())
     assert mine.has(pictures())
@@ -272,13 +272,13 @@ def test_records_differ_by_what_shapes_the_mesh(rodin, tmp_path):
     assert not Records(tmp_path, rodin_client(rodin, tier="Sketch")).has(pictures())
 
 
-def test_a_damaged_note_of_a_task_is_no_task(tmp_path):
+def test_a_damaged_task_file_is_ignored(tmp_path):
     note = tmp_path / "x.pending.json"
     note.write_text('{"uuid": 3')
     assert records_module._read_task(note) is None
 
 
-def test_what_is_missing_is_said_before_anything_runs(tmp_path, monkeypatch):
+def test_missing_keys_and_packages_are_reported_first(tmp_path, monkeypatch):
     monkeypatch.setenv("SIMRECON_GENERATION_RECORDS", str(tmp_path))
     monkeypatch.delenv("SIMRECON_RODIN_KEY", raising=False)
     with pytest.raises(EnvironmentMissing, match="SIMRECON_RODIN_KEY"):
@@ -303,16 +303,16 @@ def test_what_is_missing_is_said_before_anything_runs(tmp_path, monkeypatch):
         (b"glTF" + bytes(100), "cannot be read"),
     ],
 )
-def test_a_mesh_that_is_none_is_said(data, message):
+def test_unreadable_meshes_are_errors(data, message):
     with pytest.raises(GenerationError, match=message):
         read_generated(data)
 
 
-def test_meshes_of_no_use_are_said():
+def test_degenerate_meshes_are_errors():
     mesh = thing_mesh(make_mug)
     holed = mesh.copy()
     holed.vertices[5] = np.nan
-    with pytest.raises(GenerationError, match="no numbers"):
+    with pytest.raises(GenerationError, match="not finite"):
         read_generated(as_glb(holed))
     flat = mesh.copy()
     flat.vertices[:, 2] = 0
@@ -328,7 +328,7 @@ def test_a_mesh_keeps_its_size_axes_and_colors():
     assert read.colors[:, 0].mean() > 3 * read.colors[:, 1].mean()
 
 
-def test_a_huge_mesh_is_made_light():
+def test_a_huge_mesh_is_decimated():
     mesh = thing_mesh(make_mug)
     while len(mesh.faces) < 70_000:
         mesh = mesh.subdivide()
@@ -337,15 +337,15 @@ def test_a_huge_mesh_is_made_light():
     np.testing.assert_allclose(read.extents, mesh.extents, rtol=0.01)
 
 
-def test_doctor_looks_for_generators(rodin, hunyuan, monkeypatch):
+def test_doctor_checks_generators(rodin, hunyuan, monkeypatch):
     monkeypatch.setattr("reconstruction.assets.generation.rodin.RODIN_URL", rodin.url)
     monkeypatch.setenv("SIMRECON_HUNYUAN3D_URL", hunyuan.url)
-    checks = {check.name: check for check in doctor_learned.generator_checks()}
+    checks = {check.name: check for check in generator_checks()}
     assert checks["assets.generator=rodin"].detail == "the account has 12.5 credits"
     assert checks["assets.generator=hunyuan3d"].ok
     assert not checks["assets.generator=trellis"].ok
     rodin.broken["/api/v2/check_balance"] = [(401, {}, b"who?")]
     monkeypatch.setenv("SIMRECON_HUNYUAN3D_URL", "http://127.0.0.1:9")
-    checks = {check.name: check for check in doctor_learned.generator_checks()}
+    checks = {check.name: check for check in generator_checks()}
     assert "refuses the key" in checks["assets.generator=rodin"].detail
     assert "nobody answers" in checks["assets.generator=hunyuan3d"].detail

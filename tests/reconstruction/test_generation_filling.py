@@ -1,4 +1,4 @@
-"""A generated mesh that fills what was looked into is told; the true one is not, nor where it is a little off."""
+"""Generated meshes that fill a seen hollow are rejected; true ones are accepted, slightly displaced ones, too."""
 
 import numpy as np
 import pytest
@@ -40,13 +40,13 @@ def near_of(mesh: trimesh.Trimesh) -> float:
 
 
 def filling(mesh: trimesh.Trimesh, free, near_m: float) -> float:
-    """How much of the volume that is made of a generated mesh is free."""
+    """Return the free share of the volume of a closed mesh."""
     body = manifold_of(closed_solid(read_generated(as_glb(mesh)), AssetsConfig(), 6000))
     return filled_share(body, free, near_m)
 
 
 @pytest.mark.parametrize(("make", "stands_at"), HOLLOW)
-def test_what_is_filled_is_told_and_what_is_a_little_off_is_not(make, stands_at):
+def test_filled_meshes_are_detected_and_displaced_ones_are_not(make, stands_at):
     mesh = thing_mesh(make, seed=1)
     free, near = free_around(mesh, cameras(stands_at)), near_of(mesh)
     assert filling(mesh, free, near) == 0.0
@@ -57,14 +57,14 @@ def test_what_is_filled_is_told_and_what_is_a_little_off_is_not(make, stands_at)
     assert filling(mesh.convex_hull, free, near) > BOUND
 
 
-def test_what_is_massive_may_be_massive():
+def test_massive_objects_are_accepted():
     mesh = thing_mesh(make_cabinet, seed=1)
     free, near = free_around(mesh, cameras(0.0)), near_of(mesh)
     assert filling(mesh, free, near) == 0.0
     assert filling(mesh.convex_hull, free, near) == 0.0
 
 
-def test_a_hollow_that_nobody_looked_into_may_be_filled():
+def test_an_unseen_hollow_may_be_filled():
     mesh = thing_mesh(make_bookcase, seed=1)
     behind = [eye * [1, -1, 1] for eye in cameras(0.0)]
     assert filling(mesh.convex_hull, free_around(mesh, behind), near_of(mesh)) == 0.0
@@ -79,7 +79,7 @@ def test_the_share_is_that_of_the_volume():
     assert share == pytest.approx(0.3 * 0.3 * 0.15 / 0.4**3, rel=0.05)
 
 
-def test_lanes_between_legs_count_though_none_is_wide():
+def test_narrow_free_lanes_between_legs_count():
     import manifold3d
 
     body = manifold3d.Manifold.cube((1.0, 1.0, 1.0))

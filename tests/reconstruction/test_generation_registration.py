@@ -1,4 +1,4 @@
-"""Meshes of unknown size, heading and place are put where they were seen from one side, and wrong ones are told."""
+"""Registration of meshes of unknown pose and scale to points seen from one side, and detection of wrong meshes."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def eyes_of(mesh, first: float) -> list[np.ndarray]:
 
 
 def seen_from(mesh, eyes, rng) -> SeenSurface:
-    """What of a mesh is seen from some places, with noise."""
+    """Return the points of a mesh that are seen from some positions, with noise."""
     points, face = trimesh.sample.sample_surface(mesh, 8_000, seed=0)
     normals = mesh.face_normals[face]
     visible = np.zeros(len(points), bool)
@@ -35,7 +35,7 @@ def seen_from(mesh, eyes, rng) -> SeenSurface:
 
 
 def free_around(mesh, eyes):
-    """How deep points are in the space that rays to some places pass through, to a voxel."""
+    """Return the depth of points in the space free of rays to some positions, to a voxel."""
     size = float(mesh.extents.max())
     voxel, low = size / 32, mesh.bounds[0] - 0.15 * size
     shape = np.ceil((mesh.bounds[1] + 0.15 * size - low) / voxel).astype(int)
@@ -78,7 +78,7 @@ def generated_from(mesh, scale: float, yaw: float, offset) -> tuple[np.ndarray, 
         (make_tray, 3.9, False),
     ],
 )
-def test_a_mesh_finds_its_place(make, yaw, exact):
+def test_a_mesh_is_registered(make, yaw, exact):
     rng = np.random.default_rng(int(100 * yaw))
     mesh = thing_mesh(make, seed=int(yaw * 10))
     scale, offset = rng.uniform(0.2, 3.0), rng.uniform(-1, 1, 3)
@@ -96,7 +96,7 @@ def test_a_mesh_finds_its_place(make, yaw, exact):
         assert cKDTree(dense).query(placed)[0].max() < 0.006
 
 
-def test_the_handle_of_a_mug_is_where_it_was_seen_or_where_nobody_looked():
+def test_the_handle_of_a_mug_is_where_it_was_seen_or_in_unseen_space():
     mesh = thing_mesh(make_mug, seed=1)
     for first in (0.0, 2.8):  # the handle points to +x: beside the mug, and behind it
         rng = np.random.default_rng(3)
@@ -112,7 +112,7 @@ def test_the_handle_of_a_mug_is_where_it_was_seen_or_where_nobody_looked():
         assert (free(placed) > 0.01).mean() < 0.02
 
 
-def test_without_a_support_the_top_or_the_bottom_may_be_what_was_seen():
+def test_without_a_support_top_or_bottom_may_be_the_seen_part():
     mesh = thing_mesh(make_cabinet)
     rng = np.random.default_rng(0)
     seen = seen_from(mesh, eyes_of(mesh, 0.4), rng)
@@ -128,7 +128,7 @@ WRONG = [(make_chair, make_mug), (make_mug, make_chair), (make_tray, make_bowl)]
 
 
 @pytest.mark.parametrize(("made", "there"), WRONG)
-def test_another_thing_is_told(made, there):
+def test_a_mesh_of_another_object_is_detected(made, there):
     mesh = thing_mesh(there, seed=1)
     eyes = eyes_of(mesh, 1.0)
     points, normals, _ = generated_from(thing_mesh(made, seed=2), 0.7, 1.0, np.zeros(3))
@@ -136,8 +136,8 @@ def test_another_thing_is_told(made, there):
     assert "of what was seen is farther than" in fit.fault(0.15, 0.1)
 
 
-def test_what_fills_seen_free_space_is_told():
-    """A massive block explains the outside of a bowl, not that one can look into it."""
+def test_a_mesh_in_free_space_is_detected():
+    """A massive block explains the outside of a bowl, but fills its free inside."""
     bowl = thing_mesh(make_bowl, seed=1)
     eyes = eyes_of(bowl, 1.0)
     low, high = bowl.bounds
@@ -152,7 +152,7 @@ def test_what_fills_seen_free_space_is_told():
         assert "where rays passed through" in fit.fault(0.15, 0.1)
 
 
-def test_same_input_same_bits():
+def test_results_are_deterministic():
     mesh = thing_mesh(make_tray)
     seen = seen_from(mesh, eyes_of(mesh, 0.4), np.random.default_rng(0))
     points, normals, _ = generated_from(mesh, 2.0, 1.0, np.zeros(3))

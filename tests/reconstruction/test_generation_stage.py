@@ -1,4 +1,4 @@
-"""The assets stage with a generator: what agrees with the video is used, what does not is rejected and said."""
+"""The assets stage with a generator: meshes that agree with the video are used, others rejected with a note."""
 
 import json
 import re
@@ -26,7 +26,7 @@ from synthetic.containers import make_bowl, make_mug
 from synthetic.furnishing import make_chair
 
 NAMES = ("can", "bowl", "book")
-EMPTY = Surface(*(np.zeros(0),) * 5, voxel_size_m=0.01, space=None)
+EMPTY = Surface(*(np.zeros((0, 3), kind) for kind in ("f4", "i4", "f4", "u1")), np.zeros(0, "f4"), 0.01, None)
 
 
 class ByPrompt(RodinServer):
@@ -97,7 +97,7 @@ def seen(small_capture):
 
 
 def fetch(capture, seen, config):
-    """Return what was fetched, with names in place of ids, and what was said."""
+    """Return the fetched meshes by name, and the notes."""
     notes, found = Notes(), instances_of(capture)
     names = {item.id: item.label for item in found.objects}
     fetched = fetch_meshes(found, capture.posed, seen, config, notes)
@@ -105,7 +105,7 @@ def fetch(capture, seen, config):
     return meshes, {names[number]: why for number, why in fetched.refused.items()}, notes.notes
 
 
-def test_what_agrees_is_used_and_what_does_not_is_rejected(small_capture, server):
+def test_agreeing_meshes_are_used_and_others_rejected(small_capture, server):
     notes, found = Notes(), instances_of(small_capture)
     config = config_of(server, generator_budget=1.5)
     assets = build_assets(small_capture.posed, small_capture.depth, EMPTY, found, config, progress=notes)
@@ -136,7 +136,7 @@ def test_what_agrees_is_used_and_what_does_not_is_rejected(small_capture, server
 
 
 def test_a_bowl_that_is_filled_is_rejected(small_capture, server):
-    """Even where nothing is asked of its surface: what was seen into is known to be empty."""
+    """Even without limits on its surface, as the inside is known to be free."""
     server.meshes["bowl"] = as_glb(true_mesh(small_capture, "bowl").convex_hull)
     config = config_of(server, generator_budget=1.5, generator_missed=1.0, generator_intruding=1.0)
     found = instances_of(small_capture)
@@ -149,7 +149,7 @@ def test_a_bowl_that_is_filled_is_rejected(small_capture, server):
     )
 
 
-def test_a_rerun_pays_nothing_and_gives_the_same_bytes(small_capture, seen, server):
+def test_a_rerun_pays_nothing_and_returns_the_same_bytes(small_capture, seen, server):
     first, refused, _ = fetch(small_capture, seen, config_of(server, generator_budget=5.0))
     assert set(first) == {"can", "book"}
     assert "no .glb" in refused["bowl"]
@@ -157,7 +157,7 @@ def test_a_rerun_pays_nothing_and_gives_the_same_bytes(small_capture, seen, serv
     server.meshes["bowl"] = as_glb(true_mesh(small_capture, "bowl"))
     again, _, lines = fetch(small_capture, seen, config_of(server, generator_budget=5.0))
     assert "2 are kept from before" in lines[0]
-    assert len(server.sent("/api/v2/rodin")) == submitted  # the paid task is gone on with
+    assert len(server.sent("/api/v2/rodin")) == submitted  # the paid task is resumed
     assert first.items() <= again.items()
     server.close()
     offline, _, lines = fetch(small_capture, seen, config_of(server))
@@ -174,7 +174,7 @@ def test_nothing_is_spent_over_the_budget(small_capture, seen, server):
     assert len(server.sent("/api/v2/rodin")) == 1
 
 
-def test_a_service_that_is_away_is_asked_no_more(small_capture, seen, server):
+def test_an_unreachable_service_gets_no_more_requests(small_capture, seen, server):
     server.broken["/api/v2/rodin"] = [(401, {}, b"no such key")] * 9
     meshes, refused, lines = fetch(small_capture, seen, config_of(server, generator_budget=9.0))
     assert not meshes
@@ -183,7 +183,7 @@ def test_a_service_that_is_away_is_asked_no_more(small_capture, seen, server):
     assert sum("refuses the key" in line for line in lines) == 3
 
 
-def test_meshes_with_holes_are_closed_where_their_surface_is():
+def test_meshes_with_holes_are_closed_at_their_surface():
     mug = thing_mesh(make_mug, seed=1)
     holed = mug.copy()
     holed.update_faces(np.arange(len(mug.faces)) % 90 != 0)

@@ -63,6 +63,7 @@ class Room:
         self.posed = replace(
             posed, camera=camera, images=images, indices=np.arange(1, views + 1, dtype=np.int32),
             times_s=np.arange(views) / 10, world_from_camera=poses, sharpness=np.ones(views, np.float32),
+            held_out_images=images[:0],
         )  # fmt: skip
         self.parts = np.stack([self._seen(pose) for pose in poses])
 

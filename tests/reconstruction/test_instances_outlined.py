@@ -11,7 +11,7 @@ from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import BaseEntity, Camera, DepthMaps, Plane
 from reconstruction.editing.instances import apply_overrides
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.instances.outlined_box import Wall, WallBox, Window, fit_box, silhouette
+from reconstruction.instances.outlined_box import Wall, WallBox, WallMask, fit_box, silhouette
 from reconstruction.measure.alignment import Alignment
 from reconstruction.measure.object_boxes import instance_boxes
 from registry.errors import UsageError
@@ -21,9 +21,9 @@ WALL = Wall.of(BaseEntity(2, "wall", Plane(np.array([0.0, -1.0, 0.0, 1.0]), np.z
 SHADES = np.array([[0, 0, 0], [120, 120, 110], [200, 200, 190], [120, 80, 50], [40, 60, 160]], np.uint8)
 
 
-def window(box: WallBox, eye, target=(0.0, 1.0, 1.2)) -> Window:
+def window(box: WallBox, eye, target=(0.0, 1.0, 1.2)) -> WallMask:
     pose = looking_at(np.array(eye, float), np.array(target))
-    found = Window.of(silhouette(box, WALL, CAMERA, pose), WALL, CAMERA, pose)
+    found = WallMask.of(silhouette(box, WALL, CAMERA, pose), WALL, CAMERA, pose)
     assert found is not None
     return found
 
@@ -105,6 +105,7 @@ def room():
     posed = replace(
         frames_of(surface)[0], camera=camera, images=SHADES[ids], indices=np.arange(1, 7, dtype=np.int32),
         times_s=np.arange(6) / 10, world_from_camera=poses, sharpness=np.ones(6, np.float32),
+        held_out_images=np.zeros((0, 120, 160, 3), np.uint8),
     )  # fmt: skip
     return surface, posed, DepthMaps(camera, depth, np.where(depth > 0, 2, 0).astype(np.uint8)), ids
 

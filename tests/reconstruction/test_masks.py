@@ -44,7 +44,7 @@ def open_filters(monkeypatch):
     """Random weights are sure of nothing: let all their masks through."""
     monkeypatch.setattr(sam, "_POINTS_A_BATCH", 6)
     for module, names in (
-        (sam, ("_MIN_TRUST", "_MIN_STABILITY", "_MIN_CONCEPT_SCORE")),
+        (sam, ("_MIN_IOU", "_MIN_STABILITY", "_MIN_CONCEPT_SCORE")),
         (mask2former, ("_MIN_SCORE",)),
     ):
         for name in names:
@@ -115,7 +115,7 @@ def test_learned_masks_keep_the_promises_of_the_seam(name, folders) -> None:
 
 @pytest.mark.parametrize("name", LEARNED)
 def test_masks_of_which_a_model_is_not_sure_are_left_out(name, folders, monkeypatch) -> None:
-    monkeypatch.setattr(sam, "_MIN_TRUST", 1.1)
+    monkeypatch.setattr(sam, "_MIN_IOU", 1.1)
     monkeypatch.setattr(sam, "_MIN_CONCEPT_SCORE", 1.1)
     monkeypatch.setattr(mask2former, "_MIN_SCORE", 1.1)
     black = np.zeros((1, HEIGHT, WIDTH, 3), np.uint8)

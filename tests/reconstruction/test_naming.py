@@ -68,15 +68,15 @@ def scene() -> tuple[InstanceSet, PosedFrames]:
 def unchanged(before: InstanceSet, after: InstanceSet) -> bool:
     """Tell whether nothing but labels differs."""
     same = all(
-        replace(new, label=old.label, label_confidence=old.label_confidence) == old
+        {**new, "label": old["label"], "label_confidence": old["label_confidence"]} == old
         for old, new in zip(_plain(before), _plain(after), strict=True)
     )
     return same and after.vertex_instance is before.vertex_instance and after.id_maps is before.id_maps
 
 
-def _plain(found: InstanceSet) -> list[Instance]:
-    """Return the objects with tuples for arrays, so that == works."""
-    return [replace(o, center=tuple(o.center), extents_m=tuple(o.extents_m)) for o in found.objects]
+def _plain(found: InstanceSet) -> list[dict]:
+    """Return the fields of the objects with tuples for arrays, so that == works."""
+    return [{**vars(o), "center": tuple(o.center), "extents_m": tuple(o.extents_m)} for o in found.objects]
 
 
 # ---- Pictures.

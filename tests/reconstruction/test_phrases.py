@@ -1,4 +1,4 @@
-"""Names of objects: what is measured is said, no two objects of a scene have one name."""
+"""Referring expressions follow the measured attributes and are unique in a scene."""
 
 import numpy as np
 import pytest
@@ -11,14 +11,14 @@ FLOOR, SHELF, TABLE = 1, 2, 3
 
 
 def mesh_of(shape, rgb=(200, 30, 30)):
-    """A shape of one color."""
+    """Return a shape of one color."""
     texture = np.broadcast_to(np.array(rgb, np.uint8), (4, 4, 3)).copy()
     uvs = np.full((len(shape.vertices), 2), 0.5, np.float32)
     return TexturedMesh(shape.vertices.astype(np.float32), shape.faces.astype(np.int32), uvs, texture)
 
 
 def thing(key, label="unknown", rgb=(200, 30, 30), size=(0.1, 0.1, 0.1), at=(0, 0, 0), on=FLOOR, shape=None):
-    """An object as the assembly places it."""
+    """Return the attributes of a placed object."""
     pose = np.eye(4)
     pose[:3, 3] = at
     mesh = mesh_of(trimesh.creation.box(size) if shape is None else shape, rgb)
@@ -39,8 +39,8 @@ def test_colors_have_the_names_that_people_use(rgb, name):
 
 def test_a_thing_of_many_colors_has_no_color():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
-    texture = np.zeros((1, 3, 3), np.uint8)
-    texture[0] = (200, 30, 30), (30, 60, 190), (240, 210, 40)
+    texture = np.zeros((3, 3, 3), np.uint8)
+    texture[:] = (200, 30, 30), (30, 60, 190), (240, 210, 40)
     vertices, faces = box.vertices[box.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
     uvs = np.repeat(np.stack([(np.arange(12) % 3 + 0.5) / 3, np.full(12, 0.5)], 1), 3, axis=0)
     mesh = TexturedMesh(vertices.astype(np.float32), faces.astype(np.int32), uvs.astype(np.float32), texture)

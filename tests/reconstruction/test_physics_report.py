@@ -1,4 +1,4 @@
-"""The report card where people meet it: `simrecon verify --physics` and `--require-stable`."""
+"""The physics report in the commands: `simrecon verify --physics` and `--require-stable`."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ from registry.errors import SimReconError
 
 @pytest.fixture(scope="module")
 def verified(bundle, tmp_path_factory):
-    """What `simrecon verify --physics --json` says of the room that exports are tested with."""
+    """Output of `simrecon verify --physics --json` for the room of the export tests."""
     folder, root = tmp_path_factory.mktemp("staged") / "bundle", tmp_path_factory.mktemp("registry")
     shutil.copytree(bundle.root, folder)
     SceneRegistry(root, create=True).publish(folder, "room")
@@ -44,9 +44,9 @@ def test_verify_measures_the_published_scene_again(verified, capsys):
 def test_verify_says_it_in_words(verified, capsys):
     assert main(["verify", "room", "--registry", str(verified), "--physics"]) == 0
     said = capsys.readouterr().out
-    assert "all files are as published" in said
+    assert "all files are intact" in said
     assert "physics: stable 100%" in said
-    assert "edges are real" in said
+    assert "edges are in contact" in said
 
 
 def test_what_has_no_collision_shape_is_named_and_loads(bundle, tmp_path, capsys):
@@ -67,7 +67,7 @@ def test_what_has_no_collision_shape_is_named_and_loads(bundle, tmp_path, capsys
 
 
 def test_assembly_without_a_collision_shape_is_published_without_one(tmp_path):
-    """Not with the one that the asset has, as where nothing was changed."""
+    """An object whose collision parts the assembly removed gets none, not those of the asset."""
     assets = room(box(10, (1.2, 0.6, 0.9), (0, 0, 0)), box(11, (1.2, 0.6, 0.9), (0, 0, 0)))
     graph = SceneGraph(tuple(Edge(i, "supported_by", 1, 1.0, "") for i in (10, 11)))
     placed = assemble(assets, graph, AssemblyConfig()).placed
@@ -81,8 +81,8 @@ def test_a_scene_that_does_not_rest_is_not_published(tmp_path):
     graph = SceneGraph((Edge(10, "supported_by", 1, 1.0, ""), Edge(11, "supported_by", 10, 1.0, "")))
     scene = assemble(assets, graph, AssemblyConfig(method="in-situ"))
     lines = "\n".join(describe_physics(scene.physics_report))
-    assert "11 supported_by 10 is no contact" in lines
-    assert "11 rests on 1, which is no edge" in lines
+    assert "11 supported_by 10: no contact" in lines
+    assert "11 rests on 1: no edge" in lines
     assert "box_10 floats at the start" in lines
     registry = SceneRegistry(tmp_path / "registry", create=True)
     run = SimpleNamespace(results={"assembly": scene})

@@ -1,4 +1,4 @@
-"""Material and mass by a vision-language model: what is asked, what is believed, what happens where it fails."""
+"""Material and mass by a vision-language model: questions, validation of answers, failures."""
 
 import json
 import re
@@ -47,7 +47,7 @@ def built(crate, progress=NO_PROGRESS, **options):
     return item
 
 
-def test_what_the_model_says_is_used_with_its_range(crate, server) -> None:
+def test_the_answer_is_used_with_its_range(crate, server) -> None:
     server.responses = [chat(json.dumps(GOOD))]
     said, table = built(crate, physics="vlm"), built(crate)
     assert said.physics.material == "wood"
@@ -76,7 +76,7 @@ def test_what_the_model_says_is_used_with_its_range(crate, server) -> None:
         ({"filling": "liquid"}, "filling"),
     ],
 )
-def test_an_impossible_answer_is_asked_for_again(crate, server, wrong, reason) -> None:
+def test_an_impossible_answer_is_requested_again(crate, server, wrong, reason) -> None:
     server.responses = [chat(json.dumps(GOOD | wrong)), chat(json.dumps(GOOD))]
     posed, _, _, found = crate
     said = load_physicist(AssetsConfig(physics="vlm")).choose(found, posed, progress=NO_PROGRESS)
@@ -93,7 +93,7 @@ def test_the_table_decides_where_there_is_no_usable_answer(crate, server, respon
     assert any(note.startswith("physics: ") and "the table decides" in note for note in watcher.notes)
 
 
-def test_no_endpoint_is_said(monkeypatch) -> None:
+def test_a_missing_endpoint_is_an_error(monkeypatch) -> None:
     monkeypatch.delenv("SIMRECON_VLM_URL", raising=False)
     assert load_physicist(AssetsConfig()) is None
     with pytest.raises(EnvironmentMissing, match=r"assets\.physics needs .* set SIMRECON_VLM_URL"):

@@ -49,10 +49,10 @@ def test_all_parts_of_a_distance_and_an_object_are_kept():
         ("camera-height=74cm", "74 cm is 0.74"),
         ("distance:40,100,200,300=1", "FRAME,X1,Y1,X2,Y2"),
         ("distance:a,1,2,30,4=1", "FRAME,X1,Y1,X2,Y2"),
-        ("distance:4,1,2,1,2=1", "the same"),
-        ("object:mug.height=1", "nothing is known about 'object:mug.height'"),
-        ("object:3.width=1", "nothing is known"),
-        ("height=1", "nothing is known"),
+        ("distance:4,1,2,1,2=1", "coincide"),
+        ("object:mug.height=1", "'object:mug.height' is not one of the possible forms"),
+        ("object:3.width=1", "is not one of the possible forms"),
+        ("height=1", "is not one of the possible forms"),
     ],
 )
 def test_bad_texts_are_taught(text, message):

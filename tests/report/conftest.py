@@ -1,4 +1,4 @@
-"""A small filmed room taken through the stages that make pictures, published, with its truth beside it."""
+"""Fixtures: a small generated room, reconstructed and published, with its ground truth."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -31,12 +31,12 @@ from synthetic.capture import make_test_capture
 SCENE = "small_room"
 THINGS = ("table", "mug", "box", "picture")
 FEW_GAUSSIANS = GaussiansConfig(iterations=120, side_px=256, coarse_side_px=192, max_gaussians=12_000)
-SFM_SCALE = 0.5  # sfm units per metre: what is shown must be in metres all the same
+SFM_SCALE = 0.5  # sfm units per metre, to test that the report is in metres
 
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """A published scene, its stage results and its truth on disk."""
+    """A published scene with stage results and ground truth."""
 
     home: Path
     truth: Path
@@ -48,19 +48,19 @@ class Reconstructed:
 
     @cached_property
     def evaluation(self) -> dict:
-        """The scene's figures, from few points."""
+        """The scene's evaluation, from few samples."""
         bundle, stages = self.open()
         return evaluate_scene(bundle, self.truth, stages=stages, composition_points=40_000).to_json()
 
     def open(self) -> tuple[SceneBundle, StageResults]:
-        """Return the bundle and its stage results, freshly read."""
+        """Read the bundle and its stage results."""
         bundle = SceneRegistry(self.registry).load(SCENE)
         return bundle, StageResults.find(bundle, self.registry)
 
 
 @pytest.fixture(scope="session")
 def reconstructed(tmp_path_factory) -> Reconstructed:
-    """A generated room with true cameras and nearly true depth; everything after them is computed, coarsely."""
+    """Reconstruct a generated room coarsely, from true cameras and nearly true depth."""
     home = tmp_path_factory.mktemp("report")
     capture = make_test_capture(9, 256, 192, objects=THINGS)
     sfm_from_world = np.diag([SFM_SCALE, SFM_SCALE, SFM_SCALE, 1.0])
@@ -112,19 +112,19 @@ def reconstructed(tmp_path_factory) -> Reconstructed:
 
 @pytest.fixture(scope="session")
 def page(reconstructed) -> str:
-    """The page without a truth."""
+    """The page without ground truth."""
     return build_page(*reconstructed.open())
 
 
 @pytest.fixture(scope="session")
 def page_with_truth(reconstructed) -> str:
-    """The page with the truth beside everything."""
+    """The page with ground truth."""
     bundle, stages = reconstructed.open()
     return build_page(bundle, stages, reconstructed.truth, reconstructed.evaluation)
 
 
 def publish(home: Path, results: dict, config: PipelineConfig) -> None:
-    """Keep stage results as a run would, and publish the scene made of them."""
+    """Store stage results as a run does, and publish the scene."""
     digest = results["poses"].source.sha256
     store = StageStore(home / "work" / digest[:16])
     run = Run(Path("video.mp4"), config, store, input_digest=digest, results=results)
@@ -140,7 +140,7 @@ def publish(home: Path, results: dict, config: PipelineConfig) -> None:
 
 
 def write_truth(capture, folder: Path) -> None:
-    """Write the truth as CONTRACT section 3 has it, without images."""
+    """Write the ground truth of CONTRACT section 3, without images."""
     (folder / "meshes").mkdir(parents=True)
     names = {entity.id: entity.name for entity in capture.entities}
     entities = []

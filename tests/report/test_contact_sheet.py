@@ -1,4 +1,4 @@
-"""Contact sheets show every thing, come from the bundle alone, and give anchors that mean what they show."""
+"""Contact sheets show every object, need the bundle only, and give valid anchors."""
 
 import json
 import shutil
@@ -46,7 +46,7 @@ def test_every_thing_is_outlined_and_numbered_where_its_anchor_is(sheet):
 
 
 def pointer_into(stages) -> Pointer:
-    """Return what clicks are looked up in after a run."""
+    """Return the lookup of anchors after a run."""
     posed, depth = stages.in_world()
     surface = stages.get("surface")
     lens = Lens.measure(stages.get("frames"), stages.get("poses"))
@@ -54,7 +54,7 @@ def pointer_into(stages) -> Pointer:
 
 
 def test_later_stages_take_clicks_too(sheet, reconstructed):
-    """Mass by a click; a parent by a click on another thing, or on the floor."""
+    """Overrides by pixel: a mass, and a parent on another object or the floor."""
     _, stages = reconstructed.open()
     pointer, assets, graph = pointer_into(stages), stages.get("assets"), stages.get("scene_graph")
     small, other = list(sheet.objects.values())[-2:]
@@ -92,7 +92,7 @@ def test_the_same_bundle_gives_the_same_files(sheet, tmp_path):
 
 
 def test_the_command_needs_the_bundle_only(reconstructed, tmp_path, capsys):
-    """The work folder may be gone; the page is well formed and names each picture."""
+    """Without the work folder the page is well formed and refers to each image."""
     home = tmp_path / "home"
     shutil.copytree(reconstructed.registry, home / "registry")
     out, template = tmp_path / "sheets", tmp_path / "fixes.yaml"

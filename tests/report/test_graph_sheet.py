@@ -1,4 +1,4 @@
-"""`simrecon show SCENE --graph`: who said each edge, and a picture of every step."""
+"""`simrecon show SCENE --graph`: the source of each edge, and an image of every step."""
 
 import json
 
@@ -82,9 +82,9 @@ def test_every_thing_has_a_row_and_attachments_are_dashed():
 def test_what_is_wrong_is_said(reconstructed, capsys):
     registry = ["--registry", str(reconstructed.registry)]
     assert main(["show", "small_room", *registry, "--graph", "--views"]) == 2
-    assert "ask for one of them" in capsys.readouterr().err
+    assert "give only one of them" in capsys.readouterr().err
     assert main(["show", "small_room", *registry, "--graph", "--set", "avo.views=1"]) == 2
-    assert "--set belongs to" in capsys.readouterr().err
+    assert "--set needs --views" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("edges", [[], [(4, "supported_by", 3)]])

@@ -1,4 +1,4 @@
-"""The page in a real browser, opened from disk: no error, no request, nothing blank, usable on a phone and on paper."""
+"""The page in a browser, opened from disk: no errors, no requests, no blank images, phone and print layouts."""
 
 import os
 
@@ -71,7 +71,7 @@ def test_opens_without_error_or_request_and_nothing_is_blank(tab: Page, files, t
 
 
 def test_errors_and_requests_would_be_noticed(tab: Page, tmp_path):
-    """The check itself can fail: a page with a script error, a missing picture and a flat one."""
+    """The check detects a script error, a missing image and a blank one."""
     bad = tmp_path / "bad.html"
     bad.write_text(
         "<img src='gone.jpg' alt='gone'><script>console.error('oh'); nothing();</script>"

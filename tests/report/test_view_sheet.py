@@ -1,4 +1,4 @@
-"""`simrecon show SCENE --views`: the views of every thing as sheets, kept in the work folder."""
+"""`simrecon show SCENE --views`: contact sheets of the views, written to the work folder."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ QUICK = [
 
 @pytest.fixture(scope="module")
 def home(reconstructed, tmp_path_factory):
-    """A copy of the scene with its work folder, which the command writes to."""
+    """A copy of the scene with its work folder, which the command modifies."""
     target = tmp_path_factory.mktemp("views") / "home"
     shutil.copytree(reconstructed.home, target)
     return target
@@ -58,11 +58,11 @@ def test_every_thing_is_on_the_sheets_and_the_views_are_kept(home, tmp_path, cap
 
 def test_what_is_wrong_is_said(home, tmp_path, capsys):
     assert main(["show", "small_room", "--registry", str(home / "registry"), "--set", "avo.views=1"]) == 2
-    assert "--set belongs to" in capsys.readouterr().err
+    assert "--set needs --views" in capsys.readouterr().err
     assert main(command(home, tmp_path, "--set", "depth.depth_side_px=64")) == 2
-    assert "takes options of avo alone" in capsys.readouterr().err
+    assert "takes options of avo only" in capsys.readouterr().err
     assert main(command(home, tmp_path, "--work-dir", str(tmp_path / "elsewhere"))) == 2
-    assert "is gone; reconstruct the scene again" in capsys.readouterr().err
+    assert "does not exist; reconstruct the scene again" in capsys.readouterr().err
 
 
 def test_the_gradient_is_that_of_what_is_computed_on_fitted_gaussians(reconstructed):

@@ -1,4 +1,4 @@
-"""Suites: what is proven, that it is so in another run, what is left out, files, errors, comparisons."""
+"""Suites: proofs and their reproduction, left-out candidates, files, errors, runs, comparisons."""
 
 import json
 import os
@@ -64,7 +64,7 @@ def lazy(env):
 
 @pytest.fixture(scope="module")
 def results(suite: Suite, scenes_root: Path) -> dict[str, Results]:
-    """Return what the oracle and doing nothing get, by other environments than those of the proofs."""
+    """Return the results of the policies oracle and still, in new environments."""
     settings = RunSettings(registry=str(scenes_root))
     return {
         name: run_suite(suite, suite.select(), PolicySpec(name), settings) for name in ("oracle", "still")
@@ -96,7 +96,7 @@ def test_a_suite_says_what_is_to_be_done_and_holds_no_place_of_this_machine(
 def test_the_oracle_does_all_of_it_again_and_doing_nothing_does_none(results: dict[str, Results]) -> None:
     oracle, still = (results[name].summary()["all"] for name in ("oracle", "still"))
     assert oracle["success"]["value"] == 1.0
-    assert oracle["path_efficiency"]["value"] == pytest.approx(1.0, abs=1e-3)  # the very same episodes
+    assert oracle["path_efficiency"]["value"] == pytest.approx(1.0, abs=1e-3)  # the same episodes
     assert oracle["steps"]["value"] == np.mean([e.oracle_steps for e in results["oracle"].episodes])
     assert still["success"]["value"] == 0.0
     assert still["path_efficiency"]["value"] == 0.0
@@ -120,7 +120,7 @@ def test_a_comparison_is_paired(results: dict[str, Results], tmp_path: Path) -> 
     assert (same.success, same.p, same.steps, same.efficiency) == (0.0, 1.0, 0.0, 0.0)
     less = replace(results["still"], episodes=results["still"].episodes[1:], made_with={"sapien": "1"})
     notes = " ".join(compare_results(less, results["oracle"])["notes"])
-    assert "0 episodes of the first, 1 of the second" in notes
+    assert "0 episodes that only the first ran, 1 that only the second ran" in notes
     assert "sapien 1 and" in notes
     with pytest.raises(UsageError, match="no episode in common"):
         compare_results(replace(less, episodes=()), results["oracle"])
@@ -177,7 +177,7 @@ def test_suites_that_were_edited_or_are_none_say_so(suite_file: Path, tmp_path: 
     wrong = {
         "is no JSON": "{",
         "expected the schema 'simrecon.suite/1', found 'other'": json.dumps({**body, "schema": "other"}),
-        "not those that it was written with": json.dumps({**body, "options": {}}),
+        "the tasks were changed after it was written": json.dumps({**body, "options": {}}),
         "a field is missing": json.dumps({key: body[key] for key in body if key != "left_out"}),
         "of another type": json.dumps({**body, "tasks": [{**body["tasks"][0], "oracle": []}]}),
         "two tasks of one name": json.dumps({**body, "tasks": body["tasks"][:1] * 2}),
@@ -229,27 +229,27 @@ def test_a_policy_of_anybody_runs_and_wrong_ones_say_why(
     assert result.episodes[0].seed not in task[0].seeds
     assert result.policy["options"]["control_mode"] == "pd_joint_delta_pos"
     again = run_suite(suite, task, mine, fresh, records=Records(tmp_path / "out.json"))
-    assert again == result  # act_ms, too: nothing was run again
+    assert again == result  # even act_ms: nothing was run again
     (tmp_path / "my_test_policy.py").write_text(POLICY + "\n")
     run_suite(suite, task, mine, fresh, records=Records(tmp_path / "out.json"))
-    assert len(list(Records(tmp_path / "out.json").folder.iterdir())) == 2  # it is another policy now
+    assert len(list(Records(tmp_path / "out.json").folder.iterdir())) == 2  # the policy's file changed
     for name, message in {
         "nobody": "expected oracle, still, random or module:callable",
         "no_such_module:Policy": "there is no module 'no_such_module'",
         "my_test_policy:Absent": "no callable 'Absent'",
         "my_test_policy:Greedy": "policy_options has task, which the suite decides",
         "my_test_policy:Smell": "obs_mode 'smell': expected state, .*rgb",
-        "my_test_policy:lazy": r"what it returned \(object\) has no act",
+        "my_test_policy:lazy": "the returned object has no act",
     }.items():
         with pytest.raises(UsageError, match=message):
             run_suite(suite, task, PolicySpec(name), settings)
     at = "at step 1 of an episode of things, reach_.*, panda"
     for how, message in {
         "raise": rf"act\(\) {at} raised KeyError: 'qpos' \(.*my_test_policy.py:\d+\)",
-        "nan": rf"an action that is not finite .* {at}; expected 8 finite numbers",
+        "nan": rf"a non-finite action .* {at}; expected 8 finite numbers",
         "short": rf"an action of shape \(7,\) {at}",
-        "words": rf"no array of numbers \(str\) {at}",
-        "none": rf"no array of numbers \(NoneType\) {at}",
+        "words": rf"str, not an array of numbers {at}",
+        "none": rf"NoneType, not an array of numbers {at}",
     }.items():
         with pytest.raises(UsageError, match=message):
             run_suite(suite, task, PolicySpec("my_test_policy:Wrong", {"how": how}), settings)
@@ -282,7 +282,7 @@ def test_the_command_line_runs_compares_and_explains(
     assert "McNemar p" in capsys.readouterr().out
     assert sorted(p.name for p in tmp_path.iterdir()) == ["oracle.json", "random.json"]
     for wrong, message in {
-        ("generate", "--out", "x.json"): "name scenes, or --all",
+        ("generate", "--out", "x.json"): "name SCENEs or pass --all",
         (
             "generate",
             "things",
@@ -294,7 +294,7 @@ def test_the_command_line_runs_compares_and_explains(
         ("generate", "things", "--out", "x.json", "--randomize", "shift_m"): "expected KEY=VALUE",
         ("generate", "things", "--out", "x.json", "--robots", "pandda"): "panda",
         ("generate", "things", "--out", "x.json", "--jobs", "0"): "--jobs 0",
-        ("demos", str(suite_file)): "say where demonstrations go",
+        ("demos", str(suite_file)): "name an output folder",
         ("demos", str(suite_file), "--maniskill", "d", "--episodes", "0"): "--episodes 0",
         ("demos", str(suite_file), "--lerobot", "d", "--demo-obs", "state"): "which needs state_dict",
     }.items():

@@ -1,4 +1,4 @@
-"""Demonstrations are read by the tools that they are for: ManiSkill's, and LeRobot's format field by field."""
+"""Demonstrations: ManiSkill's tools read and replay them; LeRobot datasets have all fields of the format."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from simrecon_envs.benchmark import demonstrations_lerobot
 from simrecon_envs.benchmark.demonstrations import record_demonstrations
 from simrecon_envs.benchmark.suite import Suite
 
-# The columns and files of the format's version 3.0, as LeRobot's own reader (0.4.4) asks for them.
+# Columns and files of format 3.0 that LeRobot's reader (0.4.4) requires.
 NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 TYPES = {"float32": "float", "int64": "int64", "bool": "bool"}
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
@@ -119,7 +119,7 @@ def test_what_is_there_is_not_overwritten(
 def test_a_missing_pyarrow_is_one_error_that_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
-    monkeypatch.setitem(sys.modules, "pyarrow", None)  # Python's own way to say that a module is absent
+    monkeypatch.setitem(sys.modules, "pyarrow", None)  # makes the import fail
     with pytest.raises(EnvironmentMissing, match=r"pip install 'simrecon\[lerobot\]'"):
         demonstrations_lerobot.need_pyarrow()
 

@@ -1,4 +1,4 @@
-"""Intervals and tests against published values and simulation; splits and seeds by hash."""
+"""Intervals and tests agree with published values and simulation; splits and seeds are hashes of names."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_mean_of_like_episodes_is_as_uncertain_as_its_tasks():
     tasks = rng.normal(size=20)
     values, groups = np.repeat(tasks, 10), np.repeat(np.arange(20), 10)
     low, high = bootstrap_mean(values, list(groups))
-    alone = bootstrap_mean(values, list(range(200)))  # as if episodes had nothing in common
+    alone = bootstrap_mean(values, list(range(200)))  # as if episodes were independent
     assert low < values.mean() < high
     assert high - low == pytest.approx(2 * 1.96 * tasks.std() / np.sqrt(20), rel=0.15)
     assert high - low > 2.5 * (alone[1] - alone[0])

@@ -1,4 +1,4 @@
-"""Tasks of the graph: what is listed, that scripts can do them and nobody else does, that success is physical."""
+"""Tasks: listing and names, scripts solve them and doing nothing does not, success is measured by contacts and rest."""
 
 import dataclasses
 from pathlib import Path
@@ -176,7 +176,7 @@ def test_success_needs_contact_with_the_support_and_rest(scenes_root: Path) -> N
     info = _settle(env, 30)
     assert info["success"]
     assert info["is_there"]
-    # It falls asleep, and PhysX says no more who carries it.
+    # It falls asleep, and PhysX reports no contacts any more.
     assert _settle(env, 60)["success"]
     _teleport(env, CUBE, (1.4, -0.8, 0.001))
     assert not _settle(env, 30)["is_there"]
@@ -188,7 +188,7 @@ def test_what_sleeps_since_the_reset_is_carried_by_what_it_was_captured_on(scene
         env = _make(scenes_root, task)
         env.reset(seed=0)
         assert _settle(env, 3)["is_there"] == there
-        _teleport(env, CUBE, (0.85, 0.6, 0.55))  # in the air: it is awake, and nothing carries it
+        _teleport(env, CUBE, (0.85, 0.6, 0.55))  # in the air, awake, without contact
         assert not _settle(env, 1)["is_there"]
         env.close()
 

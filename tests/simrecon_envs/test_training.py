@@ -1,4 +1,4 @@
-"""Training: reproducible from its seed, gone on with after any stop, and refused with one clear error."""
+"""Training is reproducible from its seed, resumes after any interruption, and refuses bad input with one error."""
 
 import json
 import os
@@ -104,12 +104,12 @@ def test_ctrl_c_leaves_a_checkpoint_and_resuming_makes_the_same_number_of_steps(
     assert found == {"interrupted": True, "folder": str(out), "steps": found["steps"]}
     assert 60 <= found["steps"] < 300
     assert found["steps"] % 60 == 0
-    # What a kill in the middle of writing leaves is of no account.
+    # A partial checkpoint of a killed process is ignored.
     (out / "checkpoints" / ".writing-999").mkdir()
     (out / "checkpoints" / ".writing-999" / "model.zip").write_bytes(b"half")
     on = resume(RunFolder.open(out), video=False)
     assert on["training"]["steps"] == 300
-    assert on["training"]["episodes"] >= 15 - 1  # the interruption cuts one off
+    assert on["training"]["episodes"] >= 15 - 1  # the interruption cuts off one episode
     assert [steps for steps, _ in RunFolder(out).checkpoints()][-1] == 300
     with pytest.raises(UsageError, match="was begun with 300"):
         resume(RunFolder.open(out), steps=240)
@@ -189,7 +189,7 @@ def test_a_run_goes_through_a_suite_as_it_was_trained(
 
 
 class _Hover(gym.Env):
-    """Succeeds at the third step; every step pays 0.5."""
+    """Succeeds at the third step; every step has reward 0.5."""
 
     observation_space = action_space = gym.spaces.Box(-1, 1, (1,))
 
@@ -258,9 +258,9 @@ def test_settings_and_steps() -> None:
         (["things", "--randomize", "{"], "not JSON"),
         (["things", "--randomize", '{"wind": 1}'], "shift_m"),
         (["things", "--device", "abacus"], "expected cpu or cuda"),
-        (["things", "--resume", "--seed", "2"], "--seed: a run goes on as it was begun"),
+        (["things", "--resume", "--seed", "2"], "--seed: --resume keeps the run's settings"),
         (["things", "--resume"], "no run of things, reach, ppo"),
-        (["things", "--resume", "--out", "/nonexistent"], "no training run is in there"),
+        (["things", "--resume", "--out", "/nonexistent"], "no training run in this folder"),
         ([], "name a SCENE"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The examples of training run, and give the same policy for the same seed."""
+"""The training examples run, and give the same policy for the same seed."""
 
 import importlib.util
 import re
@@ -50,9 +50,9 @@ def test_advantages_stop_where_an_episode_does() -> None:
     no, last = torch.zeros(4, 1, dtype=torch.bool), torch.tensor([8.0])
     at_1 = torch.tensor([[False], [True], [False], [False]])
     ended = single.advantages(reward, value, last, at_1, no)
-    assert ended[1, 0] == pytest.approx(2.0 - 0.25)  # nothing comes after success
+    assert ended[1, 0] == pytest.approx(2.0 - 0.25)  # success: the next value is 0
     cut = single.advantages(reward, value, last, no, at_1)
-    assert cut[1, 0] == pytest.approx(2.0 + single.GAMMA * 4.0 - 0.25)  # a future that was not seen
+    assert cut[1, 0] == pytest.approx(2.0 + single.GAMMA * 4.0 - 0.25)  # truncated: the next value counts
     assert cut[0, 0] == pytest.approx(1.0 + 0.9 * 0.25 - 0.5 + 0.81 * float(cut[1, 0]))
 
 

@@ -1,4 +1,4 @@
-"""Collision shapes: convex parts within the visual bounds, hollow things hollow, what carries level."""
+"""Convex collision shapes within the visual bounds; hollow objects stay hollow, carrying surfaces level."""
 
 from reconstruction.assets.collision.build import collision_parts
 from reconstruction.assets.collision.decomposition import end_decomposer

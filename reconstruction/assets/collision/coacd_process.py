@@ -1,20 +1,20 @@
-"""The process that CoACD runs in: questions on stdin, answers on stdout (see `decomposition`).
+"""The child process of CoACD: requests on stdin, results on stdout (see `decomposition`).
 
-It is started by its path and needs nothing of this project, so that it starts at once and from anywhere.
+It runs by its path and imports nothing of this project, so that it starts fast and from any folder.
 """
 
 import io
 import os
 import struct
 import sys
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 
 _LENGTH = struct.Struct("<q")
 
 
-def send(stream: BinaryIO, arrays: dict) -> None:
+def send(stream: IO[bytes], arrays: dict) -> None:
     """Write named arrays."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
@@ -23,11 +23,11 @@ def send(stream: BinaryIO, arrays: dict) -> None:
     stream.flush()
 
 
-def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
+def receive(stream: IO[bytes]) -> dict[str, np.ndarray]:
     """Read named arrays.
 
     Raises:
-        EOFError: the other side is gone.
+        EOFError: the other process has ended.
     """
     head = stream.read(_LENGTH.size)
     if len(head) < _LENGTH.size:
@@ -38,9 +38,9 @@ def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Say whether CoACD is there, then answer until the other side is gone."""
+    """Report whether CoACD can be imported, then answer requests until the parent has ended."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # CoACD prints
+    os.dup2(2, 1)  # CoACD prints to stdout
     try:
         import coacd
     except (ImportError, OSError) as error:
@@ -57,7 +57,7 @@ def main() -> None:
             coacd.Mesh(asked["vertices"], asked["faces"]),
             threshold=float(asked["threshold"]),
             max_convex_hull=int(asked["budget"]),
-            preprocess_mode="off",  # the mesh is manifold already; the voxel remesh would inflate it
+            preprocess_mode="off",  # the mesh is manifold; voxel remeshing would inflate it
             resolution=100,
             mcts_nodes=6,
             mcts_iterations=6,

@@ -1,16 +1,22 @@
-"""How far a solid is from its convex hull."""
+"""Deviation of a solid from its convex hull."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.solid import Solid, hull_solid
+from reconstruction.assets.solid import Solid, hull_solid, surface_samples
+from reconstruction.core.types import ConvexPart
 
 _PROBES = 1500
 
 
+def part_of(solid: Solid) -> ConvexPart:
+    """Convert a convex solid to the array types of `ConvexPart`."""
+    return ConvexPart(solid.vertices.astype(np.float32), solid.faces.astype(np.int32))
+
+
 def nearly_convex(solid: Solid, config: AssetsConfig) -> Solid | None:
-    """Return the convex hull where the surface nowhere lies deeper inside it than reconstruction noise."""
+    """Return a solid's convex hull if its dents are within reconstruction noise; else None."""
     hull = hull_solid(solid.vertices)
     if solid.volume > config.convex_enough * hull.volume:
         return hull
@@ -21,21 +27,16 @@ def nearly_convex(solid: Solid, config: AssetsConfig) -> Solid | None:
 
 
 def waste(solid: Solid) -> float:
-    """Return how much empty space a solid's convex hull takes, cubic metres."""
+    """Return the empty volume in a solid's convex hull, cubic metres."""
     return max(0.0, hull_solid(solid.vertices).volume - solid.volume)
 
 
 def dent(solid: Solid, hull: Solid, seed: int) -> float:
-    """Return how deep in its hull a solid's surface lies, metres: the 95th percentile over the hull.
+    """Return the 95th percentile of the distance from the convex hull to the solid's vertices and face centers, metres.
 
     Over an opening that is its half width, over noise it is the noise.
     """
-    corner = hull.vertices[hull.faces]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(area), _PROBES, p=area / area.sum())
-    weight = rng.dirichlet((1.0, 1.0, 1.0), _PROBES)
-    probes = np.einsum("nk,nkc->nc", weight, corner[chosen])
+    probes = surface_samples(hull, _PROBES, np.random.default_rng(seed))
     surface = np.concatenate([solid.vertices, solid.vertices[solid.faces].mean(axis=1)])
     gap, _ = cKDTree(surface).query(probes)
     return float(np.percentile(gap, 95))

@@ -1,10 +1,11 @@
-"""CoACD in a process of its own: on some meshes it crashes or does not end, and neither must cost the scene."""
+"""CoACD in a child process, as it crashes or hangs on some meshes."""
 
 import atexit
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -14,14 +15,14 @@ from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.solid import Solid, lighten
 from registry.errors import EnvironmentMissing
 
-_LIMIT_S = 300.0  # only what hangs takes so long, however busy the machine: a part takes a second or two
+_LIMIT_S = 300.0  # per request; a part takes a second or two
 
 
 class Decomposer:
-    """Runs CoACD in a child that is started at the first question and after each crash."""
+    """Runs CoACD in a child process, which starts with the first request and again after each crash."""
 
     def __init__(self, limit_s: float = _LIMIT_S, python: str = sys.executable) -> None:
-        """Nothing is started yet."""
+        """Set the time limit of a request and the interpreter."""
         self._limit_s = limit_s
         self._python = python
         self._child: subprocess.Popen | None = None
@@ -30,17 +31,18 @@ class Decomposer:
     def run(
         self, vertices: np.ndarray, faces: np.ndarray, options: dict[str, float]
     ) -> list[np.ndarray] | None:
-        """Return the vertices (k, 3) of each part of a closed mesh; None where CoACD failed on it.
+        """Decompose a closed mesh: vertices (k, 3) of each part; None where CoACD failed.
 
         Raises:
-            EnvironmentMissing: CoACD cannot be run at all.
+            EnvironmentMissing: CoACD cannot be run.
         """
         with self._lock:
             child = self._started()
             timer = self._guard(child)
             try:
-                send(child.stdin, {"vertices": vertices, "faces": faces, **options})
-                answer = receive(child.stdout)
+                stdin, stdout = _pipes(child)
+                send(stdin, {"vertices": vertices, "faces": faces, **options})
+                answer = receive(stdout)
             except (OSError, EOFError):
                 self.close()
                 return None
@@ -49,12 +51,14 @@ class Decomposer:
         return [answer[str(number)] for number in range(len(answer))]
 
     def _guard(self, child: subprocess.Popen) -> threading.Timer:
+        """Kill the child after the time limit."""
         timer = threading.Timer(self._limit_s, child.kill)
         timer.daemon = True
         timer.start()
         return timer
 
     def _started(self) -> subprocess.Popen:
+        """Return the running child, or start one."""
         if self._child is not None and self._child.poll() is None:
             return self._child
         self.close()
@@ -67,7 +71,7 @@ class Decomposer:
             raise self._missing(str(error)) from error
         timer = self._guard(self._child)
         try:
-            missing = receive(self._child.stdout).get("missing")
+            missing = receive(_pipes(self._child)[1]).get("missing")
         except (OSError, EOFError) as error:
             status = self._child.wait()
             self.close()
@@ -91,8 +95,14 @@ class Decomposer:
         if child is not None:
             child.kill()
             child.wait()
-            child.stdin.close()
-            child.stdout.close()
+            for pipe in _pipes(child):
+                pipe.close()
+
+
+def _pipes(child: subprocess.Popen) -> tuple[IO[bytes], IO[bytes]]:
+    assert child.stdin is not None
+    assert child.stdout is not None
+    return child.stdin, child.stdout
 
 
 _decomposer = Decomposer()
@@ -100,12 +110,12 @@ atexit.register(_decomposer.close)
 
 
 def end_decomposer() -> None:
-    """End the process that parts are decomposed in; the next part starts another."""
+    """End the child process; the next part starts another."""
     _decomposer.close()
 
 
 def decompose(solid: Solid, threshold: float, budget: int, config: AssetsConfig) -> list[np.ndarray] | None:
-    """Run CoACD on the normalized, decimated mesh; return the vertices of each part, None where it failed."""
+    """Decimate and normalize a mesh and run CoACD on it: vertices (k, 3) of each part, None where it failed."""
     light = lighten(solid, config.collision_faces, 0.004 * float(solid.extents.max()))
     center = (light.vertices.max(axis=0) + light.vertices.min(axis=0)) / 2
     scale = float(light.extents.max()) / 2

@@ -1,4 +1,4 @@
-"""Collision parts that are kept by mesh: the same mesh with the same options is not cut again."""
+"""Cache of collision parts, by mesh and options."""
 
 import hashlib
 import io
@@ -18,30 +18,21 @@ from reconstruction.core.progress import NoProgress, Progress
 from reconstruction.core.types import ConvexPart
 from reconstruction.learned.requesting import write_whole
 
-_MOST_KEPT = 400  # files; those that were not used longest go first
-_ELSEWHERE = ("texture_", "base_", "generator", "physics")  # options that no collision shape depends on
+_MOST_KEPT = 400  # files; the least recently used ones are deleted
+_ELSEWHERE = (
+    "texture_",
+    "base_",
+    "generator",
+    "physics",
+)  # prefixes of options that no collision shape depends on
 
 
 def kept_parts(
-    folder: Path,
-    solid: Solid,
-    config: AssetsConfig,
-    *,
-    levels: tuple[float, ...],
-    progress: Progress,
-    name: str,
-) -> tuple[ConvexPart, ...]:
-    """Return `collision_parts`, kept in a folder or made and then kept there.
+    folder: Path, solid: Solid, config: AssetsConfig, *, levels: tuple[float, ...], progress: Progress, name: str
+) -> tuple[ConvexPart, ...]:  # fmt: skip
+    """Return `collision_parts` from a cache folder, or compute and cache them.
 
-    What a failure of CoACD stands behind is not kept: the next run tries again.
-
-    Args:
-        folder: One .npz a mesh; made where it is missing.
-        solid: The closed mesh.
-        config: Budgets and limits.
-        levels: Heights at which other things stand on it.
-        progress: Told of failures.
-        name: Of the object, for that.
+    Parts after a failure of CoACD are not cached, so that the next run tries again.
     """
     file = folder / f"{_digest(solid, config, levels)}.npz"
     kept = _read(file)
@@ -57,7 +48,7 @@ def kept_parts(
 
 
 class _Watch(NoProgress):
-    """Passes notes on and remembers that there were some."""
+    """Forwards notes and remembers whether there were any."""
 
     def __init__(self, listener: Progress) -> None:
         self._listener, self.heard = listener, False

@@ -1,19 +1,20 @@
-"""Boxes, cylinders, spheres and capsules in place of hulls, where they fit a solid within two millimetres."""
+"""Boxes, cylinders, spheres and capsules that fit a solid within two millimetres."""
 
 import math
 from functools import partial
 
 import numpy as np
 
-from reconstruction.assets.solid import Solid, hull_solid
+from reconstruction.assets.collision.convexity import part_of
+from reconstruction.assets.solid import Solid, hull_solid, surface_samples
 from reconstruction.core.types import ConvexPart
 from registry.primitives import FLAT, Primitive, Shape, corners_of
 
-BOUND_M = 0.002
-_HOPELESS = 4.0  # times the bound, of the middle half of the surface at the first guess
-_SAMPLES, _CHECKS = 600, 12_000
-_FILLED = 0.5  # of the primitive's volume: the solid's surface then goes around all of it
-# What is fitted: the shape, and whether its axis lies. Upright ones come first: things stand.
+BOUND_M = 0.002  # greatest distance between the surfaces
+_HOPELESS = 4.0  # median distance at the first guess, in bounds, above which a candidate is dropped
+_SAMPLES, _CHECKS = 600, 12_000  # surface points of the fit and of the check
+_FILLED = 0.5  # least volume of the solid, relative to the primitive's: it encloses the primitive's middle
+# Shape, and whether its axis is horizontal; upright ones are tried first.
 _CANDIDATES: tuple[tuple[Shape, bool], ...] = (
     ("box", False), ("cylinder", False), ("sphere", False), ("cylinder", True), ("capsule", False), ("capsule", True)
 )  # fmt: skip
@@ -22,18 +23,18 @@ _CANDIDATES: tuple[tuple[Shape, bool], ...] = (
 def fitted_primitive(
     solid: Solid, levels: tuple[float, ...] = (), bound_m: float = BOUND_M
 ) -> Primitive | None:
-    """Return the primitive whose surface and that of a closed mesh are nowhere farther apart than a bound.
+    """Return the first primitive whose surface lies within a bound of a closed mesh's everywhere; None if none does.
 
-    All the mesh lies within the bound of the primitive's surface, and encloses its middle: so on every way from within
-    the primitive to without, the mesh is crossed within the bound, too.
+    All the mesh lies within the bound of the primitive's surface, and encloses its middle. So any path from inside the
+    primitive to outside crosses the mesh within the bound, too.
 
     Args:
-        solid: The mesh, bottom at its lowest point.
-        levels: Heights at which other things stand on it: the primitive must end at them.
-        bound_m: Metres.
+        solid: the mesh.
+        levels: heights of children's contacts; the primitive must end at them.
+        bound_m: metres.
     """
     rng = np.random.default_rng(0)
-    few, many = _on_surface(solid, _SAMPLES, rng), _on_surface(solid, _CHECKS, rng)
+    few, many = surface_samples(solid, _SAMPLES, rng), surface_samples(solid, _CHECKS, rng)
     every = np.concatenate(
         [solid.vertices, solid.vertices[solid.faces].mean(axis=1), _edge_middles(solid), many]
     )
@@ -45,9 +46,9 @@ def fitted_primitive(
         away = np.abs(_distance(shape, lying, first, few))
         if min(first[4:]) <= bound_m or np.median(away) > _HOPELESS * bound_m:
             continue
-        found = _made(shape, lying, _refined(shape, lying, first, few), low)
+        found = _standing(shape, lying, _refined(shape, lying, first, few), low)
         if shape in ("sphere", "capsule") and FLAT * found.size[0] > bound_m:
-            continue  # its corners would not fit
+            continue  # the mesh that stands for it in files would not fit
         gap = np.abs(_distance_to(found, every)).max()
         if gap <= bound_m and solid.volume > _FILLED * _volume(found):
             return found
@@ -55,16 +56,8 @@ def fitted_primitive(
 
 
 def primitive_part(primitive: Primitive) -> ConvexPart:
-    """Return the convex mesh that stands for a primitive."""
-    hull = hull_solid(corners_of(primitive))
-    return ConvexPart(hull.vertices.astype(np.float32), hull.faces.astype(np.int32))
-
-
-def _on_surface(solid: Solid, count: int, rng: np.random.Generator) -> np.ndarray:
-    corner = solid.vertices[solid.faces]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    chosen = rng.choice(len(area), count, p=area / area.sum())
-    return np.einsum("nk,nkc->nc", rng.dirichlet((1.0, 1.0, 1.0), count), corner[chosen])
+    """Return the convex mesh of a primitive."""
+    return part_of(hull_solid(corners_of(primitive)))
 
 
 def _edge_middles(solid: Solid) -> np.ndarray:
@@ -73,7 +66,7 @@ def _edge_middles(solid: Solid) -> np.ndarray:
 
 
 def _first_guess(solid: Solid, shape: Shape, lying: bool) -> np.ndarray:
-    """Return center (3), heading, and the size of a primitive around the bounds of a solid."""
+    """Return center (3), heading and size of a primitive from the minimum-area rectangle and height of a solid."""
     import cv2
 
     outline = solid.vertices[:, :2].astype(np.float32)
@@ -95,19 +88,19 @@ def _first_guess(solid: Solid, shape: Shape, lying: bool) -> np.ndarray:
 
 
 def _refined(shape: Shape, lying: bool, first: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return center (3), heading and size, from a first guess, that lie nearest to points (n, 3) in least squares."""
+    """Return center (3), heading and size fitted to points (n, 3) by least squares from a first guess."""
     from scipy.optimize import least_squares
 
     fit = partial(_distance, shape, lying, points=points)
     return least_squares(fit, first, x_scale=np.maximum(np.abs(first), 0.05), max_nfev=40).x
 
 
-def _made(shape: Shape, lying: bool, values: np.ndarray, low: float) -> Primitive:
-    """Return the primitive of fitted values, standing where the solid does."""
+def _standing(shape: Shape, lying: bool, values: np.ndarray, low: float) -> Primitive:
+    """Return the primitive of fitted values, its bottom moved to the solid's."""
     size = np.abs(values[4:])
     center = values[:3].copy()
     if shape == "box" or (shape == "cylinder" and not lying):
-        top = center[2] + size[-1]  # stays where it fits, while its foot becomes the solid's
+        top = center[2] + size[-1]  # keeps its fitted height
         size[-1] = 0.5 * (top - low)
         center[2] = 0.5 * (top + low)
     else:
@@ -118,7 +111,7 @@ def _made(shape: Shape, lying: bool, values: np.ndarray, low: float) -> Primitiv
 
 
 def _rotation(lying: bool, heading: float) -> np.ndarray:
-    """Return object_from_primitive (3, 3): the axis upright, or lying along the heading."""
+    """Return object_from_primitive (3, 3): the axis upright, or horizontal along the heading."""
     c, s = math.cos(heading), math.sin(heading)
     turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return turned @ np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]) if lying else turned
@@ -130,12 +123,13 @@ def _distance(shape: Shape, lying: bool, values: np.ndarray, points: np.ndarray)
 
 
 def _distance_to(primitive: Primitive, points: np.ndarray) -> np.ndarray:
+    """Return the signed distance (n,) of points (n, 3) to a primitive."""
     own = (points - primitive.pose[:3, 3]) @ primitive.pose[:3, :3]
     return _own_distance(primitive.shape, np.array(primitive.size), own)
 
 
 def _own_distance(shape: Shape, size: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the signed distance (n,) of points in the primitive's own space to its surface."""
+    """Return the signed distance (n,) of points (n, 3) in the primitive's own frame."""
     if shape == "sphere":
         return np.linalg.norm(points, axis=1) - size[0]
     if shape == "capsule":

@@ -1,7 +1,7 @@
-"""The walls of a container: a ring around a hole, cut like a cake.
+"""Walls of a container: a ring around a hole, cut into sectors by vertical planes through the hole.
 
-Decomposers that look for the flattest cut close the hole of a thin ring with a few broad hulls. Cut by upright planes
-through the hole, at its corners first, a box falls into its four walls and a mug into slim wedges.
+Decomposers that search for the flattest cut close the hole of a thin ring with a few broad hulls. Cut at the hole's
+corners first, a box falls into its four walls and a mug into slim wedges.
 """
 
 from dataclasses import dataclass
@@ -12,43 +12,38 @@ import cv2
 import numpy as np
 
 from reconstruction.assets.collision.convexity import waste
-from reconstruction.assets.solid import Solid, from_manifold, manifold_of
+from reconstruction.assets.solid import Solid, from_manifold, manifold_of, raster_section
 
 if TYPE_CHECKING:
     import manifold3d
 
-_CELLS = 96
-_SECTIONS = (0.15, 0.4, 0.65, 0.9)  # of the height: where an opening must be open
-_HOLE_SHARE = 0.04  # of the box in plan
-_ENOUGH = 1.3  # times the empty space of the finest cut
+_CELLS = 96  # of the raster of a horizontal section, along its longer side
+_SECTIONS = (0.15, 0.4, 0.65, 0.9)  # relative heights at which an opening must be open
+_HOLE_SHARE = 0.04  # least area of the opening, relative to the bounding rectangle
+_ENOUGH = 1.3  # accepted empty space in the hulls, relative to the best cut
 _CUTS = ((1, 4), (1, 8), (2, 4), (1, 16), (2, 8), (3, 4), (3, 8), (2, 16), (3, 16))  # layers, sectors of each
-_CRUMB_SHARE = 0.002
+_CRUMB_SHARE = 0.002  # of a sector's mean volume: smaller pieces are dropped
 
 
 @dataclass(frozen=True)
 class Hole:
-    """An upright opening through a solid."""
+    """A vertical opening through a solid."""
 
     center: np.ndarray  # float64 (2,) metres
-    corners: np.ndarray  # float64 (4,) radians, ascending: directions from the center to its corners
+    corners: np.ndarray  # float64 (4,) radians, ascending: directions from the center to the corners
 
 
 def find_hole(solid: Solid) -> Hole | None:
-    """Return the largest opening that a solid encloses in plan; None where it is no ring."""
+    """Return the largest opening that a solid encloses, seen from above; None where there is none."""
     body = manifold_of(solid)
     if body is None:
         return None
-    low, high = solid.vertices[:, :2].min(axis=0), solid.vertices[:, :2].max(axis=0)
-    bottom, top = float(solid.vertices[:, 2].min()), float(solid.vertices[:, 2].max())
+    (low, bottom), (high, top) = ((end[:2], float(end[2])) for end in solid.bounds)
     cell = float((high - low).max()) / _CELLS
     size = np.ceil((high - low) / cell).astype(int) + 4
     covered = np.zeros((size[1], size[0]), np.uint8)
     for share in _SECTIONS:
-        section = np.zeros_like(covered)
-        outlines = body.slice(bottom + share * (top - bottom)).to_polygons()
-        at = [np.round(((outline - low) / cell + 2) * 16).astype(np.int32) for outline in outlines]
-        cv2.fillPoly(section, at, 1, cv2.LINE_8, 4)  # fixed point, four bits; even-odd
-        covered |= section
+        covered |= raster_section(body, bottom + share * (top - bottom), low, cell, 2, size)
     count, label = cv2.connectedComponents(1 - covered, connectivity=4)
     outside = label[0, 0]
     areas = np.bincount(label[covered == 0].ravel(), minlength=count) * cell**2
@@ -65,13 +60,13 @@ def find_hole(solid: Solid) -> Hole | None:
 
 
 def ring_pieces(solid: Solid, hole: Hole, budget: int, allowed_m3: float) -> list[Solid]:
-    """Cut a ring into at most about `budget` pieces: the fewest whose hulls take little more empty space than can be.
+    """Cut a ring into the fewest pieces whose hulls contain little more empty space than those of the best cut.
 
     Args:
-        solid: The ring.
-        hole: What it surrounds.
-        budget: Most pieces.
-        allowed_m3: Empty space that does not matter.
+        solid: the ring.
+        hole: its opening.
+        budget: most pieces, 4 at least.
+        allowed_m3: empty space that is accepted anyway.
     """
     cuts = [
         _cut(solid, hole, layers, sectors) for layers, sectors in _CUTS if layers * sectors <= max(budget, 4)
@@ -82,6 +77,7 @@ def ring_pieces(solid: Solid, hole: Hole, budget: int, allowed_m3: float) -> lis
 
 
 def _cut(solid: Solid, hole: Hole, layers: int, sectors: int) -> list[Solid]:
+    """Cut a ring into layers of equal height and each into sectors, with cuts at the hole's corners."""
     low, high = float(solid.vertices[:, 2].min()), float(solid.vertices[:, 2].max())
     body = manifold_of(solid)
     if body is None:
@@ -108,7 +104,7 @@ def _cut(solid: Solid, hole: Hole, layers: int, sectors: int) -> list[Solid]:
 def _sector(
     ring: "manifold3d.Manifold", center: np.ndarray, start: float, end: float
 ) -> "manifold3d.Manifold":
-    """Return what lies between two directions from an upright axis, less than half a turn apart."""
+    """Return the part of a ring between two directions from a vertical axis, less than half a turn apart."""
     for angle, side in ((start, 1.0), (end, -1.0)):
         normal = side * np.array([-np.sin(angle), np.cos(angle)])
         ring = ring.trim_by_plane((float(normal[0]), float(normal[1]), 0.0), float(normal @ center))

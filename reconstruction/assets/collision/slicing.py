@@ -1,29 +1,35 @@
-"""Solids cut at the heights of their level faces: boards, floors of containers, undersides of table tops.
+"""Cuts at the heights of a solid's level faces: boards, floors of containers, undersides of table tops.
 
-Cut there, furniture falls into slabs, legs and panels that are convex as they are, a container into its floor and the
-ring of its walls, and what carries things is as level as it was seen.
+Furniture falls into slabs, legs and panels, which are convex, a container into its floor and the ring of its walls.
+Carrying surfaces stay level.
 """
 
 import numpy as np
 
 from reconstruction.assets.solid import Solid, from_manifold, manifold_of
 
-_LEVEL = 0.97  # of a normal's z
-_LEVEL_SHARE, _LEVEL_MIN_M2 = 0.12, 4e-4  # of the box in plan, for level faces to be worth a cut
-_NOISE_M, _APART_M = 0.003, 0.004
-_OUTER_SHARE, _OFF_M = 0.8, 0.0002  # of a level's area that is below the cut, and how far beyond it that is
-_CARRYING_APART_M, _LOWEST_M = 0.02, 0.008
+_LEVEL = 0.97  # least z of a level face's normal
+_LEVEL_SHARE, _LEVEL_MIN_M2 = (
+    0.12,
+    4e-4,
+)  # least area of level faces at a cut: of the bounding rectangle, absolute
+_NOISE_M, _APART_M = 0.003, 0.004  # height range of one level; least distance between levels
+_OUTER_SHARE, _OFF_M = 0.8, 0.0002  # share of a level's area inside its cut; distance of the cut beyond that
+_CARRYING_APART_M, _LOWEST_M = 0.02, 0.008  # least distance between contacts; least height of a contact
 _MAX_LEVELS = 12
-_CRUMB_SHARE = 0.002  # of the volume
-_BUMP_M = 0.012  # lower things than this above a plane that carries others are noise of its surface
+_CRUMB_SHARE = 0.002  # of the solid's volume: smaller pieces are crumbs
+_BUMP_M = 0.012  # lower pieces right above a carrying level are crumbs, too: noise of its surface
 
 
 def sliced(solid: Solid, carrying: tuple[float, ...]) -> tuple[list[Solid], list[Solid]]:
-    """Return the bodies of a solid's layers and, apart, crumbs; the solid itself where there is nothing to cut.
+    """Cut a solid into layers.
 
     Args:
-        solid: Closed, bottom at its lowest point.
-        carrying: Heights at which other things stand on it.
+        solid: closed.
+        carrying: heights of children's contacts.
+
+    Returns:
+        The bodies of all layers, and crumbs; the solid alone where there is nothing to cut.
     """
     heights: dict[float, bool] = {}
     low, high = float(solid.vertices[:, 2].min()), float(solid.vertices[:, 2].max())
@@ -55,7 +61,7 @@ def sliced(solid: Solid, carrying: tuple[float, ...]) -> tuple[list[Solid], list
 
 
 def own_levels(solid: Solid) -> list[float]:
-    """Return heights just above the up-facing and just below the down-facing level faces between bottom and top."""
+    """Return cut heights just above the upward and just below the downward level faces, without bottom and top."""
     corner = solid.vertices[solid.faces]
     cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = np.linalg.norm(cross, axis=1) / 2
@@ -75,7 +81,7 @@ def own_levels(solid: Solid) -> list[float]:
 
 
 def _plateaus(height: np.ndarray, area: np.ndarray, wanted: float, side: float) -> list[tuple[float, float]]:
-    """Return the area of each cluster of heights, and where to cut: off it, or a film of the faces would remain."""
+    """Return area and cut height of each cluster of heights; cuts clear the faces, so that no film remains."""
     order = np.argsort(height, kind="stable")
     height, area = height[order], area[order]
     total = np.concatenate([[0.0], np.cumsum(area)])

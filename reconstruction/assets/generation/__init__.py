@@ -1,7 +1,7 @@
-"""Generation backends: services and models that complete an object from pictures of it, where the user has one.
+"""Generators: services and local models that complete an object from pictures of it.
 
-They stand on the same seam as the embedded completion. What they return is registered to what was seen and rejected
-where it disagrees; then the embedded completion stands in (docs/generation.md).
+They take the place of the embedded completion. Their meshes are registered to the seen points and rejected where they
+disagree; the embedded completion then stands in (docs/generation.md).
 """
 
 from reconstruction.assets.generation.base import (

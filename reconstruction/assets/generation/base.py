@@ -1,4 +1,4 @@
-"""What a generation backend is given, what it returns, and how it may fail."""
+"""Interface of generators: inputs, outputs and errors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,31 +8,31 @@ import numpy as np
 
 from registry.errors import SimReconError
 
-_SENT_SIDE_PX = (256, 1024)  # smallest and largest side of the square picture that is sent
-_SENT_MARGIN = 0.1  # around the object, of its longer side
+_SENT_SIDE_PX = (256, 1024)  # smallest and largest side of the picture that is sent
+_SENT_MARGIN = 0.1  # border around the object, relative to its longer side
 
 
 class GenerationError(SimReconError):
-    """No mesh of this object; another object may have one."""
+    """No mesh of this object; other objects may have one."""
 
 
 class GeneratorUnavailable(GenerationError):
-    """The generator makes no meshes at all: it is away, refuses the key, or is something else."""
+    """No mesh of any object: the generator is unreachable, refuses the key, or is not what was configured."""
 
 
 class RequestRefused(GenerationError):
-    """The service does not take this request, or does not know what it is about."""
+    """The service rejects this request, or does not know its task."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An object in one frame, cropped with some of what is around it."""
+    """An object in one frame, cropped with a margin."""
 
     color: np.ndarray  # uint8 (h, w, 3) RGB
-    mask: np.ndarray  # bool (h, w): the object
+    mask: np.ndarray  # bool (h, w) the object
 
     def cut_out(self) -> np.ndarray:
-        """Return a square picture of nothing but the object: uint8 (s, s, 4) RGBA, white and clear around it."""
+        """Return the object on a square: uint8 (s, s, 4) RGBA, white and transparent around it."""
         import cv2
 
         rows, columns = np.flatnonzero(self.mask.any(axis=1)), np.flatnonzero(self.mask.any(axis=0))
@@ -54,51 +54,52 @@ class Picture:
 
 @dataclass(frozen=True)
 class ObjectPictures:
-    """What a generator is told of one object."""
+    """A generator's input for one object."""
 
     id: int
-    label: str  # "" where it is not known well
-    pictures: tuple[Picture, ...]  # the best first
+    label: str  # "" where it is uncertain
+    pictures: tuple[Picture, ...]  # best first
 
 
 @dataclass
 class Job:
-    """One object's generation: what went to and fro, and what must not be lost while it is under way."""
+    """The generation of one object: its exchanges with the service, and its paid task."""
 
-    pending: dict[str, str] | None = None  # of a paid task that an earlier run began and did not fetch
+    pending: dict[str, str] | None = None  # a paid task that an earlier run did not fetch
     remember: Callable[[dict[str, str] | None], None] = lambda task: (
         None
-    )  # keep such a task; None: it is over
-    exchanges: list[dict[str, Any]] = field(default_factory=list)  # requests and replies, no keys
+    )  # store such a task; None: it is over
+    exchanges: list[dict[str, Any]] = field(default_factory=list)  # requests and replies, without keys
 
 
 class GenerationBackend(Protocol):
     """Makes a textured mesh of an object from pictures.
 
-    A mesh comes as the bytes of a binary glTF file, in the generator's own frame and units, upright as glTF is (+y
-    up): bytes, so that what is kept is what came.
+    The mesh is the unchanged content of a binary glTF file, in the generator's own frame and units, +y up.
     """
 
     name: str
-    cost: float  # credits for one object, 0 where nothing is paid
-    sends_to: str  # where pictures go; "" where they stay on this machine
+    cost: float  # credits per object, 0 where it is free
+    sends_to: str  # address that receives pictures; "" where they stay on this machine
     most_pictures: int
-    at_once: int  # generations that may run beside each other
+    at_once: int  # parallel generations
 
     def settings(self) -> dict[str, Any]:
-        """Return what shapes the mesh beside the pictures (JSON); with them it names a record."""
+        """Return everything but the pictures that determines the mesh, as JSON; it names a record."""
+        ...
 
     def check(self) -> None:
-        """Look whether it can be used at all, without sending or loading anything heavy.
+        """Check that the generator can be used, without sending or loading anything heavy.
 
         Raises:
-            EnvironmentMissing: something is not installed, or a key is not set.
+            EnvironmentMissing: a package is not installed, or a key is not set.
         """
 
     def generate(self, pictures: ObjectPictures, job: Job) -> bytes:
         """Return a .glb of the object.
 
         Raises:
-            GeneratorUnavailable: it makes no meshes, whatever the object.
-            GenerationError: not of this object.
+            GeneratorUnavailable: it makes no meshes at all.
+            GenerationError: it makes none of this object.
         """
+        ...

@@ -1,4 +1,4 @@
-"""A generated mesh in the place of the embedded completion, if it agrees with what was seen."""
+"""Registration of a generated mesh to the seen points, and its rejection where it disagrees."""
 
 from dataclasses import dataclass
 
@@ -16,13 +16,13 @@ from reconstruction.assets.volume import ObjectFrame, ObjectVolume
 from reconstruction.core.types import SpaceGrid
 from registry.geometry import transform_points
 
-_BELIEVED_SHARE = 0.3  # of the points; if fewer are kept, all count
-_FREE = 1  # state of a cell of the scene's space grid
+_BELIEVED_SHARE = 0.3  # least share of the points on the volume's surface; below it, all points are used
+_FREE = 1  # state in the scene's space grid
 
 
 @dataclass(frozen=True)
 class SurfaceColors:
-    """Colors of a surface, to be looked up by place and facing."""
+    """Colors of surface points, for lookup by position and normal."""
 
     points: np.ndarray  # float64 (n, 3)
     normals: np.ndarray  # float64 (n, 3)
@@ -31,28 +31,21 @@ class SurfaceColors:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of generating one object."""
+    """The result of generating one object."""
 
-    how: str  # who made it and how well it fits, or why it is not used; for the asset's provenance
+    how: str  # generator and fit, or the reason against it, for the asset's provenance
     body: Solid | None = None  # in the grid frame; None where it is not used
     colors: SurfaceColors | None = None  # in world space
-    rejected: bool = False  # a mesh was made, and disagrees with what was seen
+    rejected: bool = False  # there is a mesh, but it disagrees with the seen points or space
 
 
 def generated_shape(
     number: int, fetched: Fetched, frame: ObjectFrame, volume: ObjectVolume, space: SpaceGrid | None,
     config: AssetsConfig, *, furniture: bool,
 ) -> Attempt | None:  # fmt: skip
-    """Return the solid of a generated mesh in its place, or why there is none; None where none was asked for.
+    """Return the solid of a generated mesh at its registered pose, or why there is none; None if none was requested.
 
-    Args:
-        number: The object.
-        fetched: What the generator made.
-        frame: Where the object stands and what was seen of it.
-        volume: What is known of the space around it.
-        space: What is known of the rest of the room.
-        config: Bounds for what disagrees.
-        furniture: The object counts as furniture.
+    `space` tells free space beyond the object's grid, `furniture` selects the face budget.
     """
     if number not in fetched.meshes:
         reason = fetched.refused.get(number)
@@ -80,32 +73,25 @@ def generated_shape(
 
 
 def believed_surface(frame: ObjectFrame, volume: ObjectVolume) -> SeenSurface:
-    """Return the seen points that the object's volume keeps as surface: seen by enough frames, and within outlines."""
-    cell = np.floor((frame.points - volume.origin) / volume.voxel_m).astype(np.int64)
-    inside = np.all((cell >= 0) & (cell < volume.seen.shape), axis=1)
-    kept = inside.copy()
-    kept[inside] = volume.seen[tuple(cell[inside].T)]
+    """Return the seen points on the surface of the object's volume: seen by enough frames and within outlines."""
+    kept, _ = volume.lookup(volume.seen, frame.points)
     if kept.mean() < _BELIEVED_SHARE:
         kept[:] = True
     return SeenSurface(frame.points[kept], frame.normals[kept], 0.0 if frame.on_support else None)
 
 
 def free_space(frame: ObjectFrame, volume: ObjectVolume, space: SpaceGrid | None) -> FreeDepth:
-    """Return how deep points of the grid frame are in space that rays passed through.
+    """Return a function that measures the depth of points of the grid frame in free space.
 
-    Within the object's volume it is measured; beyond it, in the coarser grid of the room, free is deep.
+    In the object's grid it is the distance to other space; beyond it, free cells of the room count as deep.
     """
     from scipy.ndimage import distance_transform_edt
 
-    depth = distance_transform_edt(volume.free) * volume.voxel_m
-    shape = np.array(volume.free.shape)
-    beyond = float(shape.max()) * volume.voxel_m
+    depth = np.asarray(distance_transform_edt(volume.free)) * volume.voxel_m
+    beyond = float(max(volume.free.shape)) * volume.voxel_m
 
     def look(points: np.ndarray) -> np.ndarray:
-        cell = np.floor((points - volume.origin) / volume.voxel_m).astype(np.int64)
-        inside = np.all((cell >= 0) & (cell < shape), axis=1)
-        out = np.zeros(len(points))
-        out[inside] = depth[tuple(cell[inside].T)]
+        out, inside = volume.lookup(depth, points)
         if space is not None and not inside.all():
             world = transform_points(frame.world_from_grid, points[~inside])
             out[~inside] = np.where(space.lookup(world) == _FREE, beyond, 0.0)
@@ -124,7 +110,5 @@ def _description(by: str, fit: Registration) -> str:
 def _colors(mesh: GeneratedMesh, frame: ObjectFrame) -> SurfaceColors | None:
     if mesh.colors is None:
         return None
-    rotation = frame.world_from_grid[:3, :3]
-    return SurfaceColors(
-        transform_points(frame.world_from_grid, mesh.points), mesh.normals @ rotation.T, mesh.colors
-    )
+    points = transform_points(frame.world_from_grid, mesh.points)
+    return SurfaceColors(points, mesh.normals @ frame.world_from_grid[:3, :3].T, mesh.colors)

@@ -1,4 +1,4 @@
-"""Meshes of a scene's objects, made before the objects are built: what it costs is said first, and not exceeded."""
+"""Generation of the meshes of a scene's objects, within a budget that is announced first."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,29 +21,21 @@ from reconstruction.views import SceneViews
 
 @dataclass(frozen=True)
 class Fetched:
-    """What a generator made of a scene's objects."""
+    """The meshes of a scene's objects by a generator."""
 
     by: str  # the generator
-    meshes: dict[int, bytes]  # .glb files by object
-    refused: dict[int, str]  # why there is none, by object
+    meshes: dict[int, bytes]  # .glb files by object id
+    refused: dict[int, str]  # reasons for missing ones by object id
 
 
 def fetch_meshes(
     found: InstanceSet, posed: PosedFrames, seen: dict[int, SeenPoints], config: AssetsConfig, progress: Progress,
     views: SceneViews | None = None,
 ) -> Fetched | None:  # fmt: skip
-    """Have every object generated that stands and was seen well enough to be registered.
+    """Generate every standing object with enough seen points; None where no generator is configured.
 
-    Args:
-        found: The objects.
-        posed: Their frames.
-        seen: Their seen points, by id.
-        config: Which generator, and what it may cost.
-        progress: Is told what will be sent and spent before it is, and what failed.
-        views: Of the objects; without them, keyframes are shown.
-
-    Returns:
-        None where no generator is asked for.
+    Pictures are those of `views`, or keyframes where that is None. `progress` notes what will be sent and spent, and
+    failures.
     """
     backend = load_generator(config)
     if backend is None:
@@ -56,7 +48,7 @@ def fetch_meshes(
     ]
     count = min(config.generator_views, backend.most_pictures)
     pictures = object_pictures(found, posed, wanted, max(1, count), views)
-    # Those that were seen most first: they gain most where not all can be paid.
+    # The best seen objects first, as the budget may end: they gain most.
     order = sorted(pictures, key=lambda number: (-len(seen[number].points), number))
     allowed, refused = _within_budget([pictures[number] for number in order], records, backend, config)
     _announce(allowed, refused, records, backend, config, progress)
@@ -69,14 +61,13 @@ def fetch_meshes(
 def _within_budget(
     pictures: list[ObjectPictures], records: Records, backend: GenerationBackend, config: AssetsConfig
 ) -> tuple[list[ObjectPictures], dict[int, str]]:
-    """Return what may be asked for, and why the others may not."""
+    """Return the objects within the budget, and the reasons against the others."""
     spent, allowed, refused = 0.0, [], {}
     for one in pictures:
         cost = 0.0 if records.is_paid(one) else backend.cost
         if cost > 0 and spent + cost > config.generator_budget + 1e-9:
-            refused[one.id] = (
-                f"it would cost {cost:g} credits, over the budget of {config.generator_budget:g}"
-            )
+            budget = config.generator_budget
+            refused[one.id] = f"it would cost {cost:g} credits, over the budget of {budget:g}"
             continue
         spent += cost
         allowed.append(one)
@@ -87,7 +78,7 @@ def _announce(
     allowed: list[ObjectPictures], refused: dict[int, str], records: Records, backend: GenerationBackend,
     config: AssetsConfig, progress: Progress,
 ) -> None:  # fmt: skip
-    """Say what is about to be sent and spent."""
+    """Note what is about to be sent and spent."""
     kept = sum(records.has(one) for one in allowed)
     due = sum(not records.is_paid(one) for one in allowed)
     parts = [f"{backend.name}: {len(allowed) - kept} objects are generated, {kept} are kept from before"]
@@ -109,7 +100,7 @@ def _announce(
 def _make(
     allowed: list[ObjectPictures], records: Records, backend: GenerationBackend
 ) -> tuple[dict[int, bytes], dict[int, str]]:
-    """Return meshes and failures; once a generator turns out to be away, nothing more is asked of it."""
+    """Return meshes and failures; after a `GeneratorUnavailable`, no more requests are sent."""
     gone: list[str] = []
 
     def one(pictures: ObjectPictures) -> bytes | str:

@@ -1,8 +1,8 @@
-"""Hunyuan3D's own HTTP server (`api_server.py` of Tencent-Hunyuan/Hunyuan3D-2 and -2.1): a picture in, a .glb out.
+"""Client of Hunyuan3D's own HTTP server (`api_server.py` of Tencent-Hunyuan/Hunyuan3D-2 and -2.1).
 
-POST /generate answers with the file when it is made, or with status 404 and `{"text", "error_code"}` where the
-generation failed. POST /send answers with `uid` at once, and GET /status/{uid} with "processing" ("texturing" in
-2.1), then "completed" and `model_base64`; a generation that fails there never ends, which the time limit catches.
+POST /generate replies with the .glb when it is made, or with status 404 and `{"text", "error_code"}` if that failed.
+POST /send replies with `uid` at once, and GET /status/{uid} with "processing" ("texturing" in 2.1), then "completed"
+and `model_base64`; after a failure there it stays at "processing" until the time limit.
 """
 
 import base64
@@ -43,13 +43,13 @@ class Hunyuan3D:
     def __init__(
         self, url: str, model: str = "", *, textured: bool, poll: bool, seed: int, limits: ServiceLimits
     ) -> None:
-        """Nothing is sent yet; without a URL it is that of the environment, or this machine's port 8081.
+        """Take the address from `url`, else from the environment, else this machine's port 8081.
 
-        `model` is what the server runs: it tells records of several apart, and is not sent.
+        `model` names what the server runs, to tell its records apart; it is not sent.
         """
         url = url or os.environ.get(HUNYUAN_VARIABLE, "") or HUNYUAN_URL
         if not url.startswith(("http://", "https://")):
-            raise UsageError(f"assets.generator_url is {url!r}; an address as in {HUNYUAN_URL} is expected")
+            raise UsageError(f"assets.generator_url is {url!r}; an address such as {HUNYUAN_URL} is expected")
         self._model, self._textured, self._poll, self._seed = model, textured, poll, seed
         self._service = Service("Hunyuan3D", url, "", limits)
         self.sends_to = self._service.url
@@ -62,7 +62,7 @@ class Hunyuan3D:
         return {"texture": self._textured, "seed": self._seed, "face_count": _FACES, "type": "glb"}
 
     def check(self) -> None:
-        """See `GenerationBackend.check`: whether the server is there shows when it is asked."""
+        """See `GenerationBackend.check`; an unreachable server shows at the first request."""
 
     def generate(self, pictures: ObjectPictures, job: Job) -> bytes:
         """See `GenerationBackend.generate`."""
@@ -71,12 +71,12 @@ class Hunyuan3D:
         deadline = self._service.deadline()
         if self._poll:
             return self._polled(body, job, deadline)
-        # The answer comes when the mesh is made: asking again meanwhile would have it made twice.
-        return self._service.fetch(
-            job, "POST", f"{self._service.url}/generate", deadline, again=False, json=body
-        )
+        # The reply comes after the generation: a second request would start another one.
+        address = f"{self._service.url}/generate"
+        return self._service.fetch(job, "POST", address, deadline, again=False, json=body)
 
     def _polled(self, body: dict[str, Any], job: Job, deadline: float) -> bytes:
+        """Send a job or resume the pending one, and poll it."""
         if job.pending is None:
             sent = self._service.ask(job, "POST", "/send", _Sent, deadline, paid=True, json=body)
             uid = sent.uid

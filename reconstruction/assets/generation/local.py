@@ -1,9 +1,9 @@
-"""TRELLIS and SAM 3D Objects on this machine, by the Python interfaces that their repositories document.
+"""TRELLIS and SAM 3D Objects on this machine, by the Python interfaces of their repositories.
 
 TRELLIS: https://github.com/microsoft/TRELLIS (`TrellisImageTo3DPipeline.from_pretrained(...).run(image)`, then
 `postprocessing_utils.to_glb`). SAM 3D Objects: https://github.com/facebookresearch/sam-3d-objects (`Inference` of its
-`notebook/inference.py`, called with an image and a mask; the answer's `glb` is a mesh). Both need an NVIDIA GPU and
-install by their own instructions. Neither has been run in this project: the code follows their sources.
+`notebook/inference.py`, called with an image and a mask; `glb` of its result is a mesh). Both need an NVIDIA GPU and
+are installed by their own instructions. Neither has been run in this project: the code follows their sources.
 """
 
 import importlib.util
@@ -19,7 +19,7 @@ from registry.errors import EnvironmentMissing
 TRELLIS_MODEL = "microsoft/TRELLIS-image-large"
 _TRELLIS_PAGE = "https://github.com/microsoft/TRELLIS#-installation"
 _SAM3D_PAGE = "https://github.com/facebookresearch/sam-3d-objects/blob/main/doc/setup.md"
-_KEPT_SHARE = 0.95  # of the triangles, removed by TRELLIS' own simplification
+_KEPT_SHARE = 0.95  # TRELLIS' `simplify`: share of the triangles that is removed
 _TEXTURE_PX = 1024
 
 
@@ -33,18 +33,14 @@ class Trellis:
     at_once = 1
 
     def __init__(self, model: str, seed: int) -> None:
-        """Nothing is loaded yet. `model` is a name on the Hugging Face hub or a folder."""
+        """Store the model, a name on the Hugging Face hub or a folder; it is loaded with the first object."""
         self._model, self._seed = model or TRELLIS_MODEL, seed
         self._pipeline: Any = None
 
     def settings(self) -> dict[str, Any]:
         """See `GenerationBackend.settings`."""
-        return {
-            "model": self._model,
-            "seed": self._seed,
-            "simplify": _KEPT_SHARE,
-            "texture_size": _TEXTURE_PX,
-        }
+        size = {"simplify": _KEPT_SHARE, "texture_size": _TEXTURE_PX}
+        return {"model": self._model, "seed": self._seed, **size}
 
     def check(self) -> None:
         """See `GenerationBackend.check`."""
@@ -70,8 +66,8 @@ class Trellis:
     def _load(self) -> tuple[Any, Any]:
         if self._pipeline is None:
             try:
-                from trellis.pipelines import TrellisImageTo3DPipeline
-                from trellis.utils.postprocessing_utils import to_glb
+                from trellis.pipelines import TrellisImageTo3DPipeline  # pyright: ignore[reportMissingImports]
+                from trellis.utils.postprocessing_utils import to_glb  # pyright: ignore[reportMissingImports]
 
                 pipeline = TrellisImageTo3DPipeline.from_pretrained(self._model)
                 pipeline.cuda()
@@ -84,7 +80,7 @@ class Trellis:
 
 
 class Sam3D:
-    """See `GenerationBackend`. It sees the object within its surroundings."""
+    """See `GenerationBackend`; the model gets the object's surroundings, too."""
 
     name = "sam3d"
     cost = 0.0
@@ -93,7 +89,7 @@ class Sam3D:
     at_once = 1
 
     def __init__(self, pipeline_file: str, seed: int) -> None:
-        """Nothing is loaded yet; `pipeline_file` is the `pipeline.yaml` of the downloaded checkpoints."""
+        """Store the `pipeline.yaml` of the downloaded checkpoints; it is loaded with the first object."""
         self._file, self._seed = pipeline_file, seed
         self._inference: Any = None
 
@@ -132,7 +128,7 @@ class Sam3D:
             folder = str(_repository() / "notebook")
             sys.path.insert(0, folder)
             try:
-                from inference import Inference  # of their repository: it is no package
+                from inference import Inference  # pyright: ignore[reportMissingImports]  # a file of their repository
 
                 self._inference = Inference(str(self._pipeline_file()), compile=False)
             except (ImportError, OSError, RuntimeError, ValueError, AssertionError) as error:
@@ -153,10 +149,10 @@ def _repository() -> Path:
 
 
 def _needs(option: str, module: str, page: str) -> None:
-    """Look whether a module is installed, without loading what belongs to it."""
+    """Check that a module is installed, without importing it."""
     try:
         found = importlib.util.find_spec(module) is not None
-    except ImportError:  # of the package around it
+    except ImportError:  # by the package around it
         found = False
     if not found:
         raise EnvironmentMissing(

@@ -1,4 +1,4 @@
-"""A generated mesh: read, checked, made light, and its surface as points with normals and colors."""
+"""Generated meshes: reading, checks, decimation, and sampling of the surface with normals and colors."""
 
 import io
 from dataclasses import dataclass, replace
@@ -9,27 +9,27 @@ import numpy as np
 from reconstruction.assets.generation.base import GenerationError
 from reconstruction.assets.loaded import colors_of, load_mesh, picture_of, upright
 
-_MOST_FACES = 60_000  # that are worked on; detail beyond is finer than what the video saw
+_MOST_FACES = 60_000  # decimated to this many: finer detail is beyond what the video saw
 _SAMPLES = 120_000
 
 
 @dataclass(frozen=True)
 class GeneratedMesh:
-    """A mesh as a generator made it, +z up, in its own units, or as it was moved from there."""
+    """A generated mesh, +z up, in its own units or moved."""
 
     vertices: np.ndarray  # float64 (v, 3)
     faces: np.ndarray  # int32 (f, 3)
-    points: np.ndarray  # float64 (n, 3) on its surface, evenly
+    points: np.ndarray  # float64 (n, 3) evenly on the surface
     normals: np.ndarray  # float64 (n, 3) of the triangles there
-    colors: np.ndarray | None  # uint8 (n, 3) RGB there; None where it has no looks
+    colors: np.ndarray | None  # uint8 (n, 3) RGB there; None where it has none
 
     @property
     def extents(self) -> np.ndarray:
-        """Return the size of its box (3,)."""
+        """Return the size of the axis-aligned box (3,)."""
         return np.ptp(self.vertices, axis=0)
 
     def moved(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> "GeneratedMesh":
-        """Return it under x -> scale * rotation @ x + translation."""
+        """Return the mesh under x -> scale * rotation @ x + translation."""
         return replace(
             self,
             vertices=scale * self.vertices @ rotation.T + translation,
@@ -39,7 +39,7 @@ class GeneratedMesh:
 
 
 def read_generated(data: bytes, seed: int = 0) -> GeneratedMesh:
-    """Read a .glb that a generator made.
+    """Read the .glb of a generator.
 
     Raises:
         GenerationError: it holds no usable mesh.
@@ -66,10 +66,10 @@ def read_generated(data: bytes, seed: int = 0) -> GeneratedMesh:
 
 
 def _spread(area: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return triangles (n,) and barycentric weights (n, 3) of points that lie evenly on the surface."""
+    """Return triangles (n,) and barycentric weights (n, 3) of points by stratified sampling of the surface."""
     rng = np.random.default_rng(seed)
     edges = np.cumsum(area)
-    # One point in each of n equal parts of the area: no holes, as chance alone would leave.
+    # One point in each of n equal parts of the area leaves no holes.
     place = (np.arange(count) + rng.random(count)) * (edges[-1] / count)
     chosen = np.minimum(np.searchsorted(edges, place, side="right"), len(area) - 1)
     u, v = rng.random((2, count))
@@ -78,7 +78,7 @@ def _spread(area: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.nda
 
 
 def _colors(loaded: Any, corners: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
-    """Return the colors uint8 (n, 3) at points given by the corners (n, 3) of their triangles and weights."""
+    """Return the colors uint8 (n, 3) at points with these triangle corners (n, 3) and barycentric weights."""
     drawn = picture_of(loaded)
     if drawn is not None:
         uv, picture = drawn
@@ -88,25 +88,24 @@ def _colors(loaded: Any, corners: np.ndarray, weight: np.ndarray) -> np.ndarray 
         y = np.clip(((1.0 - place[:, 1]) * rows).astype(np.int64), 0, rows - 1)
         return picture[y, x]
     colors = colors_of(loaded)
-    if colors is None or (colors == colors[0]).all():  # the gray that readers put where there is nothing
+    if colors is None or (colors == colors[0]).all():  # the default gray of readers
         return None
     mixed = np.einsum("nk,nkc->nc", weight, colors[corners].astype(np.float64))
     return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
 
 
 def _lighter(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Decimate to `_MOST_FACES` by quadric error."""
     import fast_simplification
 
-    # Readers split vertices at texture seams: they must be one again, or seams open.
+    # Merge the vertices that readers split at texture seams, or the seams would open.
     place, index = np.unique(
         np.round(vertices / np.ptp(vertices, axis=0).max(), 7), axis=0, return_inverse=True
     )
     joined = np.zeros_like(place)
     joined[index.ravel()] = vertices
     out_vertices, out_faces = fast_simplification.simplify(
-        np.ascontiguousarray(joined),
-        np.ascontiguousarray(index.ravel()[faces], np.int32),
-        target_count=_MOST_FACES,
-        agg=3,
-    )
+        np.ascontiguousarray(joined), np.ascontiguousarray(index.ravel()[faces], np.int32),
+        target_count=_MOST_FACES, agg=3,
+    )[:2]  # fmt: skip
     return np.asarray(out_vertices, np.float64), np.asarray(out_faces, np.int32)

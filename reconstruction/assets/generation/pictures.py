@@ -1,4 +1,4 @@
-"""Which pictures of an object a generator is shown, and what they are sent as."""
+"""Choice and encoding of the pictures of an object that a generator gets."""
 
 import hashlib
 from collections.abc import Sequence
@@ -10,27 +10,17 @@ from reconstruction.assets.generation.base import ObjectPictures, Picture
 from reconstruction.core.types import Instance, InstanceSet, PosedFrames
 from reconstruction.views import SceneViews, View
 
-_LABEL_BELIEVED = 0.5
-_LEAST_FRONTS = 0.6  # of what a view shows; of the inside of a shell no generator is to be told
-_SPECK_SHARE = 0.1  # of an object's largest part in the picture
+_LABEL_BELIEVED = 0.5  # least confidence of a label that is sent
+_LEAST_FRONTS = 0.6  # least share of front faces in a view: the inside of a shell misleads a generator
+_SPECK_SHARE = 0.1  # least size of a mask's component, relative to the largest
 
 
 def object_pictures(
-    found: InstanceSet,
-    posed: PosedFrames,
-    wanted: list[Instance],
-    count: int,
-    views: SceneViews | None = None,
-) -> dict[int, ObjectPictures]:
-    """Return up to `count` pictures of each wanted object that anything shows, by its id.
+    found: InstanceSet, posed: PosedFrames, wanted: list[Instance], count: int, views: SceneViews | None = None
+) -> dict[int, ObjectPictures]:  # fmt: skip
+    """Return up to `count` pictures by object id, of each wanted object that has any.
 
-    Args:
-        found: the objects and which pixels show them.
-        posed: the keyframes.
-        wanted: objects.
-        count: of pictures.
-        views: what the stage `views` chose: its pictures, without what hides the object; keyframes stand in for an
-            object without views, and for all where it is None.
+    They are its views without occluders; keyframes replace missing views.
     """
     chosen = {} if views is None else {item.id: view_pictures(views.of(item.id), count) for item in wanted}
     frames = {} if all(chosen.get(item.id) for item in wanted) else keyframe_pictures(found, posed, count)
@@ -44,13 +34,13 @@ def object_pictures(
 
 
 def view_pictures(views: Sequence[View], count: int) -> list[Picture]:
-    """Return pictures of an object from its views, without what hides it; none from where backs are seen most."""
+    """Return up to `count` pictures of an object from its views, without occluders and without views of back faces."""
     shown = [view.cleared() for view in views if view.fronts >= _LEAST_FRONTS]
     return [Picture(color, _without_specks(mask)) for color, mask in filter(None, shown)][:count]
 
 
 def keyframe_pictures(found: InstanceSet, posed: PosedFrames, count: int) -> dict[int, list[Picture]]:
-    """Return the keyframes that show each object best, cropped, by its id."""
+    """Return crops of the `count` keyframes that show each object best, by object id."""
     from reconstruction.instances.naming.views import best_views
 
     return {
@@ -60,7 +50,7 @@ def keyframe_pictures(found: InstanceSet, posed: PosedFrames, count: int) -> dic
 
 
 def _without_specks(mask: np.ndarray) -> np.ndarray:
-    """Return a mask without what is small and apart: smears of its neighbors."""
+    """Drop small components of a mask, such as depth bleeding from neighbors."""
     _, labels, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     sizes = facts[1:, cv2.CC_STAT_AREA]
     kept = 1 + np.flatnonzero(sizes >= _SPECK_SHARE * sizes.max())
@@ -68,13 +58,13 @@ def _without_specks(mask: np.ndarray) -> np.ndarray:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Return an RGB or RGBA image uint8 (h, w, c) as a PNG."""
+    """Encode an RGB or RGBA image uint8 (h, w, c) as PNG."""
     how = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
     return cv2.imencode(".png", cv2.cvtColor(image, how))[1].tobytes()
 
 
 def pixel_digest(picture: Picture) -> str:
-    """Return a name for what a picture shows (of its pixels, not of a file, which differs with its library)."""
+    """Return a digest of a picture's pixels; that of a file would depend on the PNG library."""
     digest = hashlib.sha256(str(picture.color.shape).encode())
     digest.update(np.ascontiguousarray(picture.color).tobytes())
     digest.update(np.packbits(picture.mask).tobytes())

@@ -1,8 +1,8 @@
-"""Kept generations: pictures, exchanges and meshes in a folder. What is in it is neither asked nor paid again.
+"""Records of generations in a folder: pictures, exchanges and meshes. Recorded meshes are not requested or paid again.
 
-A record is named by a digest of everything that shapes the mesh: the generator, its settings, the label and the
-pixels. `DIGEST.glb` is the mesh, byte by byte as it came; `DIGEST.json` says from what and how; `DIGEST.pending.json`
-is a task that was begun and not fetched, so that a run that was stopped goes on with it instead of paying anew.
+The name is a digest of everything that determines the mesh: generator, settings, label and pixels. `DIGEST.glb` is the
+unchanged mesh, `DIGEST.json` its inputs and exchanges. `DIGEST.pending.json` is a paid task that was not fetched; the
+next run resumes it.
 """
 
 import hashlib
@@ -16,29 +16,29 @@ from reconstruction.learned.requesting import write_whole
 
 
 class Records:
-    """The folder, for one generator."""
+    """The records of one generator."""
 
     def __init__(self, folder: Path, backend: GenerationBackend) -> None:
-        """Nothing is read or written yet."""
+        """Set the folder; nothing is read or written yet."""
         self._folder, self._backend = folder, backend
 
     def any_kept(self) -> bool:
-        """Tell whether any mesh of this generator is kept."""
+        """Tell whether there is any mesh of this generator."""
         return any(self._folder.glob(f"{self._backend.name}-*.glb"))
 
     def has(self, pictures: ObjectPictures) -> bool:
-        """Tell whether the mesh of these pictures is kept."""
+        """Tell whether there is a mesh of these pictures."""
         return self._file(pictures, ".glb").is_file()
 
     def is_paid(self, pictures: ObjectPictures) -> bool:
-        """Tell whether nothing more is to be paid for these pictures: kept, or under way."""
+        """Tell whether these pictures cost nothing more: their mesh is recorded, or its task pending."""
         return self.has(pictures) or self._file(pictures, ".pending.json").is_file()
 
     def generate(self, pictures: ObjectPictures) -> bytes:
-        """Return the mesh of an object, kept or made.
+        """Return the recorded mesh of an object, or generate and record it.
 
         Raises:
-            GenerationError: there is none.
+            GenerationError: the generator made none.
         """
         mesh = self._file(pictures, ".glb")
         if mesh.is_file():
@@ -78,7 +78,7 @@ class Records:
 
 
 def _read_task(file: Path) -> dict[str, str] | None:
-    """Return a task under way; None where there is none, or the file is damaged."""
+    """Return a pending task; None where there is none, or the file is damaged."""
     try:
         task = json.loads(file.read_text())
     except (OSError, ValueError):

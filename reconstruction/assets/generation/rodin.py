@@ -1,9 +1,9 @@
-"""Rodin (Hyper3D), a paid service: submit pictures, look at the jobs until they are done, download.
+"""Client of Rodin (Hyper3D), a paid service: submit pictures, poll the jobs, download the mesh.
 
 The protocol is that of https://developer.hyper3d.ai/api-specification/rodin-generation-gen2 (POST /api/v2/rodin,
-multipart, answers with `uuid` and `jobs.subscription_key`), .../check-status (POST /api/v2/status: Waiting,
-Generating, Done or Failed for each job), .../download-results (POST /api/v2/download: names and addresses that soon
-expire) and .../check_balance. The key of the environment goes to that host as a bearer token and is written nowhere.
+multipart, replies with `uuid` and `jobs.subscription_key`), .../check-status (POST /api/v2/status: Waiting,
+Generating, Done or Failed for each job), .../download-results (POST /api/v2/download: names and addresses that expire
+soon) and .../check_balance. The key of the environment is sent to that host as a bearer token and stored nowhere.
 """
 
 import os
@@ -25,7 +25,7 @@ from registry.errors import EnvironmentMissing
 RODIN_URL = "https://api.hyper3d.com"
 RODIN_KEY = "SIMRECON_RODIN_KEY"
 DEFAULT_TIER = "Gen-2"
-_CREDITS = {"Gen-2.5-Extreme-High": 1.0}  # all other tiers: half a credit, as the pages above say
+_CREDITS = {"Gen-2.5-Extreme-High": 1.0}  # all other tiers: half a credit, by the pages above
 _FACES = 18_000
 
 
@@ -100,12 +100,11 @@ class Rodin:
 
     def balance(self) -> float:
         """Return the credits that the account has left."""
-        return self._service.ask(
-            Job(), "GET", "/api/v2/check_balance", _Balance, self._service.deadline()
-        ).balance
+        deadline = self._service.deadline()
+        return self._service.ask(Job(), "GET", "/api/v2/check_balance", _Balance, deadline).balance
 
     def generate(self, pictures: ObjectPictures, job: Job) -> bytes:
-        """See `GenerationBackend.generate`. A task that was paid for and not fetched is gone on with."""
+        """See `GenerationBackend.generate`; a paid task that was not fetched is resumed."""
         if not self._key:
             raise GeneratorUnavailable(f"{RODIN_KEY} is not set, and no mesh of this object is kept")
         deadline = self._service.deadline()
@@ -117,7 +116,7 @@ class Rodin:
             self._until_done(task, job, deadline)
             data = self._download(task, job, deadline)
         except RequestRefused:
-            job.remember(None)  # it knows no such task any more
+            job.remember(None)  # the service does not know the task any more
             raise
         job.remember(None)
         return data
@@ -151,6 +150,7 @@ class Rodin:
             self._service.wait(deadline)
 
     def _download(self, task: dict[str, str], job: Job, deadline: float) -> bytes:
+        """Return the .glb of a finished task, the PBR one where there are several."""
         body = {"task_uuid": task["uuid"]}
         reply = self._service.ask(job, "POST", "/api/v2/download", _Downloads, deadline, json=body)
         found = [file for file in reply.files if file.name.lower().endswith(".glb")]

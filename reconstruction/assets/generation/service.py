@@ -1,4 +1,4 @@
-"""A generation service behind HTTP: retries, time limits, replies that must be what the protocol says."""
+"""HTTP client of a generation service, with retries, time limits and validated replies."""
 
 import hashlib
 import time
@@ -14,35 +14,35 @@ from reconstruction.learned.requesting import asked_pause, excerpt
 
 _TRIES = 5
 _LONGEST_PAUSE_S = 60.0
-_LONGEST_REPLY_S = 120.0  # of one request that does not wait for a generation
+_LONGEST_REPLY_S = 120.0  # of a request that does not wait for a generation
 _CONNECT_S = 10.0
 _CHUNK = 1 << 18
 _BUSY = (429, 500, 502, 503, 504)
-_PERHAPS_TAKEN = (502, 504)  # a gateway gave up: what is behind it may have taken the request
-_MOST_TEXT = 1 << 20  # of a JSON reply that carries no mesh
+_PERHAPS_TAKEN = (502, 504)  # gateway errors: the server behind it may have accepted the request
+_MOST_TEXT = 1 << 20  # bytes of a JSON reply without a mesh
 Reply = TypeVar("Reply", bound=BaseModel)
 
 
 @dataclass(frozen=True)
 class ServiceLimits:
-    """How long, how often and how much."""
+    """Limits of time, size and polling."""
 
     timeout_s: float = 900.0  # for one object, from the first request to the last byte
     max_bytes: int = 100 << 20  # of one mesh
-    pause_s: float = 1.0  # before the second try; doubled before each further one
-    poll_s: float = 5.0  # between two looks at a job
+    pause_s: float = 1.0  # before the second try, doubled before each further one
+    poll_s: float = 5.0  # between two polls of a job
 
 
 class Service:
-    """One service, for one job after another; every request and reply is written to the job."""
+    """One service; every request and reply is logged in its job."""
 
     def __init__(self, name: str, url: str, key: str, limits: ServiceLimits) -> None:
-        """Nothing is sent yet."""
+        """Store the settings; nothing is sent yet."""
         self.name, self.url, self.limits = name, url.rstrip("/"), limits
         self._key = key
 
     def deadline(self) -> float:
-        """Return when a job that begins now must be done (monotonic seconds)."""
+        """Return the deadline of a job that starts now (monotonic seconds)."""
         return time.monotonic() + self.limits.timeout_s
 
     def ask(
@@ -52,19 +52,22 @@ class Service:
         """Send a request and return its JSON reply.
 
         Args:
-            job: Is told of it.
+            job: logs the exchange.
             method: "GET" or "POST".
-            path: Below the address of the service.
-            reply: What the answer is parsed into.
-            deadline: Of the job.
-            paid: Is not sent again where it may have been taken.
-            mesh_inside: The reply may be as large as a mesh.
-            content: What `requests` takes: `json`, `files`, `data`.
+            path: below the address of the service.
+            reply: type of the parsed reply.
+            deadline: of the job.
+            paid: do not send it again if it may have been accepted.
+            mesh_inside: the reply may be as large as a mesh.
+            content: arguments of `requests`: `json`, `files`, `data`.
+
+        Raises:
+            GeneratorUnavailable: the reply is not of this protocol.
         """
+        most = self.limits.max_bytes * 2 if mesh_inside else _MOST_TEXT
         data, kind = self._exchange(
-            job, method, f"{self.url}{path}", deadline, again=not paid,
-            most=self.limits.max_bytes * 2 if mesh_inside else _MOST_TEXT, **content,
-        )  # fmt: skip
+            job, method, f"{self.url}{path}", deadline, again=not paid, most=most, **content
+        )
         try:
             parsed = reply.model_validate_json(data)
         except ValidationError as error:
@@ -78,7 +81,7 @@ class Service:
     def fetch(
         self, job: Job, method: str, url: str, deadline: float, *, again: bool = True, **content: Any
     ) -> bytes:
-        """Return the bytes of a mesh; the key goes to the service's own host alone."""
+        """Return the bytes of a .glb; the key is sent to the service's own host alone."""
         data, kind = self._exchange(
             job, method, url, deadline, again=again, most=self.limits.max_bytes, long=not again, **content
         )
@@ -91,7 +94,7 @@ class Service:
         return data
 
     def wait(self, deadline: float) -> None:
-        """Pause before the next look at a job.
+        """Pause before the next poll of a job.
 
         Raises:
             GenerationError: the job's time is up.
@@ -107,7 +110,12 @@ class Service:
         self, job: Job, method: str, url: str, deadline: float, *, again: bool, most: int, long: bool = False,
         **content: Any,
     ) -> tuple[bytes, str]:  # fmt: skip
-        """Return the body and the type of a successful reply."""
+        """Send a request until it succeeds; return the reply's body and content type.
+
+        Raises:
+            GenerationError: no mesh of this object: too late, too large, or not to be sent again.
+            GeneratorUnavailable: the service cannot be reached, or refuses the key.
+        """
         pause, problem, answered = self.limits.pause_s, "", True
         for attempt in range(_TRIES):
             if attempt:
@@ -118,17 +126,15 @@ class Service:
             left = deadline - time.monotonic()
             if left <= 0:
                 break
-            entry = {"method": method, "address": url.split("?")[0]}
+            entry: dict[str, Any] = {"method": method, "address": url.split("?")[0]}
             job.exchanges.append(entry)
+            limit = left if long else min(left, _LONGEST_REPLY_S)
             try:
-                with self._send(
-                    method, url, left if long else min(left, _LONGEST_REPLY_S), content
-                ) as response:
+                with self._send(method, url, limit, content) as response:
                     entry["status"] = response.status_code
                     if response.ok:
                         return self._body(response, deadline, most), response.headers.get("Content-Type", "")
-                    text = self._text(response)
-                    problem = f"HTTP {response.status_code}: {excerpt(text)}"
+                    problem = f"HTTP {response.status_code}: {excerpt(self._text(response))}"
                     self._judge(response.status_code, problem, again)
                     pause = min(max(pause, asked_pause(response)), _LONGEST_PAUSE_S)
                     answered = True
@@ -154,17 +160,11 @@ class Service:
     def _send(self, method: str, url: str, timeout_s: float, content: dict[str, Any]) -> requests.Response:
         own = urlsplit(url).netloc == urlsplit(self.url).netloc
         headers = {"Authorization": f"Bearer {self._key}"} if self._key and own else {}
-        return requests.request(
-            method,
-            url,
-            headers=headers,
-            timeout=(min(_CONNECT_S, timeout_s), timeout_s),
-            stream=True,
-            **content,
-        )
+        timeout = (min(_CONNECT_S, timeout_s), timeout_s)
+        return requests.request(method, url, headers=headers, timeout=timeout, stream=True, **content)
 
     def _judge(self, status: int, problem: str, again: bool) -> None:
-        """Return where the request may be sent once more."""
+        """Raise for an error status, unless the request may be sent again."""
         if status in (401, 403):
             raise GeneratorUnavailable(f"{self.name} refuses the key ({problem})")
         if status == 402:
@@ -177,7 +177,7 @@ class Service:
             )
 
     def _body(self, response: requests.Response, deadline: float, most: int) -> bytes:
-        """Read a reply piece by piece: neither larger nor longer than allowed."""
+        """Read a reply in chunks, within the limits of size and time."""
         out = bytearray()
         for piece in response.iter_content(_CHUNK):
             out += piece
@@ -194,7 +194,7 @@ class Service:
 
 
 def _never_sent(error: requests.RequestException) -> bool:
-    """Tell whether nobody was there to take a request."""
+    """Tell whether no connection was made."""
     reason = getattr(error.args[0] if error.args else None, "reason", None)
     return type(reason).__name__ in ("NewConnectionError", "ConnectTimeoutError", "NameResolutionError")
 

@@ -1,4 +1,4 @@
-"""From a generated mesh, in its place, to one closed manifold solid; holes closed, thin sheets given thickness."""
+"""Conversion of a placed, generated mesh to one closed manifold solid."""
 
 import numpy as np
 
@@ -15,17 +15,17 @@ from reconstruction.assets.solid import (
     without_crumbs,
 )
 
-_CELLS_MORE = 1.4  # than the embedded completion uses: a generated mesh has no noise
-_SMOOTHING = 3
+_CELLS_MORE = 1.4  # finer than the embedded completion, as a generated mesh has no noise
+_SMOOTHING = 3  # iterations
 _LEAST_M3 = 1e-7
-_WALL = 1.0  # voxels from the surface at which the flood stops
+_WALL = 1.0  # half thickness of the surface that stops the flood, voxels
 
 
 def closed_solid(mesh: GeneratedMesh, config: AssetsConfig, budget: int) -> Solid | None:
     """Return a mesh in metres as a closed solid of about `budget` faces; None where nothing solid is left.
 
-    Where the mesh is a closed manifold, and stays one when it is made light, its own surface is kept. Otherwise the
-    space around it is flooded on a grid, and what the flood does not reach is inside.
+    A closed manifold keeps its surface if decimation keeps it closed. Otherwise the space outside is flood-filled on a
+    grid, which closes holes and thickens sheets.
     """
     own = to_manifold(_joined(mesh.vertices, mesh.faces))
     if own is not None:
@@ -44,12 +44,13 @@ def closed_solid(mesh: GeneratedMesh, config: AssetsConfig, budget: int) -> Soli
 
 
 def flooded(mesh: GeneratedMesh, voxel_m: float, thickness_m: float) -> CompletedField:
-    """Return a signed distance: near the surface by the side that it faces, elsewhere by what a flood reaches.
+    """Return a signed distance field by flood filling the space outside a mesh.
 
-    Where the flood gets in through a hole, what remains is a shell of `thickness_m`, inwards from the surface.
+    Near the surface, its normals decide the sign. Where the flood enters through a hole, a shell of `thickness_m`
+    remains, inwards from the surface.
     """
     from scipy.ndimage import binary_dilation, label
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     thickness_m = max(thickness_m, 2.0 * voxel_m)
     reach = int(np.ceil(thickness_m / voxel_m)) + 1
@@ -58,21 +59,21 @@ def flooded(mesh: GeneratedMesh, voxel_m: float, thickness_m: float) -> Complete
     shape = np.ceil((mesh.points.max(axis=0) - origin) / voxel_m).astype(np.int64) + pad
     crust = np.zeros(shape, bool)
     crust[tuple(np.floor((mesh.points - origin) / voxel_m).astype(np.int64).T)] = True
-    near = binary_dilation(crust, np.ones((3, 3, 3), bool), iterations=reach)
+    near = np.asarray(binary_dilation(crust, np.ones((3, 3, 3), bool), iterations=reach), bool)
     centers = origin + (np.argwhere(near) + 0.5) * voxel_m
     distance, nearest = cKDTree(mesh.points).query(centers)
     front = np.einsum("nk,nk->n", centers - mesh.points[nearest], mesh.normals[nearest]) > 0
     wall = np.zeros(shape, bool)
     wall[near] = distance < _WALL * voxel_m
-    bodies, _ = label(~wall)
+    bodies = label(~wall)[0]  # pyright: ignore[reportIndexIssue]
     air = bodies == bodies[0, 0, 0]
-    rim = binary_dilation(air & ~near)[near]
-    if rim.any() and front[rim].mean() < 0.5:  # a mesh inside out
+    rim = np.asarray(binary_dilation(air & ~near), bool)[near]
+    if rim.any() and front[rim].mean() < 0.5:  # the mesh is inside out
         front = ~front
     field = np.where(air, 1.0, -1.0) * reach * voxel_m
     field[near] = np.where(front, distance, np.maximum(-distance, distance - thickness_m))
-    # What the air does not reach is no hollow: pages of a book, shells within shells.
-    reached = binary_dilation(air, iterations=int(np.ceil(_WALL)) + 1)
+    # Space that the flood does not reach is solid: pages of a book, shells within shells.
+    reached = np.asarray(binary_dilation(air, iterations=int(np.ceil(_WALL)) + 1), bool)
     field = np.where((field > 0) & ~reached, -0.5 * voxel_m, field)
     limit = 3.0 * voxel_m
     return CompletedField(origin, voxel_m, np.clip(field, -limit, limit).astype(np.float32), ())
@@ -85,7 +86,7 @@ def _voxel(mesh: GeneratedMesh, config: AssetsConfig) -> float:
 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray) -> Solid:
-    """Join vertices in the same place: readers split them at texture seams."""
+    """Merge vertices at the same position, which readers split at texture seams."""
     step = 1e-6 * max(float(np.ptp(vertices, axis=0).max()), 1e-9)
     _, first, index = np.unique(
         np.round(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True

@@ -1,1 +1,1 @@
-"""Physical attributes: what a thing is made of, what it weighs, how it slides and bounces, and how sure that is."""
+"""Physical attributes of objects: material, mass, friction and restitution, with ranges."""

@@ -1,4 +1,4 @@
-"""Who says what things are made of: the seam."""
+"""Interface of the sources of materials and masses."""
 
 from typing import Protocol
 
@@ -11,20 +11,20 @@ from reconstruction.views import SceneViews
 
 
 class Physicist(Protocol):
-    """Says what things are made of and what they weigh."""
+    """A source of materials and masses."""
 
     name: str
 
     def choose(
         self, found: InstanceSet, posed: PosedFrames, *, views: SceneViews | None = None, progress: Progress
     ) -> dict[int, MaterialChoice]:
-        """Return a choice for each object, by its id, of which anything is known; the table decides on the others.
+        """Return a choice by object id where it has one; the table decides on the others.
 
         Args:
-            found: The things and which pixels show them.
-            posed: The frames they show in.
-            views: Of each thing, where they were made.
-            progress: Told of what went wrong.
+            found: the objects and their pixels.
+            posed: the keyframes.
+            views: views of each object, where they were made.
+            progress: notes failures.
         """
         ...
 
@@ -32,7 +32,7 @@ class Physicist(Protocol):
 def choice_for(
     item: Instance, said: dict[int, MaterialChoice], mean_rgb: np.ndarray, extents_m: np.ndarray
 ) -> MaterialChoice:
-    """Return what was said of an object, or else what the table says."""
+    """Return the physicist's choice for an object, else the table's."""
     if item.id in said:
         return said[item.id]
     return choose_material(item.label, item.label_confidence, mean_rgb, extents_m)

@@ -1,9 +1,10 @@
-"""Who says what things are made of: what the config asks for, loaded."""
+"""Loading of the physicist that the config names."""
 
 import os
 
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.physics.base import Physicist
+from reconstruction.core.plugins import load_plugin
 
 
 def load_physicist(config: AssetsConfig) -> Physicist | None:
@@ -14,6 +15,8 @@ def load_physicist(config: AssetsConfig) -> Physicist | None:
     """
     if config.physics == "table":
         return None
+    if config.physics != "vlm":
+        return load_plugin("assets.physics", config.physics, AssetsConfig)(config)
     from reconstruction.assets.physics.vlm import VlmPhysicist
     from reconstruction.learned.vlm import Endpoint, VlmClient
 
@@ -21,12 +24,12 @@ def load_physicist(config: AssetsConfig) -> Physicist | None:
 
 
 def physics_backend(config: AssetsConfig) -> str:
-    """Say who decides, for the bundle."""
-    if config.physics == "table":
-        return "table"
+    """Return the name of the source of materials, for the bundle."""
+    if config.physics != "vlm":
+        return config.physics
     return f"{config.physics} ({config.physics_model or os.environ.get('SIMRECON_VLM_MODEL', '')})"
 
 
 def outside_inputs(config: AssetsConfig) -> tuple[str, ...]:
-    """Return what stands behind the names in the config: another model must not reuse a result."""
-    return () if config.physics == "table" else (f"physics {physics_backend(config)}",)
+    """Return the inputs outside the config that results depend on: another model must not reuse a result."""
+    return () if config.physics != "vlm" else (f"physics {physics_backend(config)}",)

@@ -1,4 +1,4 @@
-"""Mass, center of mass and inertia of a closed mesh of some material."""
+"""Mass, center of mass and inertia of a closed mesh of a given material."""
 
 import numpy as np
 
@@ -10,16 +10,16 @@ _MIN_KG, _MAX_KG = 0.005, 250.0
 
 
 def physical_attributes(solid: Solid, choice: MaterialChoice) -> PhysicalAttributes:
-    """Compute physics in the solid's own space; hollow things weigh what their walls weigh, packages their contents.
+    """Compute the physics of an object: hollow ones weigh as much as their walls, packages include their contents.
 
     Args:
-        solid: Closed mesh in object space.
-        choice: Of `materials.choose_material`.
+        solid: closed mesh in object space.
+        choice: its material, see `materials.choose_material`.
 
     Returns:
-        Attributes whose inertia is positive definite. The range of the mass spans what the matter, the walls and,
-        for packages, empty and full may make of this very shape; an error of the shape or of the scene's scale comes
-        on top (mass goes with the third power of length).
+        Attributes with positive definite inertia. The mass range spans material, wall thickness and, for packages,
+        empty to full, for this very shape. Errors of the shape or of the scene's scale come on top (mass grows with
+        the third power of length).
     """
     material = choice.material
     volume, center, inertia = mass_properties(solid)
@@ -35,7 +35,7 @@ def physical_attributes(solid: Solid, choice: MaterialChoice) -> PhysicalAttribu
 
     density, wall = material.density_kg_m3, material.wall_m
     mass, low, high = (density.value * volume, density.low * volume, density.high * volume)
-    solid_share = 1.0  # of the mass that is spread over the volume; the rest is at the walls
+    solid_share = 1.0  # share of the mass in the volume; the rest is in the walls
     if choice.hollow or choice.filled_kg_m3:
         mass, low, high = (walls(d, w) for d, w in zip(density, wall))
         solid_share = mass / (density.value * volume)
@@ -64,19 +64,19 @@ def physical_attributes(solid: Solid, choice: MaterialChoice) -> PhysicalAttribu
 
 
 def _offset(shift: np.ndarray) -> np.ndarray:
-    """Return the inertia (3, 3) that unit mass has by being `shift` (3,) away (parallel axes)."""
+    """Return the inertia (3, 3) of unit mass displaced by `shift` (3,) (parallel axis theorem)."""
     return shift @ shift * np.eye(3) - np.outer(shift, shift)
 
 
 def _solvable(inertia: np.ndarray, mass: float, extents: np.ndarray) -> np.ndarray:
-    """Return inertia (3, 3) that is no thinner than a plate of that size: tiny moments make solvers blow up."""
+    """Raise the moments of inertia (3, 3) to a fraction of a plate's of that size: solvers diverge on tiny ones."""
     floor = mass * (0.1 * extents.max()) ** 2 / 12
     values, axes = np.linalg.eigh((inertia + inertia.T) / 2)
     return (axes * np.maximum(values, floor)) @ axes.T
 
 
 def mass_properties(solid: Solid) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return volume, centroid (3,) and second moment about it as inertia of unit density (3, 3), exactly."""
+    """Return volume, centroid (3,) and inertia about it at unit density (3, 3), exactly."""
     shift = solid.vertices.mean(axis=0)
     a, b, c = (solid.vertices[solid.faces[:, k]] - shift for k in range(3))
     six = np.einsum("nk,nk->n", a, np.cross(b, c))
@@ -87,12 +87,11 @@ def mass_properties(solid: Solid) -> tuple[float, np.ndarray, np.ndarray]:
     total = a + b + c
     second = sum(np.einsum("n,ni,nj->ij", six, p, p) for p in (a, b, c, total)) / 120
     covariance = second - volume * np.outer(center, center)
-    inertia = np.trace(covariance) * np.eye(3) - covariance
-    return volume, center + shift, inertia
+    return volume, center + shift, np.trace(covariance) * np.eye(3) - covariance
 
 
 def shell_properties(solid: Solid) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return area, centroid (3,) of the surface and its inertia (3, 3) about that per kg/m2, exactly."""
+    """Return area, centroid (3,) of the surface and inertia about it at 1 kg/m2 (3, 3), exactly."""
     shift = solid.vertices.mean(axis=0)
     a, b, c = (solid.vertices[solid.faces[:, k]] - shift for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2

@@ -1,4 +1,4 @@
-"""Materials: density, friction, restitution and walls, each with a range, and which one a thing is probably made of.
+"""Table of materials (density, friction, restitution, wall thickness, with ranges), and the choice for an object.
 
 Sources, named at each row:
 
@@ -8,8 +8,8 @@ Sources, named at each row:
 - [CRC] "CRC Handbook of Chemistry and Physics", "Coefficients of Friction".
 - [Cross] R. Cross, "The bounce of a ball", Am. J. Phys. 67 (1999) 222: how much energy blunt household contacts keep.
 
-Values are the middle of what the sources give for household goods, ranges what they span. Restitution has the weakest
-support: it depends on shape and speed as much as on matter, so that its ranges are wide.
+Values are the middle of the sources' values for household goods, ranges their span. Restitution is the least certain:
+it depends on shape and speed as much as on the material.
 """
 
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ import numpy as np
 
 
 class Spread(NamedTuple):
-    """A value and the range that it may well have."""
+    """A value and its plausible range."""
 
     value: float
     low: float
     high: float
 
     def widened(self, other: "Spread") -> "Spread":
-        """Return the same value, its range widened to that of another."""
+        """Return the same value with a range that includes another one."""
         return Spread(self.value, min(self.low, other.low), max(self.high, other.high))
 
 
 @dataclass(frozen=True)
 class Material:
-    """Properties of solid matter."""
+    """Properties of a solid material."""
 
     density_kg_m3: Spread
     friction: Spread  # against a typical household surface, dimensionless
     restitution: Spread
-    wall_m: Spread  # typical wall thickness of hollow things made of it
+    wall_m: Spread  # wall thickness of hollow objects
 
 
 def _material(density: tuple, friction: tuple, restitution: tuple, wall_m: tuple) -> Material:
@@ -79,40 +79,12 @@ _BY_LABEL = {
     "food": "fruit apple orange lemon banana bread food vegetable",
     "stone": "stone rock sculpture statue trophy",
 }
-_HOLLOW = frozenset(
-    [
-        "shelf",
-        "bookshelf",
-        "bookcase",
-        "cabinet",
-        "drawer",
-        "dresser",
-        "nightstand",
-        "wardrobe",
-        "fridge",
-        "oven",
-        "microwave",
-        "can",
-        "tin",
-        "bottle",
-        "carton",
-        "box",
-        "milk",
-        "package",
-        "lamp",
-        "monitor",
-        "tv",
-        "container",
-        "bin",
-        "kettle",
-        "moka",
-        "pot",
-        "pitcher",
-        "jar",
-    ]
+_HOLLOW = (
+    "shelf bookshelf bookcase cabinet drawer dresser nightstand wardrobe fridge oven microwave can tin bottle carton "
+    "box milk package lamp monitor tv container bin kettle moka pot pitcher jar"
 )
-# What packages hold weighs as much as the package is large: their mean density with contents, kg/m3, and that of a
-# heavy one (syrup, sand-like goods; a box of books). The light end is the empty package.
+# Density of packages with their contents, kg/m3: the mean, and that of heavy contents (syrup, sand-like goods; a box of
+# books). The lower end of the range is the empty package.
 _FILLED = {
     "can": (950.0, 1250.0),
     "tin": (950.0, 1250.0),
@@ -127,18 +99,18 @@ _FILLED = {
 
 @dataclass(frozen=True)
 class MaterialChoice:
-    """What a thing is taken to be made of, and how it fills its outline."""
+    """The assumed material of an object, and how it fills the object's shape."""
 
     name: str
-    hollow: bool  # closed outside but empty inside: mass from walls only
+    hollow: bool  # closed and empty: the walls alone have mass
     filled_kg_m3: tuple[float, float] | None  # mean and largest density with contents; None: no package
     reason: str  # provenance
-    sure: bool = True  # False: guessed by color or size; its ranges are those of any household thing
-    mass_kg: tuple[float, float] | None = None  # low and high of who estimated it; None: from the shape
+    sure: bool = True  # False: guessed by color or size, with the ranges of any household object
+    mass_kg: tuple[float, float] | None = None  # estimated range; None: computed from the shape
 
     @property
     def material(self) -> Material:
-        """The matter; where the choice is a guess, its ranges reach as far as those of an unknown one."""
+        """The material; a guess has ranges that include those of an unknown one."""
         own, other = MATERIALS[self.name], MATERIALS["unknown"]
         if self.sure:
             return own
@@ -156,24 +128,21 @@ def choose_material(
     """Choose a material by label, else by color and size.
 
     Args:
-        label: Coarse label, words separated by spaces or underscores.
-        label_confidence: In [0, 1]; below 0.25 the label is not believed.
-        mean_rgb: Mean color (3,), 0 to 255.
-        extents_m: Size of the upright box (3,).
-
-    Returns:
-        The choice with its reason.
+        label: words separated by spaces or underscores.
+        label_confidence: in [0, 1]; below 0.25 the label is ignored.
+        mean_rgb: mean color (3,), 0 to 255.
+        extents_m: size of the upright box (3,).
     """
     words = label.lower().replace("_", " ").split()
     joined = {label.lower().replace(" ", "_"), *words}
     largest = float(np.max(extents_m))
     if label_confidence >= 0.25:
-        # The last word names the thing ("milk carton", "sauce bottle").
+        # The last word names the object ("milk carton", "sauce bottle").
         for word in [*joined.intersection(["dish_rack"]), *reversed(words)]:
             for name, members in _BY_LABEL.items():
                 if word in members.split():
                     filled = _FILLED.get(word) if largest <= 0.5 else None
-                    return MaterialChoice(name, word in _HOLLOW, filled, f"label '{label}'")
+                    return MaterialChoice(name, word in _HOLLOW.split(), filled, f"label '{label}'")
     red, green, blue = (float(x) for x in mean_rgb)
     brown = red > green > blue and 25 < red - blue < 140 and red < 220
     if largest > 0.5:

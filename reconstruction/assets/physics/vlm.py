@@ -1,4 +1,4 @@
-"""Material and mass by a vision-language model: asked object by object, with pictures from up to three sides."""
+"""Material and mass by a vision-language model, one question per object with pictures from up to three sides."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,12 +15,12 @@ from reconstruction.views import SceneViews, View
 
 _HEAVIEST_KG_M3 = 8000.0  # a block of steel that fills the box
 _LIGHTEST_KG_M3 = 2.0  # a wire basket
-_FRAMES_BESIDE = 2  # keyframes beside a drawn view
-_MOST_APART = 100.0  # a range wider than that says nothing
+_FRAMES_BESIDE = 2  # keyframes shown beside a drawn view
+_MOST_APART = 100.0  # greatest ratio of the mass range
 
 
 class Described(BaseModel):
-    """What the model answers."""
+    """What the model answers."""  # part of the JSON schema, and so of the key of recorded answers
 
     model_config = ConfigDict(extra="forbid")
 
@@ -32,10 +32,10 @@ class Described(BaseModel):
 
 
 class VlmPhysicist:
-    """Any OpenAI-compatible endpoint: a `Physicist`."""
+    """A `Physicist` behind an OpenAI-compatible endpoint."""
 
     def __init__(self, client: VlmClient) -> None:
-        """Wrap a client."""
+        """Load the prompt."""
         self._client = client
         self._prompt = (Path(__file__).parent / "prompt.txt").read_text()
         self.name = client.name
@@ -43,7 +43,7 @@ class VlmPhysicist:
     def choose(
         self, found: InstanceSet, posed: PosedFrames, *, views: SceneViews | None = None, progress: Progress
     ) -> dict[int, MaterialChoice]:
-        """See `Physicist.choose`; questions that fail are noted, and asked no more once the endpoint is away."""
+        """See `Physicist.choose`; failures are noted, and an unreachable endpoint ends the questions."""
         frames = best_views(found, posed)
         said: dict[int, MaterialChoice] = {}
         for number, item in enumerate(found.objects):
@@ -78,9 +78,9 @@ class VlmPhysicist:
 
 
 def shown_pictures(frames: list[ObjectView], views: Sequence[View]) -> list[ObjectView]:
-    """Return the pictures that the model is shown: the view that shows most, without what hides the thing, first.
+    """Return the pictures for the model: the best drawn view without occluders first, then two keyframes.
 
-    A drawn view shows the whole of a thing, a photograph what it is made of: two of those stay.
+    A drawn view shows the whole object, a keyframe its material. Without a view, all keyframes are returned.
     """
     drawn = next(filter(None, (view.cleared() for view in views)), None)
     if drawn is None:
@@ -89,7 +89,7 @@ def shown_pictures(frames: list[ObjectView], views: Sequence[View]) -> list[Obje
 
 
 def _check(answer: Described, item: Instance) -> None:
-    """Raise ValueError, with words for the model, where an answer is not about the object or not possible."""
+    """Raise ValueError, with a text for the model, where an answer is about another object or impossible."""
     low, high, volume = answer.lightest_kg, answer.heaviest_kg, float(item.extents_m.prod())
     if answer.id != item.id:
         raise ValueError(f"there is no object {answer.id} in the pictures; the id is {item.id}")

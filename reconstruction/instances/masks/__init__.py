@@ -1,4 +1,4 @@
-"""Where 2D masks come from: a folder that any other tool filled, or learned models."""
+"""Sources of 2D masks: a folder of id images made by any tool, or segmentation models."""
 
 from reconstruction.instances.masks.base import (
     FrameMasks,

@@ -1,7 +1,7 @@
-"""The seam for 2D masks: whatever cuts images into segments feeds the same lifting.
+"""Interface of mask backends.
 
-Masks of one frame are one id image; the ids of two frames have nothing to do with each other. What they mean in the
-room is decided by `reconstruction.instances.lifting`, from their agreement across views.
+The masks of one frame are one id image. Ids of two frames are unrelated; `reconstruction.instances.lifting` associates
+the masks across views.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from reconstruction.core.types import Camera, DepthMaps, PosedFrames
 
 @dataclass(frozen=True)
 class FrameMasks:
-    """Segments of posed frames, keyframes or others."""
+    """Id images of posed frames, keyframes or others."""
 
     camera: Camera  # at the masks' resolution, without distortion
     frame_indices: np.ndarray  # int32 (n,) video frame numbers
@@ -23,45 +23,46 @@ class FrameMasks:
     ids: np.ndarray  # uint16 (n, h, w), 0 = in no mask
 
     def resized(self, width: int, height: int) -> "FrameMasks":
-        """Return the masks at another resolution of the same aspect; a pixel takes what lies at its center."""
+        """Return the masks at another resolution of the same aspect ratio, by the nearest pixel."""
         columns, rows = _centers(self.camera.width, width), _centers(self.camera.height, height)
         ids = np.ascontiguousarray(self.ids[:, rows[:, None], columns[None, :]])
         return replace(self, camera=self.camera.resized(width, height), ids=ids)
 
 
 def _centers(full: int, wanted: int) -> np.ndarray:
-    """Return which of `full` pixels lie at the centers of `wanted` ones."""
+    """Return the indices of `full` pixels at the centers of `wanted` pixels."""
     return np.minimum(((np.arange(wanted) + 0.5) * full / wanted).astype(np.int64), full - 1)
 
 
 class MaskBackend(Protocol):
-    """Makes masks of some frames of a capture, or finds them."""
+    """A source of masks for some frames of a capture."""
 
     name: str
 
     def frame_masks(self, posed: PosedFrames, depth: DepthMaps, *, progress: Progress) -> FrameMasks:
         """Return masks of frames with known cameras; `posed` and `depth` are in world space, in metres."""
+        ...
 
 
 class ImageSegmenter(Protocol):
-    """Cuts single images into segments."""
+    """A model that segments single images."""
 
     name: str
 
     def segment(self, image: np.ndarray) -> np.ndarray:
-        """Return uint16 (h, w) ids of an RGB image uint8 (h, w, 3), 0 = in no segment."""
+        """Return the id image uint16 (h, w) of an RGB image uint8 (h, w, 3), 0 = no mask."""
+        ...
 
 
 class KeyframeMasks:
-    """Every keyframe through an image segmenter: a `MaskBackend`."""
+    """A `MaskBackend` that segments every keyframe."""
 
     def __init__(self, segmenter: ImageSegmenter) -> None:
-        """Wrap a segmenter."""
         self._segmenter = segmenter
         self.name = segmenter.name
 
     def frame_masks(self, posed: PosedFrames, depth: DepthMaps, *, progress: Progress) -> FrameMasks:
-        """See `MaskBackend.frame_masks`; the masks are as large as the frames."""
+        """See `MaskBackend.frame_masks`; the masks have the resolution of the keyframes."""
         progress.start(len(posed.images), f"masks by {self.name}")
         ids = np.zeros(posed.images.shape[:3], np.uint16)
         for row, image in enumerate(posed.images):
@@ -71,10 +72,10 @@ class KeyframeMasks:
 
 
 def flatten_masks(masks: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return one id image, uint16 (h, w), of overlapping masks bool (k, h, w), k >= 0, with scores (k,).
+    """Merge overlapping masks bool (k, h, w), k >= 0, with scores (k,) into one id image uint16 (h, w).
 
-    A pixel goes to the smallest mask that holds it, for a thing's mask lies within that of what it stands on; of two
-    masks of nearly one extent (IoU above 0.8) the one with the higher score stays.
+    Of two masks with an IoU above 0.8 the one with the higher score is kept. A pixel gets the smallest mask that
+    contains it, since the mask of an object often lies within that of its support.
     """
     masks, scores = np.asarray(masks, bool), np.asarray(scores, np.float64)
     area = masks.sum(axis=(1, 2))

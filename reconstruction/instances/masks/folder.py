@@ -1,4 +1,4 @@
-"""Masks from a folder: one id image a frame, made by any tool."""
+"""Masks from a folder with one id image per frame, made by any tool."""
 
 import re
 from pathlib import Path
@@ -12,13 +12,13 @@ from reconstruction.frames.decoding import ImageFolder
 from reconstruction.instances.masks.base import FrameMasks
 from registry.errors import UsageError
 
-_ASPECT_TOLERANCE = 0.01
-_MAX_COLORS = 2000
+_ASPECT_TOLERANCE = 0.01  # relative
+_MAX_COLORS = 2000  # more colors are a photograph, or masks blended at their borders
 _OPTION = "instances.masks_path"
 
 
 class FolderMasks:
-    """Reads id images that belong to frames by their names: a `MaskBackend`."""
+    """A `MaskBackend` that reads id images, matched to frames by file name."""
 
     name = "folder"
 
@@ -32,13 +32,13 @@ class FolderMasks:
         self._files = _id_images(folder)
 
     def frame_masks(self, posed: PosedFrames, depth: DepthMaps, *, progress: Progress) -> FrameMasks:
-        """Return the masks of every frame with a known camera that has an id image, held-out frames too.
+        """Return the masks of all frames with a known camera and an id image, held-out frames too.
 
-        An id image shows its whole frame, at any resolution. Its name is the frame's number in the video, or the
-        name of the image that it belongs to where the input is a folder of images; the suffix is `.png`.
+        An id image covers its whole frame, at any resolution. It is named `<video frame number>.png`, or like the image
+        that it belongs to where the input is a folder of images.
 
         Raises:
-            UsageError: no folder, no image of a frame that was used, or an image that is no id image.
+            UsageError: no id image matches a frame, or a file is not an id image.
         """
         files = self._files
         indices = np.concatenate([posed.indices, posed.held_out_indices]).astype(np.int32)
@@ -66,18 +66,18 @@ class FolderMasks:
 def _id_images(folder: Path) -> list[Path]:
     if folder == Path():
         raise UsageError(
-            f"instances.masks=folder needs {_OPTION}, the folder with one id image (PNG) a frame"
+            f"instances.masks=folder needs {_OPTION}, a folder with one id image (PNG) per frame"
         )
     if not folder.is_dir():
-        raise UsageError(f"{_OPTION}={folder}: no such folder; it must hold one id image (PNG) a frame")
+        raise UsageError(f"{_OPTION}={folder}: no such folder; it must contain one id image (PNG) per frame")
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".png")
     if not files:
-        raise UsageError(f"{_OPTION}={folder}: no PNG in this folder; it must hold one id image a frame")
+        raise UsageError(f"{_OPTION}={folder}: no PNG in this folder; it must contain one id image per frame")
     return files
 
 
 def _matched(files: list[Path], indices: np.ndarray, posed: PosedFrames) -> dict[int, Path]:
-    """Return the id image of each frame that has one, by frame number."""
+    """Return the id images of frames, by frame number."""
     source = Path(posed.source.file)
     wanted = {int(i) for i in indices}
     out: dict[int, Path] = {}
@@ -87,13 +87,14 @@ def _matched(files: list[Path], indices: np.ndarray, posed: PosedFrames) -> dict
     if not out:
         for path in files:
             digits = re.fullmatch(r"\D*?(\d+)", path.stem)
-            if digits and int(digits[1]) in wanted:
-                if int(digits[1]) in out:
-                    raise UsageError(
-                        f"{_OPTION}: {out[int(digits[1])].name} and {path.name} both name frame {int(digits[1])}; "
-                        "keep one id image a frame"
-                    )
-                out[int(digits[1])] = path
+            frame = int(digits[1]) if digits else -1
+            if frame in out:
+                raise UsageError(
+                    f"{_OPTION}: {out[frame].name} and {path.name} both name frame {frame}; "
+                    "keep one id image per frame"
+                )
+            if frame in wanted:
+                out[frame] = path
     return out
 
 
@@ -102,8 +103,8 @@ def _nothing_matched(folder: Path, files: list[Path], indices: np.ndarray) -> st
     shown = ", ".join(map(str, used[:6])) + (", …" if len(used) > 6 else "")
     return (
         f"{_OPTION}={folder}: none of its {len(files)} images ({files[0].name}, …) belongs to a frame with a known "
-        f"camera. Name them by video frame number (000{used[0]:02d}.png) or like the images of the input; frames "
-        f"in use are {shown}"
+        f"camera. Name them by video frame number (000{used[0]:02d}.png) or like the images of the input; the frames "
+        f"with a known camera are {shown}"
     )
 
 
@@ -120,13 +121,13 @@ def _read(path: Path, camera: Camera) -> np.ndarray:
     if abs(width / height - camera.width / camera.height) > _ASPECT_TOLERANCE * camera.width / camera.height:
         raise UsageError(
             f"{_OPTION}: {path} is {width}x{height}, but frames are {camera.width}x{camera.height}. An id image "
-            "must show its whole frame, upright; its resolution is free, its shape is not"
+            "must show its whole frame, upright, with the same aspect ratio; any resolution will do"
         )
     return image.astype(np.uint16)
 
 
 def _from_colors(image: np.ndarray, path: Path) -> np.ndarray:
-    """Number the colors of a color-coded image; black is in no mask, and so is what is fully transparent."""
+    """Return the numbers of the colors of a color-coded image; 0 for black and for fully transparent pixels."""
     channels = image[..., :3].astype(np.int64)
     keys = (channels[..., 0] * 65536 + channels[..., 1]) * 65536 + channels[..., 2]
     if image.shape[2] == 4:
@@ -134,8 +135,8 @@ def _from_colors(image: np.ndarray, path: Path) -> np.ndarray:
     colors, numbers = np.unique(keys, return_inverse=True)
     if len(colors) > _MAX_COLORS:
         raise UsageError(
-            f"{_OPTION}: {path} has {len(colors)} colors; an id image has one flat color or number a mask, not "
-            "blended at borders"
+            f"{_OPTION}: {path} has {len(colors)} colors; an id image has one flat color or number per mask, without "
+            "blending at borders"
         )
     numbers = numbers.reshape(keys.shape) + (colors[0] != 0)
     return numbers.astype(np.uint16)

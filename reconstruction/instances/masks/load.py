@@ -1,13 +1,14 @@
-"""Which backend makes the masks: what the config asks for, loaded."""
+"""Load the mask backend of the config."""
 
 from pathlib import Path
 
+from reconstruction.core.plugins import load_plugin
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.masks.base import ImageSegmenter, KeyframeMasks, MaskBackend
 from reconstruction.instances.masks.folder import FolderMasks
 from reconstruction.learned.models import ModelRequest
 
-# Where the option names none. Licenses: docs/masks.md.
+# Used where `masks_model` is empty. Licenses: docs/masks.md.
 DEFAULT_MODELS = {
     "sam2": "facebook/sam2.1-hiera-small",
     "sam3": "facebook/sam3",
@@ -16,17 +17,19 @@ DEFAULT_MODELS = {
 
 
 def load_mask_backend(config: InstancesConfig) -> MaskBackend | None:
-    """Return the backend that `config.masks` asks for; None for the embedded cut, which needs no masks.
+    """Return the backend of `config.masks`; None for the embedded partition, which needs no masks.
 
     Raises:
         UsageError: `masks_path` is not a folder of id images.
-        EnvironmentMissing: a learned one needs something that is not installed, or weights that are not there.
+        EnvironmentMissing: a package or the weights of a model are missing.
     """
+    if config.masks == "embedded":
+        return None
     if config.masks == "folder":
         return FolderMasks(Path(config.masks_path))
     if config.masks in DEFAULT_MODELS:
         return KeyframeMasks(_load_segmenter(config))
-    return None
+    return load_plugin("instances.masks", config.masks, InstancesConfig)(config)
 
 
 def _load_segmenter(config: InstancesConfig) -> ImageSegmenter:

@@ -1,4 +1,4 @@
-"""Masks by Mask2Former through `transformers`: instance, panoptic or semantic weights, each query's mask on its own."""
+"""Masks by Mask2Former through `transformers`, with instance, panoptic or semantic weights; one mask per query."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ _MIN_SCORE = 0.5
 
 
 class QueryMasks:
-    """A Mask2Former model: an `ImageSegmenter`."""
+    """An `ImageSegmenter` by Mask2Former."""
 
     def __init__(self, request: ModelRequest) -> None:
         """Load the model and its image processor.
@@ -24,8 +24,8 @@ class QueryMasks:
     def segment(self, image: np.ndarray) -> np.ndarray:
         """See `ImageSegmenter.segment`.
 
-        A query's score is its class probability times the mean probability inside its mask, as in the model's own
-        instance segmentation; panoptic fusion is left out, since a thing's mask may lie within another's here.
+        The score of a query is its class probability times the mean probability inside its mask, as in the model's own
+        instance segmentation. Panoptic fusion is left out, since masks may lie within each other here.
         """
         import torch
 

@@ -1,8 +1,7 @@
-"""Masks by SAM 2 and SAM 3 through `transformers`: everything in an image from a grid of points, or named concepts.
+"""Masks by SAM 2 and SAM 3 through `transformers`: of everything, by a grid of points, or of given concepts.
 
-The grid is that of the models' own automatic mask generators: three masks a point, kept where the model trusts them
-and where they hardly change with the threshold, of near doubles the most trusted. SAM 3 can be asked for concepts
-(noun phrases) instead, and then returns every instance of each.
+The grid follows the models' automatic mask generators: three masks per point, filtered by predicted IoU and stability,
+then non-maximum suppression. With SAM 3, concepts (noun phrases) can be given instead: every instance is returned.
 """
 
 from typing import Any
@@ -13,16 +12,16 @@ from reconstruction.instances.masks.base import flatten_masks
 from reconstruction.learned.models import ModelRequest, SquareImages, load_model, load_part, masks_of
 
 _POINTS_A_BATCH = 64
-_MIN_TRUST = 0.8  # IoU that the model expects of its mask with the truth
-_MIN_STABILITY, _STABILITY_OFFSET = 0.95, 1.0  # IoU of the masks at thresholds that far above and below 0
-_DOUBLE = 0.7  # boxes with a larger IoU are of one thing
-_MIN_SHARE = 1e-4  # of the image; smaller masks are specks
+_MIN_IOU = 0.8  # predicted by the model
+_MIN_STABILITY, _STABILITY_OFFSET = 0.95, 1.0  # IoU of the masks at logits this far above and below 0
+_NMS_IOU = 0.7  # of bounding boxes
+_MIN_SHARE = 1e-4  # of the image; smaller masks are dropped
 _MIN_CONCEPT_SCORE = 0.5
-_TEXT_TOKENS = 32  # what SAM 3 was trained with
+_TEXT_TOKENS = 32  # length that SAM 3 was trained with
 
 
 class PointGridMasks:
-    """SAM 2, or the tracker half of SAM 3, prompted with a grid of points: an `ImageSegmenter`."""
+    """An `ImageSegmenter` by SAM 2, or by the tracker of SAM 3, prompted with a grid of points."""
 
     def __init__(self, request: ModelRequest, class_name: str, points_a_side: int) -> None:
         """Load `Sam2Model` or `Sam3TrackerModel`.
@@ -52,7 +51,7 @@ class PointGridMasks:
                     multimask_output=True,
                 )
                 logits, trust = out.pred_masks[0].flatten(0, 1), out.iou_scores[0].flatten()
-                good = (trust > _MIN_TRUST) & (stability(logits) > _MIN_STABILITY)
+                good = (trust > _MIN_IOU) & (stability(logits) > _MIN_STABILITY)
                 kept.append(logits[good])
                 scores.append(trust[good])
             logits, trust = torch.cat(kept), torch.cat(scores).float().cpu().numpy()
@@ -62,7 +61,7 @@ class PointGridMasks:
 
 
 class ConceptMasks:
-    """SAM 3 asked for every instance of some concepts: an `ImageSegmenter`."""
+    """An `ImageSegmenter` by SAM 3 that returns every instance of the given concepts."""
 
     def __init__(self, request: ModelRequest, concepts: tuple[str, ...]) -> None:
         """Load `Sam3Model` and its tokenizer, and encode the concepts once.
@@ -107,23 +106,23 @@ class ConceptMasks:
 
 
 def point_grid(points_a_side: int) -> np.ndarray:
-    """Return points (n * n, 2), x then y, in the middle of the cells of a grid over the unit square."""
+    """Return the centers (n * n, 2) of the cells of a grid over the unit square, x before y."""
     along = ((np.arange(points_a_side) + 0.5) / points_a_side).astype(np.float32)
     return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
 
 def stability(logits: Any) -> Any:
-    """Return (k,) of mask logits (k, h, w), a tensor: how little the masks change with the threshold, 0 to 1."""
+    """Return the stability scores (k,), 0 to 1, of a tensor of mask logits (k, h, w): IoU between two thresholds."""
     inner = (logits > _STABILITY_OFFSET).flatten(1).sum(1)
     outer = (logits > -_STABILITY_OFFSET).flatten(1).sum(1)
     return inner / outer.clamp(min=1)
 
 
 def boxes_of(masks: np.ndarray) -> np.ndarray:
-    """Return the boxes float64 (k, 4), x0 y0 x1 y1 with the far edges outside, of masks bool (k, h, w)."""
+    """Return the boxes float64 (k, 4) of masks bool (k, h, w): x0, y0, x1, y1, with x1 and y1 exclusive."""
     boxes = np.zeros((len(masks), 4))
     for axis, (low, high) in ((1, (0, 2)), (2, (1, 3))):
-        hit = masks.any(axis=axis)
+        hit = np.any(masks, axis)
         some = hit.any(axis=1)
         boxes[some, low] = hit.argmax(axis=1)[some]
         boxes[some, high] = hit.shape[1] - hit[:, ::-1].argmax(axis=1)[some]
@@ -131,7 +130,7 @@ def boxes_of(masks: np.ndarray) -> np.ndarray:
 
 
 def without_doubles(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return rows int64 (m,), the best first, of boxes (k, 4) after greedy suppression; empty boxes are left out."""
+    """Return rows int64 (m,) of boxes (k, 4) after non-maximum suppression, the best first, without empty boxes."""
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     open_rows = np.lexsort((np.arange(len(boxes)), -scores))
     open_rows = open_rows[area[open_rows] > 0]
@@ -139,21 +138,19 @@ def without_doubles(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
     while len(open_rows):
         first, rest = open_rows[0], open_rows[1:]
         kept.append(first)
-        low, high = (
-            np.maximum(boxes[first, :2], boxes[rest, :2]),
-            np.minimum(boxes[first, 2:], boxes[rest, 2:]),
-        )
+        low = np.maximum(boxes[first, :2], boxes[rest, :2])
+        high = np.minimum(boxes[first, 2:], boxes[rest, 2:])
         common = np.prod(np.clip(high - low, 0, None), axis=1)
-        open_rows = rest[common <= _DOUBLE * (area[first] + area[rest] - common)]
+        open_rows = rest[common <= _NMS_IOU * (area[first] + area[rest] - common)]
     return np.array(kept, np.int64)
 
 
 def flatten_large(masks: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return the id image of masks bool (k, h, w), specks left out."""
+    """Return the id image of masks bool (k, h, w), without tiny ones; see `flatten_masks`."""
     large = masks.sum(axis=(1, 2)) >= _MIN_SHARE * np.prod(masks.shape[1:])
     return flatten_masks(masks[large], scores[large])
 
 
 def _side(size: Any) -> int:
-    """Return the side of the square images that a model wants; its config holds one number or two."""
+    """Return the side of a model's square input; its config has one number or two."""
     return int(size if isinstance(size, int) else size[0])

@@ -1,7 +1,6 @@
-"""What things are called: the embedded labels, or open-vocabulary ones from models that look at the pictures.
+"""Open-vocabulary labels of objects by models that look at images.
 
-Labels change nothing but labels: ids, boxes and surfaces stay. A thing that a model does not know, or cannot be asked
-about, keeps its embedded label.
+Naming changes labels alone: ids, boxes and surfaces stay. An object without an answer keeps its embedded label.
 """
 
 from reconstruction.instances.naming.base import Name, Namer, apply_names

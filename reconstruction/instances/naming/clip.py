@@ -1,4 +1,4 @@
-"""Labels by a CLIP-like model through `transformers`: which of some words fits the pictures of an object best."""
+"""Zero-shot labels by a CLIP-like model (`transformers`): the word most similar to an object's images."""
 
 from pathlib import Path
 
@@ -6,19 +6,19 @@ import numpy as np
 
 from reconstruction.core.progress import Progress
 from reconstruction.core.types import InstanceSet, PosedFrames
-from reconstruction.instances.naming.base import Name, is_label
+from reconstruction.instances.naming.base import LABEL_RULE, Name, is_label
 from reconstruction.instances.naming.views import best_views
 from reconstruction.learned.models import ModelRequest, load_model, load_part
 from registry.errors import UsageError
 
-# An object that looks more like one of these is not named.
+# Negative prompts: an object that is more similar to one of these gets no name.
 _NO_THING = ("a photo of a wall", "a photo of a floor", "a blurry photo", "a photo of nothing in particular")
 _TEMPLATE = "a photo of a {}"
-_MIN_MARGIN = 0.1  # below it the words are as good as each other
+_MIN_MARGIN = 0.1  # least margin in probability over the second-best text
 
 
 class ClipNamer:
-    """CLIP, SigLIP or another model with one embedding for texts and images: a `Namer`."""
+    """A `Namer` with a joint embedding of texts and images: CLIP, SigLIP, ..."""
 
     def __init__(self, request: ModelRequest, vocabulary: tuple[str, ...]) -> None:
         """Load the model and embed the vocabulary.
@@ -34,9 +34,8 @@ class ClipNamer:
         tokenizer = load_part(request, "AutoTokenizer")
         texts = [*(_TEMPLATE.format(word) for word in vocabulary), *_NO_THING]
         length = self._model.config.text_config.max_position_embeddings
-        padding = (
-            "max_length" if self._model.config.model_type.startswith("siglip") else True
-        )  # as it was trained
+        siglip = self._model.config.model_type.startswith("siglip")  # trained with padding to the full length
+        padding = "max_length" if siglip else True
         tokens = tokenizer(texts, padding=padding, truncation=True, max_length=length, return_tensors="pt")
         with torch.inference_mode():
             embedded = self._model.get_text_features(**tokens.to(self._model.device))
@@ -57,7 +56,7 @@ class ClipNamer:
         return names
 
     def _probabilities(self, pictures: list[np.ndarray]) -> np.ndarray:
-        """Return (views, words + no things), each row summing to 1."""
+        """Return (views, words + negative prompts), each row summing to 1."""
         import torch
 
         inputs = self._processor(images=pictures, return_tensors="pt").to(self._model.device)
@@ -68,10 +67,13 @@ class ClipNamer:
 
 
 def choose(words: tuple[str, ...], probabilities: np.ndarray) -> Name | None:
-    """Choose a word by probabilities (views, k), k >= len(words): those beyond the words stand for no thing.
+    """Return the word with the highest mean probability; None for a negative prompt or too small a margin.
 
-    The confidence is the mean, over the views, of how far the word is ahead of the best other: views that disagree
-    count against it, and it never is more than that margin.
+    The confidence is the margin over the best other text, averaged over the views.
+
+    Args:
+        words: the vocabulary.
+        probabilities: (views, k), k >= len(words); columns after the words belong to negative prompts.
     """
     mean = probabilities.mean(axis=0)
     best = int(np.argmax(mean))
@@ -82,7 +84,7 @@ def choose(words: tuple[str, ...], probabilities: np.ndarray) -> Name | None:
 
 
 def read_vocabulary(listed: str) -> tuple[str, ...]:
-    """Return the words of a comma-separated list; an empty one stands for a list of household things.
+    """Return the words of a comma-separated list; an empty one stands for the built-in list of household objects.
 
     Raises:
         UsageError: fewer than two words, or one that cannot be a label.
@@ -95,15 +97,13 @@ def read_vocabulary(listed: str) -> tuple[str, ...]:
     words = list(dict.fromkeys(words))
     for word in words:
         if not is_label(word):
-            raise UsageError(
-                f"instances.labels_vocabulary: {word!r} is no label: up to 40 letters, digits, spaces"
-            )
+            raise UsageError(f"instances.labels_vocabulary: {word!r} is no label: {LABEL_RULE}")
     if len(words) < 2:
         raise UsageError("instances.labels_vocabulary: at least two words are needed to choose from")
     return tuple(words)
 
 
 def _directions(embedded):
-    """Return unit vectors (n, d) of what a model embeds; older versions return them bare."""
+    """Return normalized embeddings (n, d); older versions of `transformers` return the tensor itself."""
     vectors = getattr(embedded, "pooler_output", embedded)
     return vectors / vectors.norm(dim=-1, keepdim=True)

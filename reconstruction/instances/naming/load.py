@@ -1,5 +1,6 @@
-"""Which backend names things: what the config asks for, loaded and applied."""
+"""Load the naming backend of the config, and apply it."""
 
+from reconstruction.core.plugins import load_plugin
 from reconstruction.core.progress import Progress
 from reconstruction.core.types import InstanceSet, PosedFrames
 from reconstruction.instances.config import InstancesConfig
@@ -10,12 +11,14 @@ DEFAULT_CLIP_MODEL = "openai/clip-vit-base-patch32"
 
 
 def load_namer(config: InstancesConfig) -> Namer | None:
-    """Return the backend that `config.labels` asks for; None for the embedded labels.
+    """Return the backend of `config.labels`; None for the embedded labels.
 
     Raises:
-        EnvironmentMissing: it needs something that is not installed, weights or an endpoint that are not there.
-        UsageError: the vocabulary is none.
+        EnvironmentMissing: a package, the weights or the endpoint are missing.
+        UsageError: the vocabulary is invalid.
     """
+    if config.labels == "embedded":
+        return None
     if config.labels == "clip":
         from reconstruction.instances.naming.clip import ClipNamer, read_vocabulary
 
@@ -27,15 +30,14 @@ def load_namer(config: InstancesConfig) -> Namer | None:
         from reconstruction.learned.vlm import Endpoint, VlmClient
 
         return VlmNamer(VlmClient(Endpoint.from_environment("instances.labels", config.labels_model)))
-    return None
+    return load_plugin("instances.labels", config.labels, InstancesConfig)(config)
 
 
 def name_instances(
     namer: Namer, found: InstanceSet, posed: PosedFrames, *, progress: Progress
 ) -> InstanceSet:
-    """Return the instances under the names that a backend gives them."""
+    """Return the instances with the labels of a naming backend."""
     if not found.objects:
         return found
-    return apply_names(
-        found, namer.name_objects(found, posed, progress=progress), namer.name, progress=progress
-    )
+    names = namer.name_objects(found, posed, progress=progress)
+    return apply_names(found, names, namer.name, progress=progress)

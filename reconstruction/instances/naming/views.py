@@ -1,4 +1,4 @@
-"""Pictures of an object for whoever names it: from where it shows best, the object clear and the rest dimmed."""
+"""Image crops of an object for naming: its best keyframes, with the background dimmed."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ import numpy as np
 
 from reconstruction.core.types import InstanceSet, PosedFrames
 
-_MIN_PIXELS = 30  # at id-map resolution; less shows nothing
-_MARGIN = 0.25  # of the object's box, on each side
-_CUT_PENALTY = 0.4  # of a view in which the image border cuts the object
-_ALIKE_PENALTY = 0.7  # of a view from the same direction as one that is chosen already
-_DIMMED = 0.4
-_OUTLINE = (255, 40, 160)
+_MIN_PIXELS = 30  # of the object at id-map resolution, for a keyframe to be used
+_MARGIN = 0.25  # around the crop on each side, of the object's size
+_CUT_PENALTY = 0.4  # factor on the score where the image border cuts the object
+_ALIKE_PENALTY = 0.7  # loss of score from the same direction as a chosen view
+_DIMMED = 0.4  # brightness of the background
+_OUTLINE = (255, 40, 160)  # RGB
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ObjectView:
     mask: np.ndarray  # bool (h, w), where the object is in the crop
 
     def dimmed(self) -> np.ndarray:
-        """Return the crop, uint8 (h, w, 3), darker where the object is not."""
+        """Return the crop, uint8 (h, w, 3), with a darker background."""
         dark = (self.crop * _DIMMED).astype(np.uint8)
         return np.where(self.mask[..., None], self.crop, dark)
 
@@ -36,7 +36,7 @@ class ObjectView:
 
 
 def best_views(found: InstanceSet, posed: PosedFrames, count: int = 3) -> dict[int, list[ObjectView]]:
-    """Return up to `count` views of each object by its id, the best first; none where no keyframe shows it."""
+    """Return up to `count` views of each object, by id, the best first; an empty list where no keyframe shows it."""
     ids = np.asarray(found.id_maps)
     size = max((item.id for item in found.objects), default=0) + 1
     area = np.stack([np.bincount(one.ravel(), minlength=size)[:size] for one in ids])
@@ -52,7 +52,7 @@ def best_views(found: InstanceSet, posed: PosedFrames, count: int = 3) -> dict[i
 
 
 def collage(pictures: list[np.ndarray], height_px: int = 448) -> np.ndarray:
-    """Return pictures uint8 (h, w, 3) of any size beside each other, as one of that height."""
+    """Return images uint8 (h, w, 3) of any size side by side, as one image of the given height."""
     sized = []
     for picture in pictures:
         scale = min(height_px / picture.shape[0], height_px / picture.shape[1])
@@ -72,7 +72,7 @@ def _directions(posed: PosedFrames, center: np.ndarray) -> np.ndarray:
 
 
 def _spread_out(score: np.ndarray, directions: np.ndarray, count: int) -> list[int]:
-    """Return rows, best first, of which each looks from elsewhere where that costs little."""
+    """Select rows greedily by score; after each, views from similar directions lose score."""
     score, rows = score.copy(), []
     while len(rows) < count and score.max() > 0:
         row = int(np.argmax(score))
@@ -84,10 +84,10 @@ def _spread_out(score: np.ndarray, directions: np.ndarray, count: int) -> list[i
 
 
 def _crop(image: np.ndarray, mask: np.ndarray, row: int) -> ObjectView:
-    """Cut an object out of its keyframe; the mask (h, w) may have another resolution than the image."""
+    """Crop an object from its keyframe; the mask (h, w) may have another resolution than the image."""
     height, width = image.shape[:2]
     large = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
-    if not large.any():  # scattered pixels
+    if not large.any():  # isolated pixels vanish by interpolation
         large = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     ys, xs = np.nonzero(large.any(axis=1))[0], np.nonzero(large.any(axis=0))[0]
     pad_y, pad_x = (round(_MARGIN * (axis[-1] - axis[0] + 1)) + 4 for axis in (ys, xs))

@@ -1,4 +1,4 @@
-"""Labels by a vision-language model: asked object by object, with pictures from up to three sides."""
+"""Labels by a vision-language model: one question per object, with up to three views."""
 
 from pathlib import Path
 from typing import Literal
@@ -11,12 +11,12 @@ from reconstruction.instances.naming.base import Name, is_label
 from reconstruction.instances.naming.views import ObjectView, best_views, collage
 from reconstruction.learned.vlm import VlmClient, VlmError, VlmUnavailable
 
-# What models say of their own certainty is optimistic; "unsure" ones do not replace anything.
+# Models overestimate their certainty. An "unsure" answer replaces no label.
 _CONFIDENCE = {"certain": 0.8, "likely": 0.5}
 
 
 class NamedObject(BaseModel):
-    """What the model answers."""
+    """What the model answers."""  # part of the JSON schema, and so of the key of recorded answers
 
     model_config = ConfigDict(extra="forbid")
 
@@ -26,10 +26,9 @@ class NamedObject(BaseModel):
 
 
 class VlmNamer:
-    """Any OpenAI-compatible endpoint: a `Namer`."""
+    """A `Namer` that asks an OpenAI-compatible endpoint."""
 
     def __init__(self, client: VlmClient) -> None:
-        """Wrap a client."""
         self._client = client
         self._prompt = (Path(__file__).parent / "prompt.txt").read_text()
         self.name = client.name
@@ -37,7 +36,7 @@ class VlmNamer:
     def name_objects(
         self, found: InstanceSet, posed: PosedFrames, *, progress: Progress
     ) -> list[Name | None]:
-        """See `Namer.name_objects`; questions that fail are noted, and asked no more once the endpoint is away."""
+        """See `Namer.name_objects`; failed questions are noted, and an unavailable endpoint is not asked again."""
         views = best_views(found, posed)
         progress.start(len(found.objects), f"names by {self.name}")
         names: list[Name | None] = []
@@ -55,10 +54,8 @@ class VlmNamer:
         return names
 
     def _ask(self, item: Instance, views: list[ObjectView]) -> Name | None:
-        width, depth, height = (max(1, round(100 * float(side))) for side in item.extents_m)
-        prompt = self._prompt.format(
-            id=item.id, views=len(views), width_cm=width, depth_cm=depth, height_cm=height
-        )
+        x, y, z = (max(1, round(100 * float(side))) for side in item.extents_m)
+        prompt = self._prompt.format(id=item.id, views=len(views), width_cm=x, depth_cm=y, height_cm=z)
 
         def check(answer: NamedObject) -> None:
             if answer.id != item.id:

@@ -1,4 +1,4 @@
-"""The learned cut: superpoints, affinities of their borders, unaries, and one multicut (Keuper et al., ICCV 2015)."""
+"""Learned partition: superpoint graph, affinities by a graph network, multicut, and a choice of scored proposals."""
 
 from reconstruction.instances.partition.cut import cut_by_partition
 

@@ -1,7 +1,6 @@
-"""Gradient-boosted regression trees: features in, the sum of leaf values out, by compiled code.
+"""Inference of gradient-boosted regression trees (Friedman, Annals of Statistics 2001) from plain arrays.
 
-Friedman, Greedy function approximation: a gradient boosting machine, Annals of Statistics 2001. `priors` fits them
-with LightGBM; nothing but these arrays is needed to run them.
+`priors` fits the trees with LightGBM, which is not needed to run them.
 """
 
 from dataclasses import dataclass, fields
@@ -12,19 +11,19 @@ from numba import njit
 
 @dataclass(frozen=True)
 class Boosted:
-    """Trees one after the other; a child below 0 is leaf `-1 - child` of the same tree."""
+    """Trees as concatenated arrays; a child below 0 is leaf `-1 - child` of the same tree."""
 
     root: np.ndarray  # int32 (t + 1,) row of each tree's first node, and the number of nodes
     first_leaf: np.ndarray  # int32 (t,) row of each tree's first leaf
-    feature: np.ndarray  # uint8 (n,) that a node asks
+    feature: np.ndarray  # uint8 (n,) that a node compares
     threshold: np.ndarray  # float32 (n,) values up to it go left
     left: np.ndarray  # int8 (n,) child, counted from the tree's first node
     right: np.ndarray  # int8 (n,)
     value: np.ndarray  # float32 (l,) of leaves
-    features: np.ndarray  # int32 () how many a row has
+    features: np.ndarray  # int32 () number of features
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return the raw score float32 (m,) (a log-odds) of features float32 (m, F)."""
+        """Return the raw score float32 (m,), log-odds, of features float32 (m, F)."""
         if rows.shape[1] != int(self.features):
             raise ValueError(f"trees for {int(self.features)} features got {rows.shape[1]}")
         rows = np.ascontiguousarray(rows, np.float32)
@@ -34,7 +33,11 @@ class Boosted:
 
     @classmethod
     def named(cls, arrays: dict[str, np.ndarray]) -> "Boosted":
-        """Return trees from arrays by field name; a KeyError names one that is missing."""
+        """Return trees from arrays by field name.
+
+        Raises:
+            KeyError: an array is missing.
+        """
         return cls(**{f.name: np.asarray(arrays[f.name]) for f in fields(cls)})
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -1,15 +1,15 @@
-"""Clusters of a partition as nodes of a second graph: which of them, however far apart, are pieces of one thing.
+"""Graph of the multicut's clusters, with features of clusters and of pairs that may be pieces of one object.
 
-What hides a thing, or was not measured of it, leaves pieces without a common border. The second graph has the clusters
-of things as nodes, joined within a reach, and features that only whole pieces have (agglomeration on learned region
-features: Nunez-Iglesias et al., Machine learning of hierarchical clustering, PLoS ONE 2013).
+Occlusion and unmeasured surface split an object into pieces without a common border. So clusters are joined within a
+reach, and get features that only whole pieces have (agglomeration on learned region features: Nunez-Iglesias et al.,
+Machine learning of hierarchical clustering, PLoS ONE 2013).
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.instances.partition.features import (
     EDGE_FEATURES,
@@ -22,10 +22,10 @@ from reconstruction.instances.partition.features import (
 )
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, Scores, graph_of_links
 
-REACH_M = 0.25  # clusters this near to each other are compared,
-REACH_OF_SIZE = 1.0  # if the smaller one is no smaller than the gap,
-NEAREST = 8  # and one of both is among so many that are nearest to the other
-_TOUCHING_M = 0.02  # clusters this near to each other are always compared
+REACH_M = 0.25  # two clusters form a pair if their gap is at most this,
+REACH_OF_SIZE = 1.0  # and at most this times the diagonal of the smaller one,
+NEAREST = 8  # and one of them is among this many nearest neighbors of the other;
+_TOUCHING_M = 0.02  # within this gap they always form a pair
 LEAST_AREA_M2 = 2e-4  # smaller clusters are dropped
 CLUSTER_FEATURES = (
     *NODE_FEATURES, "log_thing", "log_base", "log_artifact", "log_regions", "border_base", "border_artifact",
@@ -37,27 +37,27 @@ PAIR_FEATURES = (
     "center_step", "size_ratio", "union_of_size", "hidden_between", "free_between", "surface_between", "histogram",
     "nearest", "steepness",
 )  # fmt: skip
-_SAMPLES = 160  # vertices of a cluster that hulls and boxes are made of
-_PAD_M = 0.004  # hulls of sheets have this thickness
-_INSIDE_M = 0.01
+_SAMPLES = 160  # vertices of a cluster from which hulls and boxes are computed
+_PAD_M = 0.004  # padding of the points of convex hulls, so that sheets have a volume
+_INSIDE_M = 0.01  # tolerance of tests whether points are inside a box or a hull
 _CLIP_ODDS = 20.0
-_STEPS = (0.2, 0.35, 0.5, 0.65, 0.8)  # between the nearest points of two clusters
-_AGREES = 0.015  # of depth
-_BINS = 8  # of each channel of color
+_STEPS = (0.2, 0.35, 0.5, 0.65, 0.8)  # sample positions between the nearest points of two clusters
+_AGREES = 0.015  # of the depth: measured depth within this of a sample is surface
+_BINS = 8  # of the color histogram, per channel
 _TINY = 1e-9
 
 
 @dataclass(frozen=True)
 class ClusterGraph:
-    """Clusters of things, joined within `REACH_M`; all that is no thing is one more region, the last one."""
+    """Graph of the clusters labeled "thing"; all other vertices are the last region, which has no pairs."""
 
     graph: RegionGraph
-    things: int  # regions that are clusters of things
+    things: int  # number of these clusters
     nodes: np.ndarray  # float32 (n, len(CLUSTER_FEATURES))
     edges: np.ndarray  # float32 (e, len(PAIR_FEATURES))
 
     def pair_rows(self) -> np.ndarray:
-        """Return float32 (e, F) of pairs: their own features, sums and differences of both ends' features."""
+        """Return float32 (e, F): features of pairs, sums and absolute differences of the features of both ends."""
         first, second = (self.nodes[ends] for ends in self.graph.pairs.T)
         return np.concatenate([self.edges, first + second, np.abs(first - second)], axis=1)
 
@@ -65,12 +65,12 @@ class ClusterGraph:
 def cluster_graph(
     view: View, graph: RegionGraph, scores: Scores, label: np.ndarray, cluster: np.ndarray
 ) -> ClusterGraph:
-    """Return the graph of the clusters of things of a partition.
+    """Return the graph of the clusters labeled "thing", with features.
 
     Args:
-        view: the surface with all that features are computed from.
-        graph: its superpoints.
-        scores: theirs.
+        view: the surface and its keyframes.
+        graph: its superpoint graph.
+        scores: scores of that graph.
         label: int (n,) row in LABELS of each superpoint.
         cluster: int (n,) cluster of each superpoint.
     """
@@ -92,7 +92,7 @@ def cluster_graph(
 
 
 def _numbered(view: View, graph: RegionGraph, label: np.ndarray, cluster: np.ndarray) -> np.ndarray:
-    """Return the node of each superpoint: clusters of things that are large enough, from 0; -1 for the others."""
+    """Return the node of each superpoint, from 0; -1 for superpoints of other labels or of small clusters."""
     thing = label == LABELS.index("thing")
     area = np.bincount(graph.region, weights=view.mesh.areas, minlength=graph.count)
     size = np.bincount(cluster, weights=np.where(thing, area, 0.0))
@@ -103,15 +103,15 @@ def _numbered(view: View, graph: RegionGraph, label: np.ndarray, cluster: np.nda
 
 @dataclass(frozen=True)
 class _Pieces:
-    """Samples of each cluster."""
+    """Samples and convex hulls of each cluster."""
 
-    points: list[np.ndarray]  # float64 (k, 3), at most _SAMPLES
-    vertices: list[np.ndarray]  # int (k,) theirs
+    points: list[np.ndarray]  # float64 (k, 3), k <= _SAMPLES
+    vertices: list[np.ndarray]  # int (k,) of these points
     trees: list[cKDTree]  # of all vertices
     all_vertices: list[np.ndarray]
-    box: np.ndarray  # float64 (n, 2, 3) least and most
+    box: np.ndarray  # float64 (n, 2, 3) low, high
     volume: np.ndarray  # float64 (n,) of the padded hull
-    hulls: list[np.ndarray | None]  # (facets, 4) outward planes
+    hulls: list[np.ndarray | None]  # float64 (facets, 4) planes, normals outward
 
     @classmethod
     def of(cls, view: View, node: np.ndarray, count: int) -> "_Pieces":
@@ -129,7 +129,7 @@ class _Pieces:
 
 
 def _hull(points: np.ndarray) -> tuple[float, np.ndarray | None]:
-    """Return volume and planes of the convex hull of points that are `_PAD_M` thick."""
+    """Return volume and planes of the convex hull of points, each padded by `_PAD_M`."""
     corners = _PAD_M * np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
     try:
         hull = ConvexHull((points[:, None] + corners).reshape(-1, 3))
@@ -139,7 +139,7 @@ def _hull(points: np.ndarray) -> tuple[float, np.ndarray | None]:
 
 
 def _near_pairs(view: View, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pairs of nodes that are compared (e, 2), their nearest vertices (e, 2), and the gaps, metres."""
+    """Return pairs of nodes (e, 2), their nearest vertices (e, 2), and the gaps (e,) in metres."""
     size = np.linalg.norm(pieces.box[:, 1] - pieces.box[:, 0], axis=1)
     pairs, ends, gaps = [], [], []
     for a, b, reach in _boxes_in_reach(pieces.box, size):
@@ -160,7 +160,7 @@ def _near_pairs(view: View, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _boxes_in_reach(box: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, int, float]]:
-    """Yield pairs of boxes float (n, 2, 3) that are within reach of each other, and the reach, metres."""
+    """Yield pairs of boxes float (n, 2, 3) within reach of each other, and their reach in metres."""
     reach = np.clip(REACH_OF_SIZE * size, _TOUCHING_M, REACH_M)
     for a in range(len(box)):
         apart = np.maximum(box[a, 0] - box[a + 1 :, 1], box[a + 1 :, 0] - box[a, 1])
@@ -170,7 +170,7 @@ def _boxes_in_reach(box: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, in
 
 
 def _among_nearest(pairs: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-    """Return which pairs (e, 2) have an end that is among the `NEAREST` of the other end."""
+    """Return which pairs (e, 2) have an end that is among the `NEAREST` neighbors of the other end."""
     ends, row = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.lexsort((row, gaps[row], ends))
     first = np.searchsorted(ends[order], ends[order])
@@ -182,7 +182,7 @@ def _among_nearest(pairs: np.ndarray, gaps: np.ndarray) -> np.ndarray:
 def _joined(
     graph: RegionGraph, node: np.ndarray, rest: int, pairs: np.ndarray, ends: np.ndarray
 ) -> RegionGraph:
-    """Return the graph of nodes with the links of the superpoints' graph, and one link a pair without any."""
+    """Return the graph of nodes with the links of the superpoint graph, and one link per pair without any."""
     region = node[graph.region].astype(np.int32)
     first, second = region[graph.links[:, 0]], region[graph.links[:, 1]]
     across = (first != second) & (first != rest) & (second != rest)
@@ -199,15 +199,9 @@ def _joined(
 
 
 def _of_nodes(
-    view: View,
-    graph: RegionGraph,
-    scores: Scores,
-    label: np.ndarray,
-    node: np.ndarray,
-    rest: int,
-    pieces: _Pieces,
-) -> np.ndarray:
-    """Return the features of nodes that superpoints' features lack, float (count, k)."""
+    view: View, graph: RegionGraph, scores: Scores, label: np.ndarray, node: np.ndarray, rest: int, pieces: _Pieces
+) -> np.ndarray:  # fmt: skip
+    """Return the node features beyond `NODE_FEATURES`, float (count, k)."""
     count = int(node.max()) + 1
     area = np.maximum(np.bincount(graph.region, weights=view.mesh.areas, minlength=graph.count), _TINY)
     total = np.maximum(np.bincount(node, weights=area, minlength=count), _TINY)
@@ -216,7 +210,7 @@ def _of_nodes(
     )
     a, b = graph.pairs[:, 0], graph.pairs[:, 1]
     links = np.bincount(graph.link_pair, minlength=len(graph.pairs))
-    border = np.zeros((count, 3))  # base, artifact, other things
+    border = np.zeros((count, 3))  # towards base, artifact, other clusters
     for own, other in ((a, b), (b, a)):
         across = node[own] != node[other]
         kind = np.where(label[other] == 0, 2, label[other] - 1)
@@ -238,7 +232,7 @@ def _of_pairs(
     view: View, graph: RegionGraph, scores: Scores, node: np.ndarray, rest: int, pieces: _Pieces, shapes: Shapes,
     pairs: np.ndarray, ends: np.ndarray, gaps: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return the features of pairs that borders' features lack, float (e, k)."""
+    """Return the pair features beyond `EDGE_FEATURES`, float (e, k)."""
     a, b = pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
     low, high = pieces.box[:, 0], pieces.box[:, 1]
     size = np.linalg.norm(high - low, axis=1) + 1e-3
@@ -269,7 +263,7 @@ def _of_pairs(
 def _summed_odds(
     graph: RegionGraph, scores: Scores, node: np.ndarray, rest: int, a: np.ndarray, b: np.ndarray
 ) -> np.ndarray:
-    """Return sum, mean and greatest of the log-odds of superpoints' borders between two nodes (e, 3); 0 without any."""
+    """Return sum (on a log scale), mean and maximum of the log-odds of borders between two nodes (e, 3), 0 for none."""
     ends = np.sort(node[graph.pairs].astype(np.int64), axis=1)
     keys, asked = ends[:, 0] * (rest + 1) + ends[:, 1], a * (rest + 1) + b
     row = np.searchsorted(asked, keys)
@@ -280,16 +274,12 @@ def _summed_odds(
     most = np.full(len(asked), -np.inf)
     np.maximum.at(most, row, odds)
     return np.column_stack(
-        [
-            np.sign(total) * np.log1p(np.abs(total)),
-            total / np.maximum(count, 1),
-            np.where(count > 0, most, 0.0),
-        ]
-    )
+        [np.sign(total) * np.log1p(np.abs(total)), total / np.maximum(count, 1), np.where(count > 0, most, 0.0)]
+    )  # fmt: skip
 
 
 def _hull_features(pieces: _Pieces, a: int, b: int) -> tuple[float, float, float]:
-    """Return shares of the smaller piece inside the other's box and hull, and how much the common hull grows."""
+    """Return shares of the smaller piece inside the other's box and hull, and the log growth of the common hull."""
     small, large = (a, b) if pieces.volume[a] <= pieces.volume[b] else (b, a)
     points = pieces.points[small]
     low, high = pieces.box[large] + _INSIDE_M * np.array([[-1.0], [1.0]])
@@ -303,13 +293,13 @@ def _hull_features(pieces: _Pieces, a: int, b: int) -> tuple[float, float, float
 
 
 def _thickness(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the least standard deviation of the points of both pieces, metres."""
+    """Return the smallest standard deviation along the principal axes of the points of both pieces, metres."""
     points = np.concatenate([first, second])
     return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(points.T))[0], 0.0))) if len(points) > 3 else 0.0
 
 
 def _histograms(view: View, pieces: _Pieces) -> np.ndarray:
-    """Return the shares of each piece's colors in bins of CIELAB, float (n, bins^3)."""
+    """Return the normalized CIELAB histogram of each piece, float (n, bins^3)."""
     lab = view.mesh.lab.astype(np.float64)
     low, high = lab.min(axis=0), lab.max(axis=0) + _TINY
     cell = np.clip((_BINS * (lab - low) / (high - low)).astype(int), 0, _BINS - 1)
@@ -320,7 +310,7 @@ def _histograms(view: View, pieces: _Pieces) -> np.ndarray:
 
 
 def _between(view: View, ends: np.ndarray) -> np.ndarray:
-    """Return what frames see between the nearest points of two nodes: shares hidden, free, and surface (e, 3)."""
+    """Return the shares (e, 3) of samples between the nearest points of two nodes: occluded, free space, surface."""
     first, second = view.mesh.points[ends[:, 0]], view.mesh.points[ends[:, 1]]
     counts = np.zeros((len(ends), 3))
     for share in _STEPS:

@@ -1,4 +1,4 @@
-"""The learned cut: superpoints are scored, partitioned once, and read off as base, things and artifacts."""
+"""Segmentation by the learned partition: score, partition, propose, choose; then assign base planes and supports."""
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -25,14 +25,14 @@ _THING, _BASE = LABELS.index("thing"), LABELS.index("base")
 def cut_by_partition(
     shell: Shell, surface: Surface, frames: list[Sighting], config: InstancesConfig, progress: Progress
 ) -> Cut:
-    """Partition the surface into base, things and artifacts by learned affinities.
+    """Partition the surface into base, objects and artifacts by learned affinities.
 
     Args:
-        shell: the surface, and the planes that bound the room.
-        surface: the same surface, world metres.
-        frames: keyframes, the surface drawn into them.
-        config: the least size of things.
-        progress: told how many things there are.
+        shell: the surface graph and its base planes.
+        surface: the same surface in world space.
+        frames: keyframes with the surface rendered into them.
+        config: the least size of objects.
+        progress: receives a note with the counts.
 
     Raises:
         EnvironmentMissing: the weights cannot be read.
@@ -55,10 +55,10 @@ def cut_by_partition(
 
 
 def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row in LABELS, and the cluster, of each vertex, int32 (v,) each.
+    """Return the row in LABELS and the cluster of each vertex, int32 (v,) each.
 
-    Superpoints are partitioned into clusters; of the regions that clusters can be merged into the disjoint ones with
-    the best scores are things, and what is left of the things' clusters is artifact.
+    Superpoints are partitioned into clusters by a multicut. Merge trees of the "thing" clusters give proposals; the
+    disjoint proposals with the highest total score are objects. Clusters in none of them become artifacts.
     """
     scores = models.superpoints.scores(*features(view, graph), graph.pairs)
     label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
@@ -72,26 +72,32 @@ def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[n
 
 
 def things_of(members: csr_matrix, pieces: ClusterGraph) -> np.ndarray:
-    """Return the thing int (v,) from 1 of each vertex, 0 = none, for disjoint sets of clusters (m, n)."""
+    """Return the object int (v,) of each vertex, from 1, 0 = none, for disjoint sets of clusters (m, n)."""
     number = np.zeros(pieces.things + 1, np.int64)
-    number[members.indices] = 1 + np.repeat(np.arange(members.shape[0]), np.diff(members.indptr))
+    number[members.indices] = 1 + np.repeat(np.arange(members.shape[0]), np.diff(members.indptr))  # pyright: ignore[reportOptionalSubscript]
     return number[pieces.graph.region]
 
 
 def labels_of(thing: np.ndarray, label: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return label and cluster of each vertex after the choice of things; cluster numbers of things come last."""
+    """Return label and cluster of each vertex after the choice of objects, whose cluster numbers come last.
+
+    Args:
+        thing: int (v,) object of each vertex, from 1, 0 = none.
+        label: int (v,) row in LABELS after the multicut.
+        cluster: int (v,) cluster after the multicut.
+    """
     own = np.where(thing > 0, _THING, np.where(label == _BASE, _BASE, LABELS.index("artifact")))
     number = np.where(thing > 0, int(cluster.max(initial=-1)) + thing, cluster)
     return own.astype(np.int32), _one_label_each(own, number)
 
 
 def _one_label_each(label: np.ndarray, cluster: np.ndarray) -> np.ndarray:
-    """Return cluster numbers int32 (v,), counted from 0, of which each has one label."""
+    """Return cluster numbers int32 (v,) from 0, split so that each cluster has one label."""
     return np.unique(cluster * len(LABELS) + label, return_inverse=True)[1].astype(np.int32)
 
 
 def features(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray]:
-    """Return the features of a graph's superpoints and borders."""
+    """Return the features of the superpoints and of the borders of a graph."""
     shapes = Shapes.of(view.mesh, graph)
     together = Together.of(view, graph)
     return node_features(view, graph, shapes, together), edge_features(view, graph, shapes, together)
@@ -100,7 +106,7 @@ def features(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray]:
 def clusters_of_things(
     areas: np.ndarray, label: np.ndarray, cluster: np.ndarray, config: InstancesConfig
 ) -> np.ndarray:
-    """Return the clusters that are things and not smaller than the config asks for."""
+    """Return the clusters labeled "thing" that have the least size of the config."""
     thing = label == _THING
     count = int(cluster.max()) + 1 if len(cluster) else 0
     vertices = np.bincount(cluster[thing], minlength=count)
@@ -109,7 +115,7 @@ def clusters_of_things(
 
 
 def _base_owner(shell: Shell, label: np.ndarray) -> np.ndarray:
-    """Return the base entity int32 (v,) of each vertex: of those that are base the nearest plane, 0 for others."""
+    """Return the base entity int32 (v,) of each vertex: the plane it is on, or the nearest; 0 if it is not base."""
     owner = np.zeros(len(shell.graph.points), np.int32)
     base = np.flatnonzero(label == _BASE) if len(label) else owner[:0]
     if not shell.planes or not len(base):

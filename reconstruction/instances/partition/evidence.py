@@ -1,4 +1,4 @@
-"""Evidence of keyframes for each vertex of the fused mesh: visibility, agreement of depth, edges, spread of color."""
+"""Evidence of keyframes per vertex: visibility, agreement with measured depth, image and depth edges, color spread."""
 
 from dataclasses import dataclass
 
@@ -7,28 +7,26 @@ import numpy as np
 
 from reconstruction.instances.sightings import Sighting
 
-_JUMP = 1.03  # ratio of neighboring depths from which they are of two surfaces
-_AGREES = 0.015  # of depth: measured depth this near to a vertex confirms it
-_FAR_M = 0.1  # distances to depth edges are capped here
+_JUMP = 1.03  # ratio of neighboring depths at a depth discontinuity
+_AGREES = 0.015  # of the depth: measured depth within this of a vertex confirms it
+_FAR_M = 0.1  # cap of distances to depth edges
 
 
 @dataclass(frozen=True)
 class FrameLook:
-    """One keyframe's look at the vertices."""
+    """Evidence of one keyframe at each vertex."""
 
-    shown: np.ndarray  # bool (v,) in view, and nothing of the mesh hides it
-    inside: np.ndarray  # bool (v,) in view, hidden or not
-    beyond: (
-        np.ndarray
-    )  # float32 (v,) measured depth less the vertex's, over the vertex's; nan where unmeasured
+    shown: np.ndarray  # bool (v,) inside of the image and not occluded by the mesh
+    inside: np.ndarray  # bool (v,) inside of the image, occluded or not
+    beyond: np.ndarray  # float32 (v,) measured depth over the vertex's depth, less 1; nan where unmeasured
     color: np.ndarray  # float32 (v, 3) weighted CIELAB
     edge: np.ndarray  # float32 (v,) strongest color gradient within a pixel, CIELAB a pixel
-    jump_m: np.ndarray  # float32 (v,) distance to the nearest depth edge of the frame, capped
-    cosine: np.ndarray  # float32 (v,) between normal and ray
+    jump_m: np.ndarray  # float32 (v,) distance to the nearest depth edge, capped
+    cosine: np.ndarray  # float32 (v,) between normal and direction to the camera
 
 
 def look(frame: Sighting, points: np.ndarray, normals: np.ndarray) -> FrameLook:
-    """Return what one keyframe says of vertices (v, 3) with normals (v, 3), world metres."""
+    """Return the evidence of one keyframe at points (v, 3) with normals (v, 3) in world space."""
     row, column, z = frame.seen_at(points)
     shown = frame.shown(row, column, z)
     measured = frame.measured[row, column]
@@ -39,20 +37,18 @@ def look(frame: Sighting, points: np.ndarray, normals: np.ndarray) -> FrameLook:
     rays = frame.eye - points
     cosine = (rays * normals).sum(axis=1) / np.maximum(np.linalg.norm(rays, axis=1), 1e-9)
     edge = _gradient(frame.lab)[row, column]
-    return FrameLook(
-        shown, z > 0, beyond, frame.lab[row, column], edge, jump, cosine.astype(np.float32)
-    )  # fmt: skip
+    return FrameLook(shown, z > 0, beyond, frame.lab[row, column], edge, jump, cosine.astype(np.float32))
 
 
 def _gradient(lab: np.ndarray) -> np.ndarray:
-    """Return the strongest color gradient (h, w) within a pixel of each pixel, CIELAB a pixel."""
+    """Return the largest color gradient (h, w) in the 3 x 3 neighborhood of each pixel, CIELAB per pixel."""
     smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
     squares = sum(cv2.Sobel(smooth, cv2.CV_32F, dx, dy, scale=1 / 8) ** 2 for dx, dy in ((1, 0), (0, 1)))
-    return cv2.dilate(np.sqrt(squares.sum(axis=2)), np.ones((3, 3), np.uint8))
+    return cv2.dilate(np.sqrt(squares.sum(axis=2)), np.ones((3, 3), np.uint8))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _jump_distance(depth: np.ndarray) -> np.ndarray:
-    """Return the distance (h, w) in pixels to the nearest step between measured depths."""
+    """Return the distance (h, w) in pixels to the nearest depth discontinuity."""
     around = np.ones((3, 3), np.uint8)
     high = cv2.dilate(depth, around)
     low = cv2.erode(np.where(depth > 0, depth, high.max(initial=0.0)), around)
@@ -64,20 +60,20 @@ def _jump_distance(depth: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class VertexEvidence:
-    """Means over the keyframes that show a vertex; where none does, zeros, and `shown` is 0."""
+    """Means over the keyframes in which a vertex is visible, float32 (v,) each; zeros where `shown` is 0."""
 
-    shown: np.ndarray  # float32 (v,) number of keyframes
+    shown: np.ndarray  # number of keyframes
     agreed: np.ndarray  # share of them that measured the vertex's depth
-    through: np.ndarray  # share of all keyframes with the vertex in view that look through it
-    before: np.ndarray  # share of those that show it and measured something before it
-    facing: np.ndarray  # greatest cosine between normal and ray
+    through: np.ndarray  # share of the keyframes with the vertex in the image that measured larger depth
+    before: np.ndarray  # share of the keyframes that show it and measured smaller depth
+    facing: np.ndarray  # largest cosine between normal and direction to a camera; -1 where `shown` is 0
     edge: np.ndarray  # mean color gradient
     jump_m: np.ndarray  # mean distance to depth edges
-    spread: np.ndarray  # standard deviation of color between keyframes, CIELAB
+    spread: np.ndarray  # standard deviation of the color over keyframes, CIELAB
 
 
 def gather(looks: list[FrameLook]) -> VertexEvidence:
-    """Return what all keyframes together say of each vertex."""
+    """Aggregate the evidence of all keyframes."""
     count = len(looks[0].shown)
     sums = {
         name: np.zeros(count) for name in ("shown", "inside", "agreed", "through", "before", "edge", "jump_m")

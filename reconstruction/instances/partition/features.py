@@ -1,6 +1,6 @@
-"""Features of regions and of their borders, from the mesh and from what keyframes say of its vertices.
+"""Features of regions and of their borders, from the mesh and from the evidence of keyframes.
 
-Lengths are metres, gravity is -z. Every feature of a border is the same whichever side comes first.
+Lengths are in metres, gravity is -z. The features of a border are symmetric in its two sides.
 """
 
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.core.types import Surface
@@ -32,19 +32,20 @@ EDGE_FEATURES = (
     "chord_depth", "slope", "agreed", "through", "facing", "in_common",
     "together_1", "together_4", "together_12", "pixel_pairs",
 )  # fmt: skip
+# "gap_below": reach in plan, how far the surface below may rise over the foot, least z of its normals
 _BELOW_REACH_M, _BELOW_STEP_M, _UP = 0.08, 0.01, 0.7
-_FREE_REACH_M = 0.04
-_USUAL_FRAMES = 36.0  # counts of keyframes are features as if there were so many
-_SHEET_COSINE, _SHEET_STEP_M = 0.97, 0.012  # neighbors of nearly one direction and plane are of one sheet
+_FREE_REACH_M = 0.04  # distance to the surface at which free space is looked up
+_USUAL_FRAMES = 36.0  # counts of keyframes are normalized to this number
+_SHEET_COSINE, _SHEET_STEP_M = 0.97, 0.012  # least cosine and largest step between coplanar neighbors
 _CHORD_CAP_M = 0.05
 _TINY = 1e-9
-_LOG_ODDS = np.log((np.arange(256) + 1.0) / (256.0 - np.arange(256)))
-_FEW_PAIRS = 4.0  # pixel pairs that weigh as much as knowing nothing
+_LOG_ODDS = np.log((np.arange(256) + 1.0) / (256.0 - np.arange(256)))  # of affinities stored as uint8
+_FEW_PAIRS = 4.0  # weight of the prior log-odds 0, in pixel pairs
 
 
 @dataclass(frozen=True)
 class View:
-    """The surface with all that features are computed from."""
+    """Input of the features: the surface, its keyframes, and their evidence."""
 
     mesh: MeshGraph
     surface: Surface
@@ -54,20 +55,20 @@ class View:
 
     @classmethod
     def of(cls, mesh: MeshGraph, surface: Surface, frames: list[Sighting]) -> "View":
-        """Look at the surface from every keyframe."""
+        """Collect the evidence of all keyframes."""
         looks = list(ordered_map(lambda frame: look(frame, mesh.points, mesh.normals), frames))
         return cls(mesh, surface, frames, looks, gather(looks))
 
 
 @dataclass(frozen=True)
 class Shapes:
-    """Area-weighted shape of each region."""
+    """Area-weighted shape and color of each region."""
 
     area: np.ndarray  # float64 (n,)
     center: np.ndarray  # float64 (n, 3)
     normal: np.ndarray  # float64 (n, 3) unit
     coherence: np.ndarray  # float64 (n,) length of the mean normal
-    spread: np.ndarray  # float64 (n, 3) standard deviations along the main axes, ascending
+    spread: np.ndarray  # float64 (n, 3) standard deviations along the principal axes, ascending
     color: np.ndarray  # float64 (n, 3) weighted CIELAB
     color_spread: np.ndarray  # float64 (n,)
 
@@ -94,15 +95,15 @@ class Shapes:
 
 @dataclass(frozen=True)
 class Together:
-    """Means over keyframes of what the mending network says of pixel pairs: log-odds of one thing, at 1, 4, 12 px."""
+    """Mean affinities of the mending network over keyframes: log-odds that pixels 1, 4, 12 px apart are one object."""
 
-    inside: np.ndarray  # float64 (n, 3) of pairs inside a region, 0 where nothing is known
-    across: np.ndarray  # float64 (e, 3) of pairs across a border
-    pixel_pairs: np.ndarray  # float64 (e,) number of those 12 px apart
+    inside: np.ndarray  # float64 (n, 3) of pixel pairs inside a region, 0 = unknown
+    across: np.ndarray  # float64 (e, 3) of pixel pairs across a border
+    pixel_pairs: np.ndarray  # float64 (e,) number of pixel pairs 12 px apart
 
     @classmethod
     def of(cls, view: View, graph: RegionGraph) -> "Together":
-        """Gather the affinities of all keyframes that have them."""
+        """Average the affinities of all keyframes that have them."""
         count, pairs = graph.count, len(graph.pairs)
         keys = graph.pairs[:, 0].astype(np.int64) * count + graph.pairs[:, 1]
         sums, shown = np.zeros((len(OFFSETS_PX), count + pairs)), np.zeros((len(OFFSETS_PX), count + pairs))
@@ -112,7 +113,7 @@ class Together:
             region = np.where(frame.vertex >= 0, graph.region[np.maximum(frame.vertex, 0)], -1)
             for scale, px in enumerate(OFFSETS_PX):
                 for axis in (1, 0):
-                    step = max(px // 2, 1)  # at every second pixel: the nearest pair is 2 px apart
+                    step = max(px // 2, 1)  # `vertex` has every second pixel: the nearest pair is 2 px apart
                     first = np.moveaxis(region, axis, 0)[:-step].ravel()
                     other = np.moveaxis(region, axis, 0)[step:].ravel()
                     channel = frame.affinity[2 * scale + (1 - axis)]
@@ -129,7 +130,7 @@ class Together:
 
 
 def _places(keys: np.ndarray, asked: np.ndarray) -> np.ndarray:
-    """Return the row of each number in sorted keys; their count where it is not there."""
+    """Return the row of each number in sorted keys; the number of keys where it is missing."""
     row = np.searchsorted(keys, asked)
     there = keys[np.minimum(row, len(keys) - 1)] == asked if len(keys) else np.zeros(len(asked), bool)
     return np.where(there, row, len(keys))
@@ -167,7 +168,7 @@ def node_features(view: View, graph: RegionGraph, shapes: Shapes, together: Toge
 
 
 def _sheets(mesh: MeshGraph, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
-    """Return (n, 4) of the connected, nearly flat sheet that each region is in: log area, length, top, foot; metres."""
+    """Return log area, length, top and foot (n, 4) of the planar sheet of connected regions that each region is in."""
     a, b = graph.pairs[graph.touching].T
     off = [np.abs((shapes.normal[k] * (shapes.center[b] - shapes.center[a])).sum(axis=1)) for k in (a, b)]
     flat = ((shapes.normal[a] * shapes.normal[b]).sum(axis=1) > _SHEET_COSINE) & (
@@ -217,7 +218,7 @@ def edge_features(view: View, graph: RegionGraph, shapes: Shapes, together: Toge
 
 
 def _bends(shapes: Shapes, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return angle between two regions (1 - cosine), how convex they meet, and how far one is off the other's plane."""
+    """Return 1 - cosine of the angle between two regions, convexity, and distance of one from the other's plane."""
     apart = shapes.center[b] - shapes.center[a]
     distance = np.maximum(np.linalg.norm(apart, axis=1), _TINY)[:, None]
     angle = 1.0 - (shapes.normal[a] * shapes.normal[b]).sum(axis=1)
@@ -227,7 +228,7 @@ def _bends(shapes: Shapes, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, ..
 
 
 def _means(graph: RegionGraph, weight: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the weighted means (n, k) of vertices' values (v, k) over each region."""
+    """Return the weighted means (n, k) of values (v, k) over the vertices of each region."""
     total = np.bincount(graph.region, weights=weight, minlength=graph.count)
     sums = [np.bincount(graph.region, weights=weight * column, minlength=graph.count) for column in values.T]
     return np.stack(sums, axis=1) / total[:, None]
@@ -241,7 +242,7 @@ def _link_means(graph: RegionGraph, values: np.ndarray) -> np.ndarray:
 
 
 def _on_planes(view: View) -> np.ndarray:
-    """Return (v, 5): whether a vertex is on the floor, a wall, the ceiling, a support; distance to the nearest wall."""
+    """Return (v, 5): 1 if on the floor, a wall, the ceiling, a support plane; signed distance to the nearest wall."""
     labels = ("floor", "wall", "ceiling", "support")
     out = np.zeros((len(view.mesh.points), len(labels) + 1))
     nearest = np.full(len(out), 1.0)
@@ -255,7 +256,7 @@ def _on_planes(view: View) -> np.ndarray:
 
 
 def _gap_below(shapes: Shapes, foot: np.ndarray) -> np.ndarray:
-    """Return how far the nearest up-facing region in plan is below the foot of each region, metres; else its height."""
+    """Return the smallest gap (n,) between each region's foot and an up-facing region below, else its height."""
     up = np.flatnonzero(shapes.normal[:, 2] > _UP)
     out = foot.copy()
     if len(up) == 0:
@@ -269,9 +270,11 @@ def _gap_below(shapes: Shapes, foot: np.ndarray) -> np.ndarray:
 
 
 def _along_borders(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return per pair the median color gradient and distance to depth edges of the frames that show the border.
+    """Return image evidence along borders, (e,) each, from the frames in which they are visible.
 
-    The third array is the share of the frames showing either side of a border that show both.
+    Returns:
+        Median color gradient, median distance to depth edges, and of all (frame, link) combinations in which a vertex
+        of the link is visible the share in which both are.
     """
     count, frames = len(graph.pairs), len(view.looks)
     edge, jump = (np.full((frames, count), np.nan, np.float32) for _ in range(2))
@@ -295,7 +298,7 @@ def _along_borders(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarr
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """Return the lower median (e,) of columns (k, e) without nan; 0 where there is nothing."""
+    """Return the lower median (e,) of columns (k, e), ignoring nan; 0 where all are nan."""
     known = np.isfinite(values).sum(axis=0)
     ordered = np.sort(values, axis=0)  # nan last
     out = ordered[np.maximum(known - 1, 0) // 2, np.arange(values.shape[1])]
@@ -303,9 +306,9 @@ def _median(values: np.ndarray) -> np.ndarray:
 
 
 def _chords(view: View, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the share of frames that look through the middle of each chord, and by how much on average, metres.
+    """Return the share of frames in which the middle of each chord is in free space, and the mean margin in metres.
 
-    A chord between two sides of a convex thing runs inside of it: frames measure depth before its middle.
+    A chord between two sides of a convex object runs inside of it: frames measure smaller depth than its middle has.
     """
     middle = 0.5 * (first + second)
     free, judged, ahead = (np.zeros(len(middle)) for _ in range(3))
@@ -313,9 +316,7 @@ def _chords(view: View, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarr
         row, column, z = frame.seen_at(middle)
         measured = frame.measured[row, column]
         margin = np.clip(measured - z, -_CHORD_CAP_M, _CHORD_CAP_M)
-        known = (
-            (z > 0) & (measured > 0) & (measured > z - _CHORD_CAP_M)
-        )  # farther before it: something hides it
+        known = (z > 0) & (measured > 0) & (measured > z - _CHORD_CAP_M)  # else occluded
         judged += known
         free += known & (margin > 0)
         ahead += np.where(known, margin, 0.0)

@@ -1,47 +1,45 @@
-"""The graph that is partitioned: superpoints of the fused mesh, joined where they touch or nearly touch."""
+"""Region adjacency graph of superpoints, with edges across mesh borders and across small gaps."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.instances.superpoints import superpoints
 
-GAP_M = 0.03  # superpoints this near to each other are joined across a gap
+GAP_M = 0.03  # largest gap that an edge may bridge
 LABELS = ("thing", "base", "artifact")
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of a graph by the network."""
+    """Scores of the network for a graph."""
 
-    affinity: np.ndarray  # float32 (e,) log-odds that both sides are one thing
+    affinity: np.ndarray  # float32 (e,) log-odds that both sides are one object
     label: np.ndarray  # float32 (n, 3) log-probabilities of LABELS
 
 
 @dataclass(frozen=True)
 class RegionGraph:
-    """Regions of a mesh (superpoints, or clusters of them) as nodes, and pairs of neighbors as edges.
+    """Graph with regions of a mesh (superpoints, or clusters of them) as nodes.
 
-    A link is a pair of vertices of two regions: a mesh edge across their border, or vertices near each other across a
-    gap.
+    A link is a pair of vertices of two regions: a mesh edge across their border, or two vertices across a gap.
     """
 
     region: np.ndarray  # int32 (v,) region of each vertex, from 0
-    count: int  # of regions
-    pairs: np.ndarray  # int32 (e, 2) neighbors, the smaller number first, sorted
-    touching: np.ndarray  # bool (e,) joined by mesh edges, else across a gap
-    links: np.ndarray  # int32 (l, 2) vertices; the first is of the pair's first region
+    count: int  # number of regions
+    pairs: np.ndarray  # int32 (e, 2) edges: neighboring regions, the smaller number first, sorted
+    touching: np.ndarray  # bool (e,) linked by mesh edges, else across a gap
+    links: np.ndarray  # int32 (l, 2) vertices; the first one belongs to the pair's first region
     link_pair: np.ndarray  # int32 (l,) row in `pairs` of each link
 
 
 def region_graph(mesh: MeshGraph, gap_m: float = GAP_M) -> RegionGraph:
     """Return the graph of a mesh's superpoints.
 
-    Superpoints without a mesh edge between them and without a common neighbor are joined where vertices of both are
-    within `gap_m`.
+    Superpoints with vertices within `gap_m` of each other are joined, too, unless they have a common neighbor.
     """
     region = superpoints(mesh)
     a, b = region[mesh.edges[:, 0]], region[mesh.edges[:, 1]]
@@ -52,7 +50,7 @@ def region_graph(mesh: MeshGraph, gap_m: float = GAP_M) -> RegionGraph:
 
 
 def _gap_links(mesh: MeshGraph, region: np.ndarray, links: np.ndarray, gap_m: float) -> np.ndarray:
-    """Return pairs of vertices (k, 2) within a gap of each other, of regions that are not neighbors of neighbors."""
+    """Return pairs of vertices (k, 2) within `gap_m`, of regions that are neither neighbors nor have a common one."""
     if len(region) == 0:
         return np.zeros((0, 2), np.int32)
     near = cKDTree(mesh.points).query_pairs(gap_m, output_type="ndarray")
@@ -63,7 +61,7 @@ def _gap_links(mesh: MeshGraph, region: np.ndarray, links: np.ndarray, gap_m: fl
     rows, columns = np.r_[ends[:, 0], ends[:, 1], :count], np.r_[ends[:, 1], ends[:, 0], :count]
     step = csr_matrix((ones, (rows, columns)), shape=(count, count))
     step.data[:] = 1
-    reached = (step @ step).tocoo()
+    reached = (step @ step).tocoo()  # pyright: ignore[reportAttributeAccessIssue]
     known = np.sort(reached.row.astype(np.int64) * count + reached.col)
     keys = region[near[:, 0]].astype(np.int64) * count + region[near[:, 1]]
     place = np.minimum(np.searchsorted(known, keys), len(known) - 1)
@@ -74,7 +72,7 @@ def _gap_links(mesh: MeshGraph, region: np.ndarray, links: np.ndarray, gap_m: fl
 def graph_of_links(
     region: np.ndarray, links: np.ndarray, touching: np.ndarray, count: int | None = None
 ) -> RegionGraph:
-    """Return the graph of regions int32 (v,) that links int32 (l, 2) of vertices join, by mesh edges or across gaps."""
+    """Return the graph of regions int32 (v,) with links int32 (l, 2), `touching` (l,) where they are mesh edges."""
     if count is None:
         count = int(region.max()) + 1 if len(region) else 0
     ends = region[links].astype(np.int64)
@@ -85,7 +83,7 @@ def graph_of_links(
     pairs = np.stack([keys // max(count, 1), keys % max(count, 1)], axis=1).astype(np.int32)
     joined = np.zeros(len(pairs), bool)
     joined[link_pair[touching]] = True
-    kept = touching | ~joined[link_pair]  # gaps say nothing where the mesh itself joins two regions
+    kept = touching | ~joined[link_pair]  # links across a gap are dropped where mesh edges join the regions
     return RegionGraph(
         region, count, pairs, joined, links[kept].astype(np.int32), link_pair[kept].astype(np.int32)
     )

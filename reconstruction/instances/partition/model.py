@@ -1,8 +1,8 @@
-"""The learned models of the cut. A network scores borders and regions: features in, log-odds and probabilities out.
+"""Inference of the learned models: a message-passing network on the region graph, and boosted trees.
 
-Features of regions and borders are embedded; in each round every region receives the mean and the maximum of messages
-from its neighbors (Battaglia et al., Relational inductive biases, deep learning, and graph networks, 2018). All layers
-are symmetric in the two sides of a border.
+The network embeds the features of regions and borders. In each round a region receives the mean and the maximum of the
+messages of its neighbors (Battaglia et al., Relational inductive biases, deep learning, and graph networks, 2018). All
+layers are symmetric in the two sides of a border.
 """
 
 from dataclasses import dataclass
@@ -21,27 +21,27 @@ from registry.errors import EnvironmentMissing
 WEIGHTS = Path(__file__).parent / "weights" / "partition.safetensors"
 FEATURES = (len(NODE_FEATURES), len(EDGE_FEATURES))  # of superpoints and of their borders
 TREES = {"pairs": len(PAIR_FEATURES) + 2 * len(CLUSTER_FEATURES), "proposals": len(PROPOSAL_FEATURES)}
-CLIP = 5.0  # standard deviations beyond which features are cut off
+CLIP = 5.0  # standard deviations at which features are clipped
 
 
 @dataclass(frozen=True)
 class Model:
-    """Weights by name, as `priors.partition_network.Network` names them."""
+    """The network: weights by their names in `priors.partition_network.Network`."""
 
     weights: dict[str, np.ndarray]
 
     @property
     def rounds(self) -> int:
-        """Return how often neighbors exchange messages."""
+        """Return the number of message-passing rounds."""
         return len({name.split(".")[1] for name in self.weights if name.startswith("message.")})
 
     def scores(self, nodes: np.ndarray, edges: np.ndarray, pairs: np.ndarray) -> Scores:
-        """Score a graph.
+        """Return affinities of borders and label probabilities of regions.
 
         Args:
             nodes: float32 (n, F) features of regions.
-            edges: float32 (e, G) features of their borders.
-            pairs: int (e, 2) regions on both sides, rows sorted.
+            edges: float32 (e, G) features of borders.
+            pairs: int (e, 2) regions on both sides of each border, rows sorted.
         """
         w = self.weights
         h = self._mlp("node_in", standardized(nodes, w["node_mean"], w["node_scale"]))
@@ -66,12 +66,12 @@ class Model:
 
 
 def standardized(values: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return features less their mean over their scale, clipped."""
+    """Return (values - mean) * scale, clipped to `CLIP`, as float32."""
     return np.clip((values - mean) * scale, -CLIP, CLIP).astype(np.float32)
 
 
 class _Neighbors:
-    """Mean and maximum of messages to each node."""
+    """Mean and maximum of the messages to each node."""
 
     def __init__(self, pairs: np.ndarray, count: int) -> None:
         to = np.concatenate([pairs[:, 0], pairs[:, 1]])
@@ -91,12 +91,12 @@ class _Neighbors:
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Models whose scores are averaged."""
+    """Networks whose scores are averaged."""
 
     members: tuple[Model, ...]
 
     def scores(self, nodes: np.ndarray, edges: np.ndarray, pairs: np.ndarray) -> Scores:
-        """Return the mean log-odds, and the normalized mean of the log-probabilities; see `Model.scores`."""
+        """Return the mean log-odds, and the renormalized mean log-probabilities; see `Model.scores`."""
         every = [model.scores(nodes, edges, pairs) for model in self.members]
         label = np.mean([s.label for s in every], axis=0)
         return Scores(np.mean([s.affinity for s in every], axis=0), _log_softmax(label))
@@ -109,20 +109,20 @@ def _log_softmax(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Models:
-    """What the learned cut is made of."""
+    """All models of the learned partition."""
 
-    superpoints: Ensemble  # scores the graph of superpoints
-    pairs: Boosted  # log-odds that two clusters are pieces of one thing
-    proposals: Boosted  # log-odds whose logistic is the IoU of a proposal and a thing
-    least_iou: float  # what a proposal has to be better than to be a thing
+    superpoints: Ensemble  # scores of the superpoint graph
+    pairs: Boosted  # log-odds that two clusters are pieces of one object
+    proposals: Boosted  # logit of the estimated IoU of a proposal and its best object
+    least_iou: float  # subtracted from the estimated IoU of a proposal: those below it are never objects
 
 
 @lru_cache(maxsize=2)
 def load_models(weights: Path = WEIGHTS) -> Models:
-    """Read the weights, named `superpoints.<member>.<name>`, `<pairs or proposals>.<array>`, and `least_iou`.
+    """Read a safetensors file with `superpoints.<member>.<name>`, `<pairs or proposals>.<array>` and `least_iou`.
 
     Raises:
-        EnvironmentMissing: the file is not there or is not what this version reads.
+        EnvironmentMissing: the file is missing, or was made for other features.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load_file

@@ -1,8 +1,8 @@
-"""Multicut of a weighted graph: greedy additive edge contraction, then moves of single nodes and joins.
+"""Multicut of a weighted graph: greedy additive edge contraction (GAEC), then local search by node moves and joins.
 
-Maximizes the sum of the weights of edges within clusters (Keuper et al., Efficient decomposition of image and mesh
-graphs by lifted multicuts, ICCV 2015). The moves are those of Kernighan and Lin of one node at a time. Labels of nodes
-take part as terminal nodes (Levinkov et al., Joint graph decomposition and node labeling, CVPR 2017).
+It maximizes the sum of the weights of edges within clusters (Keuper et al., Efficient decomposition of image and mesh
+graphs by lifted multicuts, ICCV 2015). Moves are of the Kernighan-Lin type, one node at a time. Labels of nodes are
+terminal nodes (Levinkov et al., Joint graph decomposition and node labeling, CVPR 2017).
 """
 
 from heapq import heapify, heappop, heappush
@@ -10,16 +10,16 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 from numba import njit
 
-_ROUNDS = 30
+_ROUNDS = 30  # at most, of the local search and of the moves within it
 
 
 def multicut(count: int, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the cluster int32 (count,) of each node, numbered from 0 by its first node.
 
     Args:
-        count: of nodes.
+        count: number of nodes.
         pairs: int (e, 2) edges, each once, no loops.
-        weights: float (e,) log-odds that both ends are one thing; -inf for ends that never are.
+        weights: float (e,) log-odds that both ends are one object; -inf for ends that must be separate.
     """
     if count == 0:
         return np.zeros(0, np.int32)
@@ -37,17 +37,17 @@ def multicut(count: int, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def partition_with_labels(
     pairs: np.ndarray, weights: np.ndarray, unary: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Partition a graph whose nodes also choose one of several labels, of which label 0 alone has many clusters.
+    """Partition a graph and label its nodes jointly. Only label 0 has several clusters.
 
-    Every other label is a terminal: its nodes are in one cluster with it.
+    Every other label is a terminal node, which shares one cluster with its nodes.
 
     Args:
         pairs: int (e, 2) edges.
-        weights: float (e,) log-odds of one thing.
+        weights: float (e,) log-odds that both ends are one object.
         unary: float (n, k) log-probabilities of the labels.
 
     Returns:
-        int32 (n,) label of each node, and int32 (n,) cluster of each node, from 0.
+        Label of each node int32 (n,), and cluster of each node int32 (n,) from 0.
     """
     count, labels = unary.shape
     nodes = np.arange(count)
@@ -78,7 +78,7 @@ def _numbered(label: np.ndarray) -> np.ndarray:
 
 
 def _contract(count: int, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Contract the heaviest edge between clusters, parallel edges added up, while it is positive."""
+    """Contract the heaviest edge, parallel edges summed, while its weight is positive; return roots int (count,)."""
     if len(pairs) == 0:
         return np.arange(count)
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
@@ -87,7 +87,7 @@ def _contract(count: int, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _joined(label: np.ndarray, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Contract whole clusters while joining two of them gains."""
+    """Join whole clusters while that increases the objective."""
     label = _numbered(label)
     ends = np.sort(label[pairs], axis=1)
     across = ends[:, 0] != ends[:, 1]
@@ -98,7 +98,7 @@ def _joined(label: np.ndarray, pairs: np.ndarray, weights: np.ndarray) -> np.nda
 
 
 def _moved(count: int, pairs: np.ndarray, weights: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Move single nodes to the neighboring cluster, or one of their own, that gains most, until none gains."""
+    """Move single nodes to the best neighboring cluster, or to a new one, until no move increases the objective."""
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     start = np.searchsorted(ends[order, 0], np.arange(count + 1))
@@ -153,7 +153,7 @@ def _find(parent, i):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _slot(keys, key):  # pragma: no cover - compiled
-    """Return the place of a key in an open-addressed table of 2^k places, or of the free place where it belongs."""
+    """Return the slot of a key in an open-addressing hash table of 2^k slots, or the free slot where it belongs."""
     mask = keys.shape[0] - 1
     place = (key * 0x9E3779B97F4A7C1 >> 7) & mask
     while keys[place] != -1 and keys[place] != key:
@@ -165,8 +165,9 @@ def _slot(keys, key):  # pragma: no cover - compiled
 def _gaec(count, low, high, weight):  # pragma: no cover - compiled
     """Return the root of each node after greedy additive edge contraction.
 
-    Edges between roots are in a hash table; a root's neighbors in linked lists that are appended on contraction. The
-    heap holds entries that may be outdated: an entry counts only with the weight that the table has.
+    Edge weights between roots are in a hash table, the neighbors of a root in linked lists that are concatenated on
+    contraction. Heap entries may be outdated: an entry is valid only if the table has its weight. One loop, since the
+    table, the lists and the heap change together.
     """
     edges = low.shape[0]
     room = 1
@@ -177,7 +178,7 @@ def _gaec(count, low, high, weight):  # pragma: no cover - compiled
     parent = np.arange(count)
     head, tail, degree = np.full(count, -1, np.int64), np.full(count, -1, np.int64), np.zeros(count, np.int64)
     follow, node = np.empty(2 * edges, np.int64), np.empty(2 * edges, np.int64)
-    heap = [(0.0, np.int64(0), np.int64(0)) for _ in range(0)]
+    heap = [(0.0, np.int64(0), np.int64(0)) for _ in range(0)]  # empty; gives Numba the type
     for e in range(edges):
         a, b = low[e], high[e]
         place = _slot(keys, a * count + b)
@@ -192,7 +193,7 @@ def _gaec(count, low, high, weight):  # pragma: no cover - compiled
             head[at] = entry
             degree[at] += 1
         if values[place] > 0:
-            heap.append((-values[place], a, b))
+            heap.append((-values[place], a, b))  # pyright: ignore[reportArgumentType]
     heapify(heap)
     while len(heap) > 0:
         negative, a, b = heappop(heap)
@@ -216,7 +217,7 @@ def _gaec(count, low, high, weight):  # pragma: no cover - compiled
                     keys[place] = x * count + y
                     values[place] += moved
                     if values[place] > 0:
-                        heappush(heap, (-values[place], x, y))
+                        heappush(heap, (-values[place], x, y))  # pyright: ignore[reportArgumentType]
             entry = follow[entry]
         if head[gone] >= 0:
             if head[kept] < 0:
@@ -232,7 +233,7 @@ def _gaec(count, low, high, weight):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _rebuilt(keys, values, parent, count):  # pragma: no cover - compiled
-    """Return the table with live entries only, of the same size or larger."""
+    """Return the hash table without zero weights, of the same size or larger."""
     live = 0
     for i in range(keys.shape[0]):
         if keys[i] != -1 and values[i] != 0.0:

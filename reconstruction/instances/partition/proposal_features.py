@@ -1,7 +1,9 @@
-"""Features of proposals: shape, color, and evidence inside them, along their borders and along their contours.
+"""Features of proposals: shape, color, and evidence inside them, along their borders and along their image contours.
 
-Lengths are metres, gravity is -z. Sums over clusters are matrix products with the proposals' members.
+Lengths are in metres, gravity is -z. Sums over clusters are matrix products with the members of the proposals.
 """
+# pyright: reportOptionalSubscript=false
+# SciPy's stubs let the shape of a sparse matrix be None.
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,7 +17,7 @@ from reconstruction.instances.partition.features import View
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, Scores
 from reconstruction.instances.partition.proposals import Proposals
 
-_BESIDE = ("thing", "base", "artifact", "nothing")  # of which a border or a contour can be
+_BESIDE = ("thing", "base", "artifact", "nothing")  # what is on the other side of a border or a contour
 _CONTOUR = ("behind", "before", "level", "level_color", "level_odds", "color", "odds")
 _BETWEEN = ("hidden_between", "free_between", "surface_between", "histogram")
 PROPOSAL_FEATURES = (
@@ -33,23 +35,23 @@ PROPOSAL_FEATURES = (
     *(f"contour_{name}_{kind}" for kind in _BESIDE for name in ("share", *_CONTOUR[:5])),
     "pixels_most", "pixels_mean", "frames_share", "rim_best", "rim", "perimeter",
 )  # fmt: skip
-_SAMPLES, _HULL_SAMPLES = 60, 150  # vertices of a cluster, and of a proposal, that hulls are made of
-_PAD_M = 0.003
-_NEAR_M = 0.02
-_LARGE = 0.15  # of a proposal's area
-_LEVEL = 0.03  # of depth: closer surfaces do not hide each other
-_SHOWN_PX = 20
+_SAMPLES, _HULL_SAMPLES = 60, 150  # vertices of a cluster, and of a proposal, from which hulls are computed
+_PAD_M = 0.003  # padding of the points of convex hulls
+_NEAR_M = 0.02  # largest gap of a "near" pair
+_LARGE = 0.15  # of a proposal's area: least area of a large neighbor
+_LEVEL = 0.03  # of the depth: least step at an occlusion boundary
+_SHOWN_PX = 20  # least size in a keyframe that shows the proposal
 _CLIP_ODDS, _CLIP_BORDER, _CLIP_COLOR = 20.0, 10.0, 40.0
 _TINY = 1e-9
 
 
 @dataclass(frozen=True)
 class _Sums:
-    """Proposals and what sums over their clusters need."""
+    """Members and areas of m proposals of n clusters, for sums over clusters."""
 
     members: csr_matrix  # float64 (m, n)
     region: np.ndarray  # int (v,) cluster of each vertex, n = none
-    weight: np.ndarray  # float64 (v,) m2
+    weight: np.ndarray  # float64 (v,) area, m2
     cluster_area: np.ndarray  # float64 (n,)
     area: np.ndarray  # float64 (m,)
 
@@ -60,29 +62,24 @@ class _Sums:
         return (self.members @ np.stack(sums, axis=1)) / self.area[:, None]
 
     def most(self, values: np.ndarray, lowest: float) -> np.ndarray:
-        """Return the greatest of values (n,) of the clusters of each proposal."""
+        """Return the maximum (m,) of values (n,) over the clusters of each proposal."""
         return _row_most(self.members, values, lowest)
 
 
 def proposal_features(
-    view: View,
-    graph: RegionGraph,
-    scores: Scores,
-    label: np.ndarray,
-    pieces: ClusterGraph,
-    odds: np.ndarray,
+    view: View, graph: RegionGraph, scores: Scores, label: np.ndarray, pieces: ClusterGraph, odds: np.ndarray,
     proposals: Proposals,
-) -> np.ndarray:
-    """Return float32 (m, len(PROPOSAL_FEATURES)).
+) -> np.ndarray:  # fmt: skip
+    """Return the features float32 (m, len(PROPOSAL_FEATURES)) of m proposals.
 
     Args:
-        view: the surface with all that features are computed from.
-        graph: its superpoints.
-        scores: theirs.
+        view: the surface and its keyframes.
+        graph: its superpoint graph.
+        scores: scores of that graph.
         label: int (s,) row in LABELS of each superpoint.
         pieces: the clusters, and pairs of them.
-        odds: float (e,) log-odds that both clusters of a pair are one thing.
-        proposals: regions of clusters.
+        odds: float (e,) log-odds that both clusters of a pair are one object.
+        proposals: sets of clusters.
     """
     count, members = pieces.things, proposals.members
     if members.shape[0] == 0:
@@ -102,7 +99,7 @@ def proposal_features(
 
 
 def _kinds(graph: RegionGraph, label: np.ndarray, pieces: ClusterGraph) -> np.ndarray:
-    """Return int (v,) cluster of each vertex, or, from the number of clusters on: base, artifact."""
+    """Return the cluster int (v,) of each vertex; for others `pieces.things` if base, else that plus 1 (artifact)."""
     count, own = pieces.things, label[graph.region]
     return np.where(
         pieces.graph.region < count, pieces.graph.region, count + (own != LABELS.index("base")).astype(int)
@@ -110,7 +107,7 @@ def _kinds(graph: RegionGraph, label: np.ndarray, pieces: ClusterGraph) -> np.nd
 
 
 def _shapes(view: View, sums: _Sums) -> np.ndarray:
-    """Return spread along the main axes, directions of normals, and the spread of colors."""
+    """Return spread along the principal axes, distribution of normals, and spread of colors."""
     mesh = view.mesh
     points = mesh.points - mesh.points.mean(axis=0)
     center = sums.mean(points)
@@ -142,7 +139,7 @@ def _boxes(view: View, sums: _Sums, proposals: Proposals) -> np.ndarray:
 
 
 def _hulls(view: View, sums: _Sums, proposals: Proposals) -> np.ndarray:
-    """Return volume of the convex hull, and how surface, hull and box fill each other."""
+    """Return the volume of the convex hull, and ratios of surface, hull and box."""
     count = sums.members.shape[1]
     order = np.argsort(sums.region, kind="stable")
     first = np.searchsorted(sums.region[order], np.arange(count + 1))
@@ -170,7 +167,7 @@ def _spaced(rows: np.ndarray, most: int) -> np.ndarray:
 
 
 def _row_most(matrix: csr_matrix, values: np.ndarray, lowest: float) -> np.ndarray:
-    """Return the greatest of values (n,) at the columns that each row has, `lowest` for rows without any."""
+    """Return the maximum of values (n,) over the nonzero columns of each row, `lowest` for empty rows."""
     out = np.full(matrix.shape[0], lowest)
     some = np.diff(matrix.indptr) > 0
     if some.any():
@@ -179,7 +176,7 @@ def _row_most(matrix: csr_matrix, values: np.ndarray, lowest: float) -> np.ndarr
 
 
 def _pairs(sums: _Sums, pieces: ClusterGraph, odds: np.ndarray) -> np.ndarray:
-    """Return statistics of the log-odds and of other features of pairs inside, and of pairs with one end inside."""
+    """Return statistics of log-odds and features over pairs inside a proposal, and over those with one end inside."""
     members = sums.members
     a, b = pieces.graph.pairs.astype(np.int64).T
     odds = np.clip(odds.astype(np.float64), -_CLIP_ODDS, _CLIP_ODDS)
@@ -207,12 +204,12 @@ def _pairs(sums: _Sums, pieces: ClusterGraph, odds: np.ndarray) -> np.ndarray:
 
 
 def _single_clusters(sums: _Sums, a: np.ndarray, b: np.ndarray, odds: np.ndarray) -> list[np.ndarray]:
-    """Return the greatest log-odds of a proposal and one other cluster, and the least of a member and the rest."""
+    """Return the largest log-odds of a proposal and one other cluster, and the smallest of a member and the rest."""
     members, shape = sums.members, (sums.members.shape[1],) * 2
     ends = (np.r_[a, b], np.r_[b, a])
-    number = (members @ csr_matrix((np.ones(2 * len(a)), ends), shape=shape)).tocoo()
+    number = (members @ csr_matrix((np.ones(2 * len(a)), ends), shape=shape)).tocoo()  # pyright: ignore[reportAttributeAccessIssue]
     row, other = number.row, number.col
-    # sums of log-odds that cancel out have no entry, so that all are looked up
+    # Sums of log-odds that cancel out are not stored in the product: look all of them up.
     total = _entries(members @ csr_matrix((np.r_[odds, odds], ends), shape=shape), row, other)
     mean = total / number.data
     own = _entries(members, row, other) > 0
@@ -228,12 +225,12 @@ def _single_clusters(sums: _Sums, a: np.ndarray, b: np.ndarray, odds: np.ndarray
 
 
 def _entries(matrix: csr_matrix, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Return the entries (k,) of a sparse matrix at rows and columns (k,); scipy returns a matrix for k = 0."""
+    """Return the entries (k,) of a sparse matrix at rows and columns (k,), also for k = 0, where SciPy does not."""
     return np.asarray(matrix[row, column]).ravel() if len(row) else np.zeros(0)
 
 
 class _Outward:
-    """Sums over ordered pairs of neighbors of which the first is in a proposal and the second is not."""
+    """Sums over ordered pairs of neighbors whose first is inside a proposal and whose second is outside."""
 
     def __init__(self, sums: _Sums, first: np.ndarray, second: np.ndarray, values: np.ndarray) -> None:
         count = sums.members.shape[1]
@@ -249,7 +246,7 @@ class _Outward:
         self.kind = np.where(other < count, 0, other - count + 1)
 
     def __call__(self, kind: str) -> np.ndarray:
-        """Return the sums (m, k) towards what is of one kind of `_BESIDE`, or towards "all"."""
+        """Return the sums (m, k) towards one kind of `_BESIDE`, or towards "all"."""
         chosen = np.flatnonzero((self.kind == _BESIDE.index(kind)) if kind != "all" else self.kind >= 0)
         return self.pairs[:, chosen] @ self.values[chosen]
 
@@ -257,15 +254,13 @@ class _Outward:
 def _borders(
     view: View, graph: RegionGraph, scores: Scores, sums: _Sums, kind: np.ndarray, proposals: Proposals
 ) -> np.ndarray:
-    """Return length, height in the box, and log-odds of the borders of superpoints around each proposal."""
+    """Return length, relative height and mean log-odds of each proposal's border, by kind of the other side."""
     ends, height = kind[graph.links], view.mesh.points[graph.links, 2].mean(axis=1)
     odds = np.clip(scores.affinity[graph.link_pair].astype(np.float64), -_CLIP_BORDER, _CLIP_BORDER)
     values = np.stack([np.ones(len(ends)), height, odds], axis=1)
     first, second, values = (
-        np.r_[ends[:, 0], ends[:, 1]],
-        np.r_[ends[:, 1], ends[:, 0]],
-        np.r_[values, values],
-    )
+        np.r_[ends[:, 0], ends[:, 1]], np.r_[ends[:, 1], ends[:, 0]], np.r_[values, values]
+    )  # fmt: skip
     across = (first != second) & (first < sums.members.shape[1])
     outward = _Outward(sums, first[across], second[across], values[across])
     tall = proposals.high[:, 2] - proposals.low[:, 2] + 0.01
@@ -282,7 +277,7 @@ def _borders(
 
 
 def _contours(view: View, sums: _Sums, kind: np.ndarray) -> np.ndarray:
-    """Return the evidence of keyframes along the contours of each proposal, and how large it is in them."""
+    """Return the evidence along the image contours of each proposal, and its size in the keyframes."""
     count = sums.members.shape[1]
     nothing = count + len(_BESIDE) - 2
     first, second, values, pixels, rims = [], [], [], [], []
@@ -329,7 +324,7 @@ def _contours(view: View, sums: _Sums, kind: np.ndarray) -> np.ndarray:
 
 
 def _contour_values(near: np.ndarray, far: np.ndarray, color: np.ndarray, odds: np.ndarray) -> np.ndarray:
-    """Return (k, 8): one, then `_CONTOUR` as sums; `far` is inf where nothing was drawn."""
+    """Return (k, 8): 1, then terms whose sums give `_CONTOUR`; `far` is inf where no surface was rendered."""
     away = np.where(np.isinf(far), 1.0, far / np.maximum(near, 0.05) - 1.0)
     level = (np.abs(away) <= _LEVEL).astype(float)
     return np.stack(

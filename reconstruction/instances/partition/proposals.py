@@ -1,7 +1,7 @@
-"""Proposals of whole things: regions of merge trees of clusters, and the best choice of disjoint ones.
+"""Object proposals: regions of merge trees of clusters, and the choice of disjoint ones by weighted set packing.
 
-A sum of pairwise scores cannot tell a whole thing from a part of it. So regions of many sizes are proposed by
-hierarchical merging, each is scored as a whole, and the disjoint ones with the greatest total score are chosen
+A sum of pairwise scores cannot tell a whole object from a part of it. So regions of many sizes are proposed by
+hierarchical merging, each is scored as a whole, and the disjoint ones with the largest total score are chosen
 (Arbelaez et al., Multiscale combinatorial grouping, CVPR 2014; Endres and Hoiem, Category independent object
 proposals, ECCV 2010).
 """
@@ -17,32 +17,32 @@ from scipy.sparse import csr_matrix
 from reconstruction.instances.partition.clusters import ClusterGraph
 from reconstruction.instances.partition.features import View
 
-LARGEST_M = 4.0  # diagonal of a thing
-LEAST_AREA_M2 = 0.002  # smaller regions are not proposed
-ALIKE = 1.03  # regions that grow by less until the next one are left out
+LARGEST_M = 4.0  # largest diagonal of a proposal's bounding box
+LEAST_AREA_M2 = 0.002  # of a proposal
+ALIKE = 1.03  # a region is left out if its parent in the merge tree is larger by less than this factor
 _CLIP_ODDS = 20.0
-_TIME_S = 20.0  # for the choice; the best that was found until then is taken
+_TIME_S = 20.0  # limit of the integer program; the best solution until then is used
 
 
 @dataclass(frozen=True)
 class Proposals:
-    """Regions of clusters."""
+    """Sets of clusters with their bounding boxes."""
 
     members: csr_matrix  # float64 (m, n) 1 = the cluster is in the proposal
-    low: np.ndarray  # float64 (m, 3) least coordinates, metres
-    high: np.ndarray  # float64 (m, 3) greatest coordinates
+    low: np.ndarray  # float64 (m, 3) metres
+    high: np.ndarray  # float64 (m, 3)
 
 
 def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
-    """Return the regions of two merge trees, by the summed and by the mean log-odds of pairs.
+    """Return the regions of two merge trees, with summed and with mean log-odds of pairs as linkage.
 
-    Each is proposed with all that is below it, too: what a thing stands on, a pedestal or legs, often has no
-    measured surface in common with the rest of it.
+    Each region is proposed a second time together with all clusters below it: a pedestal or legs often share no
+    measured surface with the top.
 
     Args:
         view: the surface.
-        pieces: clusters on it, and pairs of them.
-        odds: float (e,) log-odds that both clusters of a pair are one thing.
+        pieces: its clusters, and pairs of them.
+        odds: float (e,) log-odds that both clusters of a pair are one object.
     """
     count, region = pieces.things, pieces.graph.region
     area = np.bincount(region, weights=view.mesh.areas, minlength=count + 1)[:count]
@@ -71,14 +71,7 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
 def _with_all_below(
     members: frozenset[int], low: np.ndarray, high: np.ndarray, middle: np.ndarray
 ) -> frozenset[int]:
-    """Return a region with the clusters whose middle is below its foot and within its box in plan.
-
-    Args:
-        members: clusters of the region.
-        low: float (n, 3) least coordinates of the clusters, metres.
-        high: float (n, 3) greatest coordinates.
-        middle: float (n, 3) middles of their boxes.
-    """
+    """Return a region with the clusters whose box centers (n, 3) are below its box and inside its footprint."""
     rows = list(members)
     least, most = low[rows].min(axis=0), high[rows].max(axis=0)
     within = ((middle[:, :2] > least[:2]) & (middle[:, :2] < most[:2])).all(axis=1)
@@ -86,13 +79,13 @@ def _with_all_below(
 
 
 def members_of(regions: list[list[int]], count: int) -> csr_matrix:
-    """Return regions, lists of clusters, as the rows of a matrix (m, count)."""
+    """Return lists of clusters as the rows of a binary matrix (m, count)."""
     starts = np.cumsum([0, *(len(r) for r in regions)])
     every = np.array([k for r in regions for k in r], np.int64)
     return csr_matrix((np.ones(len(every)), every, starts), shape=(len(regions), count))
 
 
-Link = tuple[float, int]  # sum and number of the log-odds between two regions
+Link = tuple[float, int]  # sum and number of the pairwise log-odds between two regions
 
 
 def _total(link: Link) -> float:
@@ -106,14 +99,14 @@ def _mean(link: Link) -> float:
 def _merged(
     area: np.ndarray, pairs: np.ndarray, odds: np.ndarray, linkage: Callable[[Link], float]
 ) -> list[frozenset[int]]:
-    """Return the regions of one merge tree, without those that the next region is hardly larger than."""
+    """Return the regions of one merge tree, without those that are almost as large as their parent; see `ALIKE`."""
     around: list[dict[int, Link]] = [{} for _ in area]
     for (a, b), value in zip(pairs.tolist(), odds.tolist()):
         around[a][b] = around[b][a] = (value, 1)
     heap = [(-linkage(link), a, b) for a, links in enumerate(around) for b, link in links.items() if a < b]
     heapq.heapify(heap)
     members = [frozenset([k]) for k in range(len(area))]
-    size, since = area.tolist(), area.tolist()  # area now, and of the last region that was kept
+    size, since = area.tolist(), area.tolist()  # area of each region, and where its growth is measured from
     alive, dropped = [True] * len(area), set()
     while heap:
         value, a, b = heapq.heappop(heap)
@@ -143,11 +136,11 @@ def _merged(
 
 
 def best_disjoint(members: csr_matrix, gain: np.ndarray) -> np.ndarray:
-    """Return the rows of the disjoint proposals with the greatest total gain (weighted set packing, exactly).
+    """Return the rows of the disjoint proposals with the largest total gain: weighted set packing by integer program.
 
     Args:
         members: (m, n) 1 = the cluster is in the proposal.
-        gain: float (m,) of each; those without any are never chosen.
+        gain: float (m,) of each proposal; only positive ones are chosen.
     """
     rows = np.flatnonzero(gain > 0)
     if not len(rows):
@@ -157,13 +150,13 @@ def best_disjoint(members: csr_matrix, gain: np.ndarray) -> np.ndarray:
         -gain[rows], constraints=once, bounds=Bounds(0, 1), integrality=np.ones(len(rows)),
         options={"time_limit": _TIME_S},
     )  # fmt: skip
-    if found.x is None:  # out of time without any choice: the best one by one
+    if found.x is None:  # no solution within the time limit
         return _greedy(members, gain, rows)
     return rows[found.x > 0.5]
 
 
 def _greedy(members: csr_matrix, gain: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    taken, out = np.zeros(members.shape[1], bool), []
+    taken, out = np.zeros(members.shape[1], bool), []  # pyright: ignore[reportOptionalSubscript]
     for row in rows[np.argsort(-gain[rows], kind="stable")].tolist():
         own = members.indices[members.indptr[row] : members.indptr[row + 1]]
         if not taken[own].any():

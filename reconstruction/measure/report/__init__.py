@@ -1,5 +1,5 @@
-"""The report of a scene: one HTML page that shows what every stage made, what it cost, and where it is wrong.
+"""Render a scene as one HTML page: the results, cost and errors of every stage.
 
-`collect.py` gathers the bundle, the stage results and the truth; `pictures.py` and `plots.py` draw; `sections.py` says
-what the page holds, in the blocks of `blocks.py`; `page.py` renders them with the template beside it.
+`collect.py` gathers the bundle, the stage results and the truth. `sections.py` builds the sections from the blocks of
+`blocks.py`, with images of `pictures.py` and plots of `plots.py`. `page.py` renders them with the template.
 """

@@ -1,4 +1,4 @@
-"""The evaluation as a section of the report."""
+"""Build the report's section on the evaluation against ground truth."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from reconstruction.measure.report.blocks import (
 )
 from reconstruction.measure.report.collect import Gathered, by_reason
 
-# Metric, name, unit, factor, digits: what a reader looks at first.
+# (metric, name, unit, factor, digits) of the tiles.
 _HEADLINE = (
     ("ate_cm", "camera error", " cm", 1, 1),
     ("scale_error", "scale error", "%", 100, 1),
@@ -31,7 +31,7 @@ _HEADLINE = (
 
 
 def truth_section(g: Gathered) -> Section | None:
-    """Return the metrics of CONTRACT section 4 for this scene; None where there is no truth."""
+    """Return the metrics of CONTRACT section 4 for this scene; None without an evaluation."""
     if g.evaluation is None:
         return None
     metrics = g.evaluation["metrics"]
@@ -42,24 +42,26 @@ def truth_section(g: Gathered) -> Section | None:
     ]
     blocks: list[Block] = [Tiles(tiles, columns=5)]
     if g.evaluation["objects"]:
-        blocks.append(_objects_table(g))
+        blocks.append(_objects_table(g, g.evaluation["objects"]))
     extra = [f"{item['label']} {item['id']}" for item in g.evaluation["extra"]]
     if extra:
-        blocks.append(Text(f"Found, but no match of an evaluated object: {', '.join(extra)}."))
+        blocks.append(Text(f"Found objects without a match: {', '.join(extra)}."))
     blocks.append(_stages_table(g.evaluation["stages"]))
     lines = [f"{key} = {value:.6g}" for key, value in metrics.items() if value is not None]
     blocks.append(Details("All metrics", "\n".join(lines)))
     for reason, names in by_reason(g.evaluation["left_out"]).items():
         blocks.append(left_out(", ".join(sorted(names)), reason))
-    return Section(
-        "truth", "Against the truth", blocks, "After aligning the cameras with the true ones.", "Truth"
-    )
+    lead = "After aligning the cameras with the true ones."
+    return Section("truth", "Against the truth", blocks, lead, "Truth")
 
 
-def _objects_table(g: Gathered) -> Table:
+def _objects_table(g: Gathered, objects: list[dict[str, Any]]) -> Table:
     rows = []
-    for item in g.evaluation["objects"]:
+    for item in objects:
         match, right = item["match"], item.get("relation_right")
+        relation = Cell("–")
+        if right is not None:
+            relation = Cell("right", "good") if right else Cell("wrong", "bad")
         rows.append(
             [
                 Cell(item["name"].replace("_", " ")),
@@ -67,9 +69,7 @@ def _objects_table(g: Gathered) -> Table:
                 Cell(f"{item['box_iou']:.2f}", "" if item["box_iou"] >= 0.5 else "warn"),
                 Cell(f"{item['cd_cm']:.1f} cm"),
                 Cell(f"{item['f_1cm']:.0f}%"),
-                Cell("–")
-                if right is None
-                else Cell("right" if right else "wrong", "good" if right else "bad"),
+                relation,
             ]
         )
     columns = ["true object", "found as", "box IoU", "Chamfer", "F 1 cm", "relation"]
@@ -77,7 +77,7 @@ def _objects_table(g: Gathered) -> Table:
 
 
 def _stages_table(stages: dict[str, Any]) -> Table:
-    """One row for each stage, in the order of the pipeline."""
+    """Return one row per stage, in the order of the pipeline."""
     from reconstruction.pipeline import STAGE_NAMES
 
     order = [name for name in STAGE_NAMES if name in stages] + sorted(set(stages) - set(STAGE_NAMES))
@@ -89,7 +89,7 @@ def _stages_table(stages: dict[str, Any]) -> Table:
 
 
 def _flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return single figures by name; lists (of objects) have tables of their own."""
+    """Flatten nested figures to (name, value) pairs; lists, which have tables of their own, are skipped."""
     out = []
     for name, value in figures.items():
         if isinstance(value, dict):
@@ -103,7 +103,7 @@ _UNITS = (("_cm", " cm"), ("_mm", " mm"), ("_deg", "°"), ("_db", " dB"), ("_s",
 
 
 def _with_unit(name: str, value: Any) -> tuple[str, str]:
-    """Return a metric's name in words, and its value with the unit that the name ends in."""
+    """Return a metric's name in words, and its value with the unit from the name's suffix."""
     if not isinstance(value, float):
         return name.replace("_", " "), str(value)
     if "share" in name or name.endswith("_rel") or "recall" in name or "precision" in name:

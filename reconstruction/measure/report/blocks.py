@@ -1,4 +1,4 @@
-"""What a report page is made of. The template has one macro for each kind of block."""
+"""The building blocks of a report page; the template has one macro per kind of block."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -6,34 +6,34 @@ from typing import ClassVar
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture, inline."""
+    """One inline image."""
 
     src: str  # data URI
     width: int
     height: int
     alt: str
     caption: str = ""
-    overlay: str = ""  # SVG that is drawn over it, edge to edge
+    overlay: str = ""  # SVG drawn over the whole image
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures side by side; `columns` on a wide screen, fewer on a phone."""
+    """Images in a grid with `columns` on a wide screen, `phone_columns` on a phone."""
 
     kind: ClassVar[str] = "pictures"
     items: list[Picture]
     columns: int
-    heads: list[str] = field(default_factory=list)  # over the columns
+    heads: list[str] = field(default_factory=list)  # titles of the columns
     phone_columns: int = 2
     caption: str = ""
 
 
 @dataclass(frozen=True)
 class Legend:
-    """What the colors of a picture mean."""
+    """The color scale of an image."""
 
     kind: ClassVar[str] = "legend"
-    gradient: str  # CSS
+    gradient: str  # CSS value
     low: str
     high: str
     text: str
@@ -46,12 +46,12 @@ class Cell:
     text: str
     status: str = ""
     swatch: str = ""  # CSS color
-    figures: tuple[tuple[str, str], ...] = ()  # names and values, set in one paragraph
+    figures: tuple[tuple[str, str], ...] = ()  # (name, value) pairs, in one paragraph
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table; the columns named in `numeric` are set flush right."""
+    """A table; the columns with the indices `numeric` are right-aligned."""
 
     kind: ClassVar[str] = "table"
     columns: list[str]
@@ -62,7 +62,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Tile:
-    """One figure that is seen at a glance."""
+    """One highlighted figure."""
 
     value: str
     label: str
@@ -72,7 +72,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Figures side by side."""
+    """Highlighted figures side by side."""
 
     kind: ClassVar[str] = "tiles"
     items: list[Tile]
@@ -81,7 +81,7 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Plots:
-    """SVG plots side by side; they scroll on narrow screens where `wide`."""
+    """SVG plots in a grid; `wide` ones scroll on narrow screens."""
 
     kind: ClassVar[str] = "plots"
     svgs: list[str]
@@ -92,7 +92,7 @@ class Plots:
 
 @dataclass(frozen=True)
 class Text:
-    """A line of text; `left_out` ones say what is not shown and why."""
+    """A paragraph; `left_out` marks one about missing content."""
 
     kind: ClassVar[str] = "text"
     text: str
@@ -101,7 +101,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Listing:
-    """A list of lines."""
+    """A bulleted list."""
 
     kind: ClassVar[str] = "listing"
     lines: list[str]
@@ -109,7 +109,7 @@ class Listing:
 
 @dataclass(frozen=True)
 class Details:
-    """Preformatted text that is folded away."""
+    """Preformatted text in a collapsed element."""
 
     kind: ClassVar[str] = "details"
     summary: str
@@ -118,7 +118,7 @@ class Details:
 
 @dataclass(frozen=True)
 class Card:
-    """One object: its turntable, facts and views."""
+    """One object: turntable, facts and crops of its views."""
 
     id: int
     title: str
@@ -132,7 +132,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Cards:
-    """All objects."""
+    """A grid of objects."""
 
     kind: ClassVar[str] = "cards"
     items: list[Card]
@@ -152,25 +152,25 @@ Block = Pictures | Legend | Table | Tiles | Plots | Text | Listing | Details | C
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page with an entry in its table of contents."""
+    """A section of the page, with an entry in the table of contents."""
 
     id: str
     title: str
     blocks: list[Block]
     lead: str = ""
-    short: str = ""  # its name in the table of contents, where the title is too long
+    short: str = ""  # entry in the table of contents, if the title is too long
 
 
 def left_out(what: str, why: str) -> Text:
-    """One line for what cannot be shown."""
+    """Return a paragraph on missing content and the reason."""
     return Text(f"{what} left out: {why}.", left_out=True)
 
 
 def facts(rows: list[tuple[str, str]]) -> Table:
-    """A table of names and values."""
+    """Return a table of (name, value) rows."""
     return Table([], [[Cell(name), Cell(value)] for name, value in rows])
 
 
 def graded(value: float, good: float, fair: float) -> str:
-    """Return the status of a figure that is better the larger it is."""
+    """Grade a figure for which larger is better by two thresholds: "good", "warn" or "bad"."""
     return "good" if value >= good else "warn" if value >= fair else "bad"

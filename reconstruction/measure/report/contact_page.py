@@ -1,4 +1,4 @@
-"""Write the contact sheets of a scene into a folder: pictures, and a page that turns clicks into anchors."""
+"""Write the contact sheets of a scene: images, an HTML page that converts clicks to anchors, an overrides template."""
 
 import html
 import json
@@ -38,10 +38,7 @@ for (const code of document.querySelectorAll('td code')) code.addEventListener('
 
 
 def write_contact_sheets(sheet: ContactSheet, folder: Path) -> list[Path]:
-    """Write `frame_NNNNN.jpg` for each frame, `things.jpg`, and `index.html`; return their paths.
-
-    The same bundle gives the same files.
-    """
+    """Write `frame_NNNNN.jpg` per frame, `things.jpg` and `index.html`; return their paths. Deterministic."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     pictures = [(f"frame_{frame.index:05d}.jpg", frame_sheet(sheet, frame)) for frame in sheet.frames]
@@ -77,8 +74,8 @@ def _page(sheet: ContactSheet) -> str:
         )
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{name}: things</title><style>{_STYLE}</style>'
-        f"<h1>{name}: {len(rows)} things</h1><p>Click on a thing in a frame, or on an anchor: it is copied, to be "
-        f"pasted into a file for <code>simrecon reconstruct --overrides</code>.</p>"
+        f"<h1>{name}: {len(rows)} things</h1><p>Click on an object in a frame, or on an anchor, to copy the anchor. "
+        f"Paste it into a file for <code>simrecon reconstruct --overrides</code>.</p>"
         f'<div id="said"><code>pixel: …</code></div><table><tr><th>id<th>label<th>sure<th>size<th>held<th>anchor</tr>'
         f"{''.join(rows)}</table>{''.join(frames)}"
         f'<img src="things.jpg" alt="every thing for itself">'
@@ -87,16 +84,16 @@ def _page(sheet: ContactSheet) -> str:
 
 
 def overrides_template(sheet: ContactSheet) -> str:
-    """Return an overrides file with a commented line for every thing, to edit."""
+    """Return the text of an overrides file with one commented line per object."""
     lines = [
-        f"# Corrections of {sheet.scene['id']}. Take the # off a line and edit it, then run the same",
-        "# `simrecon reconstruct` command again with --overrides and this file. All it can say: docs/overrides.md.",
-        "# Anchors are clicks in frames of the film: they survive other options, presets and scales.",
+        f"# Corrections of {sheet.scene['id']}. Uncomment and edit lines, then run the same `simrecon reconstruct`",
+        "# command again with --overrides and this file. All options: docs/overrides.md.",
+        "# Anchors are pixels of video frames: they stay valid with other options, presets and scales.",
         "#",
         "# - {pixel: ..., relabel: mug}            # or drop: true, make_base: wall, mass_kg: 0.3, material: ceramic",
-        "# - merge: [{pixel: ...}, {pixel: ...}]   # one thing that was cut in two",
-        "# - split: [{pixel: ...}, {pixel: ...}]   # things taken for one, a click on each",
-        "# - {pixel: ..., parent: {pixel: ...}}    # stands on another thing than was thought",
+        "# - merge: [{pixel: ...}, {pixel: ...}]   # two instances that are one object",
+        "# - split: [{pixel: ...}, {pixel: ...}]   # one instance that is two objects, a pixel on each",
+        "# - {pixel: ..., parent: {pixel: ...}}    # stands on another object",
         "",
     ]
     for number, item in sheet.objects.items():

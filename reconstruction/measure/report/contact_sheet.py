@@ -1,7 +1,6 @@
-"""Contact sheets of a scene's things: frames with outlined, numbered things and a legend, and a picture of each thing.
+"""Draw contact sheets of a scene: frames with outlined, numbered objects and a legend, and a crop of each object.
 
-Everything comes from the bundle: its `instances/` holds frames that show each thing well
-(`reconstruction.publish.instance_views`).
+All data is in the bundle's `instances/` (`reconstruction.publish.instance_views`).
 """
 
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from reconstruction.measure.report import drawing
 from registry import SceneBundle
@@ -20,73 +19,80 @@ from registry.errors import BundleError, UsageError
 FRAME_PX = 1120
 _ROW_PX, _TILE_PX, _COLUMNS = 21, 270, 4
 _INK, _FAINT = (28, 31, 36), (104, 110, 120)
-_WORD_CHARACTERS, _CROWDED = 22, 14
+_WORD_CHARACTERS = 22  # longest label
+_CROWDED = 14  # objects in a frame, above which only numbers are drawn
 
 
 @dataclass(frozen=True)
 class SheetFrame:
-    """A frame of the film and what its pixels show."""
+    """A video frame with its id map."""
 
     index: int
-    image: np.ndarray  # uint8 (h, w, 3) as filmed
-    ids: np.ndarray  # uint16 (h', w')
+    image: np.ndarray  # uint8 (h, w, 3)
+    ids: np.ndarray  # uint16 (h', w') object ids, 0 = none
 
 
 @dataclass(frozen=True)
 class ContactSheet:
-    """What the sheets of one scene are drawn from."""
+    """The data of the sheets of one scene."""
 
     scene: dict
     frames: tuple[SheetFrame, ...]
 
     @classmethod
     def of(cls, bundle: SceneBundle) -> "ContactSheet":
-        """Read the frames that a bundle keeps for its sheets.
+        """Read the frames of a bundle.
 
         Raises:
-            UsageError: the scene was published before bundles kept them.
-            BundleError: a picture is damaged.
+            UsageError: the bundle has none, as it was written by an older version.
+            BundleError: an image is damaged.
         """
         if "instances" not in bundle.scene:
             raise UsageError(
                 f"{bundle.scene['id']}: its bundle holds no frames for contact sheets; run its `simrecon reconstruct` "
-                "command again (what is cached is not computed again)"
+                "command again (cached stages are reused)"
             )
         return cls.read(bundle.scene, bundle.resolve)
 
     @classmethod
     def read(cls, scene: dict, resolve: Callable[[str], Path]) -> "ContactSheet":
-        """Read the frames that `instances.frames` of a scene names; `resolve` says where a file lies."""
+        """Read the frames listed in `instances.frames` of a scene; `resolve` maps their names to paths.
+
+        Raises:
+            BundleError: an image is damaged.
+        """
         frames = []
         for entry in scene["instances"]["frames"]:
             image = cv2.imread(str(resolve(entry["image"])), cv2.IMREAD_COLOR)
             ids = cv2.imread(str(resolve(entry["ids"])), cv2.IMREAD_UNCHANGED)
             if image is None or ids is None or ids.ndim != 2:
-                raise BundleError(f"{scene['id']}: {entry['image']} or {entry['ids']} is no such picture")
+                raise BundleError(
+                    f"{scene['id']}: {entry['image']} or {entry['ids']} cannot be read as an image"
+                )
             frames.append(SheetFrame(entry["index"], image[..., ::-1].copy(), ids.astype(np.uint16)))
         return cls(scene, tuple(frames))
 
     @cached_property
     def objects(self) -> dict[int, dict]:
-        """The things of the scene by id, in order."""
+        """The objects of the scene by id, ascending."""
         return {item["id"]: item for item in sorted(self.scene["objects"], key=lambda o: o["id"])}
 
     @cached_property
     def colors(self) -> dict[int, tuple[int, int, int]]:
-        """One color for each thing, the same as in the report."""
+        """One color per object id, the same as in the report."""
         return {number: drawing.object_color(rank) for rank, number in enumerate(self.objects)}
 
     def shown_in(self, frame: SheetFrame) -> list[int]:
-        """Return the things that a frame shows, by id."""
+        """Return the ids of the objects visible in a frame."""
         return [int(n) for n in np.unique(frame.ids) if int(n) in self.objects]
 
     def frame_of(self, number: int) -> SheetFrame | None:
-        """Return the frame that shows a thing best; None where no frame shows it."""
+        """Return the frame with an object's anchor; None if no frame shows it."""
         anchor = self.objects[number].get("anchor")
         return next((f for f in self.frames if anchor and f.index == anchor["frame"]), None)
 
     def facts(self, number: int) -> tuple[str, str, str, str]:
-        """Return what is said of a thing: its label, confidence, size and what holds it."""
+        """Return label, confidence, size and support of an object as text."""
         item = self.objects[number]
         names = {e["id"]: e["label"] for e in (*self.scene["base"], *self.scene["objects"])}
         edge = next((e for e in self.scene["graph"]["edges"] if e["child"] == number), None)
@@ -98,12 +104,12 @@ class ContactSheet:
 
 
 def shortened(label: str) -> str:
-    """Return a label that fits a legend."""
+    """Truncate a label to fit a legend."""
     return label if len(label) <= _WORD_CHARACTERS else label[: _WORD_CHARACTERS - 1].rstrip() + "…"
 
 
 def anchor_text(item: dict) -> str:
-    """Return the address of a thing as it stands in an overrides file: a click, or its id where no frame shows it."""
+    """Return the address of an object for an overrides file: its anchor pixel, or its id without an anchor."""
     anchor = item.get("anchor")
     if anchor is None:
         return f"id: {item['id']}"
@@ -111,7 +117,7 @@ def anchor_text(item: dict) -> str:
 
 
 def frame_picture(sheet: ContactSheet, frame: SheetFrame) -> np.ndarray:
-    """Draw one frame with its things outlined, numbered and, unless they are many, named; longest side FRAME_PX."""
+    """Draw a frame with its objects outlined, numbered and, unless crowded, named; the longer side is FRAME_PX."""
     height, width = frame.image.shape[:2]
     scale = FRAME_PX / max(height, width)
     size = (round(width * scale), round(height * scale))
@@ -123,9 +129,9 @@ def frame_picture(sheet: ContactSheet, frame: SheetFrame) -> np.ndarray:
 
 
 def frame_sheet(sheet: ContactSheet, frame: SheetFrame) -> np.ndarray:
-    """Draw one frame (`frame_picture`) with a legend to the right: uint8 (h, w, 3).
+    """Draw a frame (`frame_picture`) with a legend to its right: uint8 (h, w, 3).
 
-    The frame itself begins in the upper left corner, so that a pixel of it is a pixel of the sheet.
+    The frame starts in the upper left corner, so that its pixel coordinates are those of the sheet.
     """
     picture = frame_picture(sheet, frame)
     height, width = picture.shape[:2]
@@ -141,7 +147,7 @@ def _legend(
 ) -> np.ndarray:
     rows = [(n, *sheet.facts(n)) for n in shown]
     bold, plain, small = drawing.font(14), drawing.font(14, ""), drawing.font(11, "")
-    columns = [18 + 14 * 2, *(_widest([r[k] for r in rows], plain) for k in range(1, 5))]
+    columns = [18 + 14 * 2, *(_max_width([str(r[k]) for r in rows], plain) for k in range(1, 5))]
     lefts = 16 + np.cumsum([0, *(c + 14 for c in columns)])
     note = f"clicks counted in this picture: size: [{size[0]}, {size[1]}]"
     wide = int(max(lefts[-1] + 4, 32 + plain.getlength(note)))
@@ -158,15 +164,19 @@ def _legend(
     return np.asarray(image)
 
 
-def _widest(words: list[str], font: object) -> int:
+def _max_width(words: list[str], font: ImageFont.FreeTypeFont) -> int:
     return int(max((font.getlength(word) for word in words), default=0))
 
 
 def crops_sheet(sheet: ContactSheet, columns: int = _COLUMNS) -> np.ndarray:
-    """Draw every thing for itself, in the frame that shows it best, with what is said of it: uint8 (h, w, 3)."""
+    """Draw a grid of object crops from their best frames, with facts: uint8 (h, w, 3).
+
+    Raises:
+        UsageError: the scene has no objects.
+    """
     tiles = [_tile(sheet, number) for number in sheet.objects]
     if not tiles:
-        raise UsageError(f"{sheet.scene['id']}: nothing was found in this scene; there is nothing to show")
+        raise UsageError(f"{sheet.scene['id']}: this scene has no objects; there is nothing to show")
     blank = np.full_like(tiles[0], 255)
     columns = min(columns, len(tiles))
     tiles += [blank] * (-len(tiles) % columns)
@@ -186,18 +196,16 @@ def _tile(sheet: ContactSheet, number: int) -> np.ndarray:
     draw.text((24, side + 20), f"{number} {label}", font=bold, fill=_INK, anchor="lm")
     draw.text((side + 6, side + 20), confidence, font=plain, fill=_FAINT, anchor="rm")
     draw.text((6, side + 39), f"{size}, {held}", font=plain, fill=_INK, anchor="lm")
-    draw.text(
-        (6, side + 57), anchor_text(item) if frame else "in no keyframe", font=small, fill=_FAINT, anchor="lm"
-    )
+    words = anchor_text(item) if frame else "in no keyframe"
+    draw.text((6, side + 57), words, font=small, fill=_FAINT, anchor="lm")
     return np.asarray(image)
 
 
 def crop(frame: SheetFrame, number: int, color: tuple[int, int, int], side: int) -> np.ndarray:
-    """Return a square picture (side, side, 3) of one thing, outlined, with a little of what is around it."""
+    """Crop a frame around one object, with its outline: (side, side, 3)."""
     height, width = frame.image.shape[:2]
-    mask = cv2.resize(
-        (frame.ids == number).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
-    )
+    mask = (frame.ids == number).astype(np.uint8)
+    mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
     rows, columns = np.nonzero(mask)
     low = np.array([columns.min(), rows.min()])
     high = np.array([columns.max(), rows.max()]) + 1
@@ -207,9 +215,8 @@ def crop(frame: SheetFrame, number: int, color: tuple[int, int, int], side: int)
     window = (slice(max(y, 0), y + 2 * half), slice(max(x, 0), x + 2 * half))
     image = np.pad(frame.image[window], (*pad, (0, 0)), constant_values=236)
     mask = np.pad(mask[window], pad)
-    big = cv2.resize(
-        image, (side, side), interpolation=cv2.INTER_CUBIC if side > 2 * half else cv2.INTER_AREA
-    )
+    method = cv2.INTER_CUBIC if side > 2 * half else cv2.INTER_AREA
+    big = cv2.resize(image, (side, side), interpolation=method)
     smooth = cv2.resize(mask * 255, (side, side), interpolation=cv2.INTER_LINEAR)
     contours, _ = cv2.findContours((smooth > 127).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     big = np.ascontiguousarray(big)

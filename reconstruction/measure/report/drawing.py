@@ -1,4 +1,4 @@
-"""Small drawing tools: colors, normals, light, outlines, numbers, cameras that frame a thing, data URIs."""
+"""Drawing helpers: color maps, normals, shading, outlines, badges, framing cameras, data URIs."""
 
 import base64
 from functools import cache
@@ -19,20 +19,20 @@ BACKGROUND = np.array([236, 238, 241], np.uint8)
 UNKNOWN = np.array([222, 224, 228], np.uint8)
 PAPER = np.array([205, 208, 212], np.float32)
 ERROR_MAP = "YlOrRd"
-_FAR = 40.0  # A camera this many radii away is orthographic to a percent.
+_FAR = 40.0  # camera distance in radii of the framed points; nearly orthographic
 
 Placed = tuple[TexturedMesh, np.ndarray]  # a mesh with its world_from_mesh
 
 
 def data_uri(image: np.ndarray, quality: int = 82) -> str:
-    """Encode uint8 RGB (h, w, 3) as a JPEG data URI."""
+    """Encode an image uint8 RGB (h, w, 3) as a JPEG data URI."""
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     _, encoded = cv2.imencode(".jpg", cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), flags)
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 def fit_width(image: np.ndarray, width: int) -> np.ndarray:
-    """Return the picture at this width; never larger than it is."""
+    """Downscale an image to at most this width."""
     if image.shape[1] <= width:
         return np.ascontiguousarray(image)
     height = max(1, round(image.shape[0] * width / image.shape[1]))
@@ -41,14 +41,14 @@ def fit_width(image: np.ndarray, width: int) -> np.ndarray:
 
 @cache
 def color_table(name: str) -> np.ndarray:
-    """Return a color map of matplotlib as uint8 (256, 3)."""
+    """Return a matplotlib color map as uint8 (256, 3)."""
     import matplotlib
 
     return (matplotlib.colormaps[name](np.linspace(0, 1, 256))[:, :3] * 255).round().astype(np.uint8)
 
 
 def colorize(values: np.ndarray, low: float, high: float, name: str, known: np.ndarray) -> np.ndarray:
-    """Color values (...) between two limits; gray where not known. Returns uint8 (..., 3)."""
+    """Map values (...) between two limits to colors uint8 (..., 3); gray where `known` is False."""
     level = np.clip((np.nan_to_num(values) - low) / max(high - low, 1e-9), 0, 1)
     picture = color_table(name)[(level * 255).round().astype(np.int64)]
     picture[~known] = UNKNOWN
@@ -56,15 +56,16 @@ def colorize(values: np.ndarray, low: float, high: float, name: str, known: np.n
 
 
 def gradient(name: str) -> str:
-    """Return the same color map as a CSS gradient, for legends."""
+    """Return a matplotlib color map as a CSS gradient."""
     stops = color_table(name)[np.linspace(0, 255, 9).astype(int)]
     return "linear-gradient(90deg," + ",".join("#{:02x}{:02x}{:02x}".format(*c) for c in stops) + ")"
 
 
 def object_color(rank: int) -> tuple[int, int, int]:
-    """Return a color for the rank-th object; neighbors in rank are far apart in hue."""
-    hue = np.uint8([[[int(179 * ((0.07 + rank * 0.381966) % 1.0)), 175, 226]]])
-    return tuple(int(c) for c in cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0])
+    """Return a color for the rank-th object; the golden ratio separates the hues of neighboring ranks."""
+    hue = np.array([[[int(179 * ((0.07 + rank * 0.381966) % 1.0)), 175, 226]]], np.uint8)
+    red, green, blue = cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0].tolist()
+    return red, green, blue
 
 
 def css_color(color: tuple[int, int, int]) -> str:
@@ -73,22 +74,17 @@ def css_color(color: tuple[int, int, int]) -> str:
 
 
 def camera_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return unit normals float32 (h, w, 3) towards the camera, in its space, of a z-depth map; 0 where unknown.
+    """Compute unit normals float32 (h, w, 3), in camera space towards the camera, of a z-depth map; 0 = unknown.
 
-    Of the differences to the left and right (up and down) the smaller is used, so that normals hold at edges.
+    Each derivative is the smaller of the forward and backward difference, so that depth edges do not affect it.
     """
-    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.dstack(
-        [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(depth.shape)]
-    )
+    rays = camera.pixel_rays()
     points = rays * depth[..., None].astype(np.float64)
 
     def derivative(axis: int) -> tuple[np.ndarray, np.ndarray]:
         ahead = np.roll(points, -1, axis) - points
         valid = (depth > 0) & (np.roll(depth, -1, axis) > 0)
-        edge = [slice(None), slice(None)]
-        edge[axis] = -1
-        valid[tuple(edge)] = False
+        np.moveaxis(valid, axis, 0)[-1] = False
         behind, behind_valid = np.roll(ahead, 1, axis), np.roll(valid, 1, axis)
         better = behind_valid & (~valid | (np.abs(behind[..., 2]) < np.abs(ahead[..., 2])))
         return np.where(better[..., None], behind, ahead), valid | behind_valid
@@ -103,14 +99,14 @@ def camera_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def normal_colors(normals: np.ndarray) -> np.ndarray:
-    """Color unit normals (h, w, 3) as (n + 1) / 2; gray where they are zero."""
+    """Map unit normals (h, w, 3) to colors (n + 1) / 2, uint8; gray where they are zero."""
     picture = ((normals + 1) * 127.5).round().astype(np.uint8)
     picture[~normals.any(axis=2)] = UNKNOWN
     return picture
 
 
 def shaded(picture: np.ndarray, depth: np.ndarray, camera: Camera, strength: float = 0.45) -> np.ndarray:
-    """Darken what is turned away from the camera, so that shape shows; the background stays as it is."""
+    """Shade an image with a headlight, from the normals of its z-depth; the background is unchanged."""
     slope = -camera_normals(depth, camera)[..., 2]
     light = np.where((depth > 0) & (slope > 0), 1 - strength * (1 - slope), 1.0)
     light = cv2.blur(light.astype(np.float32), (3, 3))[..., None]
@@ -118,22 +114,20 @@ def shaded(picture: np.ndarray, depth: np.ndarray, camera: Camera, strength: flo
 
 
 def render_ids(meshes: list[tuple[int, Placed]], camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """Return int32 (h, w): which of the numbered meshes is seen where, 0 = none."""
-    ids, depth = np.zeros((camera.height, camera.width), np.int32), None
+    """Render the numbers of meshes: int32 (h, w), 0 = none."""
+    ids, depth = (
+        np.zeros((camera.height, camera.width), np.int32),
+        np.full((camera.height, camera.width), np.inf),
+    )
     for number, (mesh, world_from_mesh) in meshes:
         raster = rasterize_mesh(transform_points(world_from_mesh, mesh.vertices), mesh.faces, camera, pose)
-        nearer = raster.face >= 0
-        if depth is None:
-            depth = np.where(nearer, raster.depth, np.inf)
-        else:
-            nearer &= raster.depth < depth
-            depth = np.where(nearer, raster.depth, depth)
-        ids[nearer] = number
+        nearer = (raster.face >= 0) & (raster.depth < depth)
+        depth[nearer], ids[nearer] = raster.depth[nearer], number
     return ids
 
 
 def render_lit(meshes: list[Placed], camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """Draw textured meshes with a little light from the camera."""
+    """Render textured meshes with a headlight."""
     picture, depth = render_textured(meshes, camera, pose)
     return shaded(picture, depth, camera)
 
@@ -141,7 +135,7 @@ def render_lit(meshes: list[Placed], camera: Camera, pose: np.ndarray) -> np.nda
 def render_colored(
     vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, camera: Camera, pose: np.ndarray
 ) -> np.ndarray:
-    """Draw a mesh with vertex colors (v, 3) of 0..255, lit from the camera, smoothed by two samples a side."""
+    """Render a mesh with vertex colors (v, 3), 0..255, and a headlight; antialiased by 2x2 supersampling."""
     big = camera.resized(2 * camera.width, 2 * camera.height)
     raster: Raster = rasterize_mesh(vertices, faces, big, pose)
     picture = np.where(
@@ -152,13 +146,13 @@ def render_colored(
 
 
 def facing(vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Tell which faces (f,) show their front to a camera: walls seen from behind are then left out."""
+    """Return which faces (f,) are front-facing for a camera."""
     a, b, c = (np.asarray(vertices, np.float64)[faces[:, k]] for k in range(3))
     return (np.cross(b - a, c - a) * (pose[:3, 3] - a)).sum(axis=1) > 0
 
 
 def looking(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
-    """Return the rotation (3, 3) world_from_camera of an upright camera that stands there and looks at the origin."""
+    """Return the rotation (3, 3) world_from_camera of an upright camera in that direction, looking at the origin."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     back = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
@@ -175,9 +169,9 @@ def framing_camera(
     height: int | None = None,
     margin: float = 0.04,
 ) -> tuple[Camera, np.ndarray]:
-    """Return a far camera, nearly orthographic, that frames points (n, 3) from a direction, and its pose.
+    """Return a distant, nearly orthographic camera that frames points (n, 3) from a direction, and its pose.
 
-    Without a height the picture is as high as the points need, at most 1.2 times its width.
+    Without `height` the image is as high as the points need, at most 1.2 times its width.
     """
     rotation = looking(azimuth_deg, elevation_deg)
     local = np.asarray(points, np.float64) @ rotation
@@ -201,9 +195,16 @@ def outlined(
     smallest: float = 3e-4,
     line_px: int = 2,
 ) -> np.ndarray:
-    """Tint, outline and label (with their ids) what an id map (h, w) shows; the rest of the picture is paled.
+    """Tint, outline and label the objects of an id map (h, w); the rest of the image is lightened.
 
-    What covers less than `smallest` of the picture is left out. Without `line_px` there are no outlines.
+    Args:
+        image: uint8 (h, w, 3).
+        ids: of any size, resampled to the image.
+        colors: id -> color; other ids are not drawn.
+        labels: id -> text; the default is the id.
+        tint: opacity of the color.
+        smallest: least share of the image that an object covers.
+        line_px: width of outlines; 0: none.
     """
     height, width = image.shape[:2]
     ids = cv2.resize(ids.astype(np.uint16), (width, height), interpolation=cv2.INTER_NEAREST)
@@ -237,7 +238,7 @@ def badge(
     color: tuple[int, int, int],
     taken: list[tuple[float, float, float, float]],
 ) -> np.ndarray:
-    """Write a short text in a colored pill near a pixel: inside the picture and, if it can, beside those in `taken`."""
+    """Draw a text badge near a pixel, inside the image and if possible not over the boxes `taken`; adds its box."""
     from PIL import Image, ImageDraw
 
     size = max(11, round(image.shape[1] / 44))
@@ -259,7 +260,7 @@ def badge(
 
 @cache
 def font(size: int, weight: str = "Bold") -> "ImageFont.FreeTypeFont":
-    """Return a font that comes with matplotlib ("Bold", or "" for regular): pictures are the same everywhere."""
+    """Return DejaVu Sans ("Bold", or "" for regular) of matplotlib, so that images are the same on all machines."""
     import matplotlib
     from PIL import ImageFont
 

@@ -1,4 +1,4 @@
-"""How a scene graph came about, a picture a step: the view, what it said, the graph after it."""
+"""Draw the steps of scene graph inference: per step the view, its local graph and the merged graph."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,13 +27,13 @@ Triple = tuple[int, str, int]  # child, relation, parent
 def write_graph_steps(
     steps: Sequence[Mapping], names: Mapping[int, str], views: Sequence[np.ndarray | None], folder: Path
 ) -> list[Path]:
-    """Write `step_01.png` and so on; return their paths. The same steps give the same files.
+    """Write `step_01.png` and so on; return their paths. Deterministic.
 
     Args:
         steps: `graph.steps` of a bundle.
-        names: what each thing, floor and wall is called, by id.
-        views: uint8 (h, w, 3) what each step looked at, with numbers; None where there is no picture.
-        folder: created where it is missing.
+        names: name of each object and base surface by id.
+        views: uint8 (h, w, 3) annotated view of each step; None without an image.
+        folder: created if missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -51,14 +51,14 @@ def write_graph_steps(
 def draw_step(
     title: str, step: Mapping, names: Mapping[int, str], view: np.ndarray | None, changed: set[Triple]
 ) -> np.ndarray:
-    """Return one step, uint8 (h, w, 3): view, local graph, merged graph, and in words what was not plain.
+    """Draw one step: view, local graph, merged graph, and conflicts as text; uint8 (h, w, 3).
 
     Args:
-        title: above it.
-        step: of a bundle's `graph.steps`.
+        title: first line.
+        step: entry of a bundle's `graph.steps`.
         names: by id.
-        view: what was looked at.
-        changed: edges of the merged graph that were not in it before.
+        view: annotated view; may be None.
+        changed: new edges of the merged graph.
     """
     verdicts = {_triple(d): d["verdict"] for d in step["decisions"]}
     said = [_triple(edge) for edge in step["said"]]
@@ -84,7 +84,7 @@ def draw_step(
     for k, line in enumerate(lines):
         at = (_GAP_PX, top + shown.shape[0] + _GAP_PX + _ROW_PX * k)
         draw.text(at, line, font=drawing.font(13, ""), fill=_INK)
-    for column, (words, tree) in enumerate((("what it says", local), ("the graph after it", whole))):
+    for column, (words, tree) in enumerate((("graph of this view", local), ("merged graph", whole))):
         left = 2 * _GAP_PX + _VIEW_PX + column * (_TREE_PX + _GAP_PX)
         draw.text((left, 2 * _GAP_PX + 12), words, font=drawing.font(13, ""), fill=_FAINT)
         image.paste(Image.fromarray(tree), (left, top))
@@ -94,7 +94,7 @@ def draw_step(
 def draw_tree(
     edges: Sequence[Triple], names: Mapping[int, str], colors: Mapping[Triple, tuple[int, int, int]]
 ) -> np.ndarray:
-    """Return a forest as an indented list, uint8 (h, w, 3); dashed lines are attachments."""
+    """Draw a forest as an indented list, uint8 (h, w, 3); attachments are dashed."""
     children: dict[int, list[Triple]] = {}
     for edge in sorted(edges):
         children.setdefault(edge[2], []).append(edge)
@@ -125,8 +125,14 @@ def draw_tree(
     return np.asarray(image)
 
 
-def _line(draw, start: tuple[int, int], end: tuple[int, int], color: tuple[int, int, int], dash: int) -> None:
-    """Draw a level or upright line."""
+def _line(
+    draw: ImageDraw.ImageDraw,
+    start: tuple[int, int],
+    end: tuple[int, int],
+    color: tuple[int, int, int],
+    dash: int,
+) -> None:
+    """Draw a horizontal or vertical line, with dashes of `dash` pixels unless 0."""
     length = abs(end[0] - start[0]) + abs(end[1] - start[1])
     step = 2 * dash or max(length, 1)
     for at in range(0, max(length, 1), step):

@@ -1,4 +1,4 @@
-"""Pictures of single objects: on a turntable, and in the frames that textured them."""
+"""Render single objects on a turntable and crop them from the frames that textured them."""
 
 import cv2
 import numpy as np
@@ -13,12 +13,12 @@ from registry.geometry import invert_rigid, transform_points
 
 ANGLES = 12
 _TURNTABLE_PX, _VIEW_PX = 190, 150
-# A square of unit half-width in a camera's image plane: what a turntable frames, whatever the object's shape.
+# Corners of a square of half-width 1 in the image plane, which the turntable frames.
 _CROSS = np.array([[-1.0, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]])
 
 
 def turntable(g: Gathered, mesh: PlacedMesh, first_view: int | None) -> Picture:
-    """Draw an object from twelve angles in one strip, beginning with where its best view looked from."""
+    """Render an object from twelve azimuths side by side, starting at that of its best view."""
     vertices = np.asarray(mesh.visual.vertices, np.float64)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     center = (low + high) / 2
@@ -43,7 +43,7 @@ def turntable(g: Gathered, mesh: PlacedMesh, first_view: int | None) -> Picture:
 
 
 def object_views(g: Gathered, mesh: PlacedMesh, views: list[int], count: int = 4) -> list[Picture]:
-    """Crop the frames that textured an object around it; its outline is where it was found."""
+    """Crop an object from up to `count` of the frames `views`, with the outline of its instance mask."""
     if g.posed is None or g.seen_poses is None or mesh.id not in g.seen_poses:
         return []
     rows = {int(i): row for row, i in enumerate(g.posed.indices)}
@@ -82,7 +82,7 @@ def _crop_box(pixels: np.ndarray, camera: Camera) -> tuple[int, int, int, int] |
 
 
 def _resized_to(image: np.ndarray, side: int) -> np.ndarray:
-    """Scale a crop so that it fits a square, up or down, and center it there."""
+    """Scale a crop to fit a square and center it there."""
     scale = side / max(image.shape[:2])
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC

@@ -1,4 +1,4 @@
-"""From a scene to its page: gather, draw, render the template."""
+"""Build the report page of a scene: gather the inputs, draw, render the template."""
 
 import json
 from importlib.resources import files
@@ -8,7 +8,7 @@ from typing import Any
 from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.measure.ground_truth import GroundTruth
 from reconstruction.measure.report import pictures, sections
-from reconstruction.measure.report.collect import Gathered, by_reason, gather
+from reconstruction.measure.report.collect import Gathered, by_reason
 from reconstruction.measure.scene import placed_meshes
 from reconstruction.measure.stage_results import StageResults
 from registry import SceneBundle
@@ -30,11 +30,11 @@ def build_page(
 
     Args:
         bundle: the scene.
-        stages: what its stages made, as far as that is kept; what is missing is left out and said so.
-        ground_truth: folder of CONTRACT section 3; None: there are no error maps.
-        evaluation: what `Evaluation.to_json` gave for this scene; None: measured here where there is a truth.
-        labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); None: there is no such section.
-        progress: told of each part.
+        stages: its stage results; the page names missing ones.
+        ground_truth: folder of CONTRACT section 3; None: no error maps.
+        evaluation: `Evaluation.to_json` of this scene; None: evaluated here, if there is ground truth.
+        labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); None: no such section.
+        progress: advanced by the evaluation.
 
     Raises:
         UsageError: the truth or the labels are malformed, or not of this video.
@@ -52,14 +52,14 @@ def build_page(
         from reconstruction.measure.outlines import measure_outlines
 
         outlines = measure_outlines(bundle, placed_meshes(bundle), labels, stages)
-    return render(gather(bundle, stages, truth, evaluation, outlines))
+    return render(Gathered(bundle, stages, truth, evaluation, outlines))
 
 
 def read_evaluation(path: Path, bundle: SceneBundle) -> dict[str, Any]:
-    """Read what `simrecon evaluate --json` wrote about this scene.
+    """Read a file of `simrecon evaluate --json` for this scene.
 
     Raises:
-        UsageError: it cannot be read, is something else, or is about another scene or revision.
+        UsageError: it cannot be read, has another format, or is of another scene or revision.
     """
     from reconstruction.measure.evaluate import SCHEMA
 
@@ -68,17 +68,21 @@ def read_evaluation(path: Path, bundle: SceneBundle) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise UsageError(f"--evaluation {path}: cannot be read ({error})") from error
     if not isinstance(found, dict) or found.get("schema") != SCHEMA:
-        raise UsageError(f"--evaluation {path}: is not what `simrecon evaluate --json` writes ({SCHEMA})")
+        raise UsageError(f"--evaluation {path}: not a file of `simrecon evaluate --json` ({SCHEMA})")
     if found.get("revision") != bundle.revision:
         raise UsageError(
-            f"--evaluation {path}: is about revision {found.get('revision')} of {found.get('scene')}, this is "
+            f"--evaluation {path}: is of revision {found.get('revision')} of {found.get('scene')}, this is "
             f"{bundle.revision} of {bundle.scene['id']}; evaluate it again"
         )
     return found
 
 
 def render(g: Gathered) -> str:
-    """Render the page of what was gathered."""
+    """Render the page.
+
+    Raises:
+        EnvironmentMissing: jinja2 is not installed.
+    """
     try:
         from jinja2 import DictLoader, Environment, StrictUndefined
     except ImportError as error:

@@ -1,7 +1,8 @@
-"""Plots as inline SVG by matplotlib: the camera's path, the scene graph, bars."""
+"""Draw plots as inline SVG with matplotlib: camera path, scene graph, bars."""
 
 import io
 import re
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +11,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, MUTED, LINE, ACCENT = "#1d2330", "#6b7280", "#d5d9e0", "#2f6fde"
-_STYLE = {
-    "svg.fonttype": "none",  # text stays text: small, selectable, and set in the page's font
-    "text.parse_math": False,  # a label with dollar signs is no formula
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text stays text: selectable and in the page's font
+    "text.parse_math": False,  # labels may contain dollar signs
     "font.family": "sans-serif",
     "font.size": 10,
     "axes.edgecolor": LINE,
@@ -24,14 +25,14 @@ _STYLE = {
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return a figure of this size in inches that belongs to no window."""
+    """Return a figure of this size in inches, without a window."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height))
 
 
 def to_svg(figure: "Figure", name: str, title: str) -> str:
-    """Return a figure as an SVG element without dates; its inner ids are those of its name."""
+    """Render a figure as an SVG element without dates, with `name` as prefix of its ids."""
     import matplotlib
 
     out = io.StringIO()
@@ -48,13 +49,13 @@ def to_svg(figure: "Figure", name: str, title: str) -> str:
 def camera_path(
     positions: np.ndarray, forward: np.ndarray, is_keyframe: np.ndarray, size: tuple[int, int]
 ) -> str:
-    """Draw the camera's path over a picture from above.
+    """Draw the camera path as an overlay of a top view.
 
     Args:
-        positions: (n, 2) in pixels of the picture, in time order.
-        forward: (n, 2) where each camera looks, in pixels, unit length or shorter.
-        is_keyframe: bool (n,); the others were kept out.
-        size: width and height of the picture.
+        positions: (n, 2) in pixels of the view, in time order.
+        forward: (n, 2) projected viewing directions, in pixels, at most unit length.
+        is_keyframe: bool (n,); the others are held out.
+        size: width and height of the view.
     """
     import matplotlib
 
@@ -83,7 +84,7 @@ def camera_path(
 
 
 def bars(names: list[str], values: list[float], title: str, unit: str, color: str, name: str) -> str:
-    """Draw one horizontal bar for each name, with its value."""
+    """Draw one horizontal bar per name, with its value."""
     import matplotlib
 
     with matplotlib.rc_context(_STYLE):
@@ -107,8 +108,9 @@ def bars(names: list[str], values: list[float], title: str, unit: str, color: st
 
 
 def scene_graph(edges: list[dict[str, Any]], names: dict[int, str], colors: dict[int, str]) -> str:
-    """Draw the forest of who stands on or hangs from whom, roots to the left."""
+    """Draw the forest of support and attachment relations, roots to the left."""
     import matplotlib
+    from matplotlib.patches import FancyBboxPatch, PathPatch
     from matplotlib.path import Path as Curve
 
     places, depth = _tree_layout(edges, names)
@@ -124,13 +126,13 @@ def scene_graph(edges: list[dict[str, Any]], names: dict[int, str], colors: dict
             curve = Curve([(x0, y0), (middle, y0), (middle, y1), (x1, y1)], [1, 4, 4, 4])
             hangs = edge["relation"] == "attached_to"
             axes.add_patch(
-                matplotlib.patches.PathPatch(
+                PathPatch(
                     curve, facecolor="none", edgecolor="#c2577a" if hangs else "#8a94a6", linewidth=1.4,
                     linestyle=(0, (3, 2)) if hangs else "-", alpha=0.4 + 0.6 * min(1.0, edge["confidence"]),
                 )
             )  # fmt: skip
         for item, (x, y) in places.items():
-            box = matplotlib.patches.FancyBboxPatch(
+            box = FancyBboxPatch(
                 (x, y - 0.33), 0.62, 0.66, boxstyle="round,pad=0,rounding_size=0.09", mutation_aspect=3.5,
                 facecolor="#ffffff", edgecolor=colors.get(item, "#9aa3b2"), linewidth=1.8,
             )  # fmt: skip
@@ -142,23 +144,19 @@ def scene_graph(edges: list[dict[str, Any]], names: dict[int, str], colors: dict
 def _tree_layout(
     edges: list[dict[str, Any]], names: dict[int, str]
 ) -> tuple[dict[int, tuple[float, float]], dict[int, int]]:
-    """Place leaves on successive rows and parents in the middle of their children; return places and depths."""
+    """Lay out a forest: leaves on successive rows, parents centered on their children; return (x, y) and depths."""
     children: dict[int, list[int]] = {item: [] for item in names}
     for edge in sorted(edges, key=lambda e: e["child"]):
         children[edge["parent"]].append(edge["child"])
     roots = sorted(set(names) - {edge["child"] for edge in edges})
     places: dict[int, tuple[float, float]] = {}
     depth: dict[int, int] = {}
-    next_row = 0
+    rows = count()
 
     def place(item: int, level: int) -> float:
-        nonlocal next_row
         depth[item] = level
-        if children[item]:
-            rows = [place(child, level + 1) for child in children[item]]
-            row = (rows[0] + rows[-1]) / 2
-        else:
-            row, next_row = next_row, next_row + 1
+        below = [place(child, level + 1) for child in children[item]]
+        row = (below[0] + below[-1]) / 2 if below else next(rows)
         places[item] = (level, row)
         return row
 

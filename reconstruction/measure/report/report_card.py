@@ -1,4 +1,4 @@
-"""The sections in figures: physics, time and memory, notes and options."""
+"""Build the report's sections on physics, time and memory, notes and options."""
 
 import json
 from dataclasses import asdict
@@ -30,10 +30,10 @@ _THRESHOLDS = (
 
 
 def physics_section(g: Gathered) -> Section:
-    """The report card, overall and for each object."""
+    """Return the physics report, overall and per object."""
     physics = g.scene["report"]["physics"]
     if "objects" not in physics:
-        return Section("physics", "Physics", [left_out("The report card", "the bundle's report has none")])
+        return Section("physics", "Physics", [left_out("The report card", "the bundle has none")])
     rates = {"stable": "stable_rate", **{key: f"stable_rate_{key[7:]}" for key, _ in _THRESHOLDS[1:]}}
     tiles = [
         Tile(f"{physics[rates[key]]:.0%}", text, graded(physics[rates[key]], 1.0, 0.8))
@@ -42,7 +42,7 @@ def physics_section(g: Gathered) -> Section:
     floating, overlap = physics["floating_rate"], physics["spawn_penetration_mm"]
     between = " and ".join(x.replace("_", " ") for x in physics.get("spawn_penetration_between", []))
     tiles.append(Tile(f"{floating:.0%}", "floating", graded(-floating, 0.0, -0.2), "fall > 5 mm in 0.5 s"))
-    tiles.append(Tile(f"{overlap:.2f} mm", "deepest overlap at spawn", graded(-overlap, -1.0, -5.0), between))
+    tiles.append(Tile(f"{overlap:.2f} mm", "deepest contact at spawn", graded(-overlap, -1.0, -5.0), between))
     tiles += _rest_tiles(physics)
     rows = []
     ids = {o["id"] for o in g.objects}
@@ -63,11 +63,11 @@ def physics_section(g: Gathered) -> Section:
         )
     columns = ["object", "moved", "turned", "drop", *(text for _, text in _THRESHOLDS), "floats"]
     lead = (
-        f"All {physics['dynamic_objects']} movable objects together for {physics['duration_s']:.0f} s at "
+        f"All {physics['dynamic_objects']} movable objects together, simulated for {physics['duration_s']:.0f} s at "
         f"1/{1 / physics['timestep_s']:.0f} s, undamped, never asleep; {physics['fixed_objects']} objects are fixed."
     )
-    if unfelt := physics.get("without_collision"):  # bundles of before have no list
-        lead += f" No collision shape: {', '.join(name.replace('_', ' ') for name in unfelt)}."
+    if without := physics.get("without_collision"):  # older bundles have no list
+        lead += f" No collision shape: {', '.join(name.replace('_', ' ') for name in without)}."
     blocks: list[Block] = [Tiles(tiles, columns=-(-len(tiles) // 2) if len(tiles) > 5 else len(tiles))]
     if rows:
         blocks.append(Table(columns, rows, numeric=[1, 2, 3]))
@@ -75,7 +75,7 @@ def physics_section(g: Gathered) -> Section:
 
 
 def _rest_tiles(physics: dict) -> list[Tile]:
-    """Return the tiles on the scene at rest; older bundles have none."""
+    """Return the tiles on contacts and energy at rest; older bundles have none."""
     if "contacts" not in physics:
         return []
     contacts, energy = physics["contacts"], physics["energy_at_rest_j"]
@@ -83,15 +83,15 @@ def _rest_tiles(physics: dict) -> list[Tile]:
     real = contacts["support_edges_real"] + contacts["attached_edges_real"]
     other = len(contacts["supports_without_edge"])
     share = real / edges if edges else 1.0
-    unknown = f"{other} rest on something else" if other else "and nothing rests on anything else"
+    unknown = f"{other} more contacts carry objects" if other else "no other contact carries an object"
     return [
         Tile(f"{real} of {edges}", "relations are contacts at rest", graded(share, 1.0, 0.8), unknown),
-        Tile(f"{energy:.0e} J", "left after it", graded(physics["at_rest_rate"], 1.0, 0.8), "kinetic energy"),
+        Tile(f"{energy:.0e} J", "kinetic energy at the end", graded(physics["at_rest_rate"], 1.0, 0.8)),
     ]
 
 
 def cost_section(g: Gathered) -> Section:
-    """Wall time, CPU time and peak memory of each stage."""
+    """Return wall time, CPU time and peak memory of each stage."""
     from reconstruction.pipeline import STAGE_NAMES
 
     report = g.scene["report"]
@@ -122,7 +122,7 @@ def cost_section(g: Gathered) -> Section:
 
 
 def notes_section(g: Gathered) -> Section:
-    """Notes of the stages, what differs from the default options, overrides, the whole config."""
+    """Return the notes of the stages, changed options, overrides, and the whole configuration."""
     report = g.scene["report"]
     blocks: list[Block] = []
     if report.get("notes"):
@@ -140,7 +140,7 @@ def notes_section(g: Gathered) -> Section:
 
 
 def changed_options(config: dict[str, dict]) -> list[tuple[str, str, str]]:
-    """List options that differ from the defaults: (stage.option, value, default)."""
+    """Return the options that differ from the defaults: (stage.option, value, default)."""
     from reconstruction.config import PipelineConfig
 
     default = json.loads(json.dumps(asdict(PipelineConfig())))

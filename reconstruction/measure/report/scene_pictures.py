@@ -1,4 +1,4 @@
-"""Pictures of the whole scene from far cameras: the surface, the assembled scene, and their errors."""
+"""Render the whole scene from distant cameras: the fused surface, the assembled scene, and their error maps."""
 
 from dataclasses import replace
 
@@ -8,22 +8,22 @@ from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera, Surface, TexturedMesh
 from reconstruction.measure.report import drawing
 from reconstruction.measure.report.blocks import Picture
-from reconstruction.measure.report.collect import Gathered
+from reconstruction.measure.report.collect import Gathered, present
 from reconstruction.measure.report.pictures import VIEW_PX, picture
 from reconstruction.measure.report.truth import NearSurface
 from reconstruction.measure.scene import PlacedMesh, joined
 from reconstruction.measure.surfaces import sample
 
-SURFACE_ERROR_M = 0.05
+SURFACE_ERROR_M = 0.05  # upper end of the color scale
 
 
 def side_views(g: Gathered, width: int = VIEW_PX) -> list[tuple[str, Camera, np.ndarray]]:
-    """Three far cameras around the scene: where the video was taken from, and to both sides of that."""
+    """Return three distant cameras (name, camera, pose): on the side of the video's cameras, and 55° to both sides."""
     centers = g.bundle.cameras.world_from_camera[:, :3, 3]
     things = [m.vertices for m in g.object_meshes] or [m.vertices for m in g.meshes] or [centers]
     points = np.concatenate([_box(v) for v in things])
     floor = [m for m in g.meshes if m.label == "floor"]
-    for mesh in floor:  # as much floor as lies around the things
+    for mesh in floor:  # the floor around the objects
         low, high = points.min(axis=0) - 0.4, points.max(axis=0) + 0.4
         inside = np.clip(_box(mesh.vertices), low, high)
         points = np.concatenate([points, inside])
@@ -44,7 +44,7 @@ def _box(vertices: np.ndarray) -> np.ndarray:
 
 
 def surface_faces(g: Gathered, surface: Surface, pose: np.ndarray) -> np.ndarray:
-    """Return the surface's faces without floor and walls that turn their back to a camera."""
+    """Return the surface's faces without back-facing faces of floor and walls."""
     faces = np.asarray(surface.faces)
     front = drawing.facing(surface.vertices, faces, pose)
     if g.instances is None:
@@ -54,12 +54,12 @@ def surface_faces(g: Gathered, surface: Surface, pose: np.ndarray) -> np.ndarray
 
 
 def surface_views(g: Gathered) -> tuple[list[Picture], list[str]]:
-    """The fused surface from three sides: in color, as clay, and by its distance from the truth."""
-    surface, views = g.surface, side_views(g)
+    """Render the fused surface from three sides: in color, in gray, and as an error map; also return their names."""
+    surface, views = present(g.surface), side_views(g)
     vertices = np.asarray(surface.vertices)
     clay = np.full((len(vertices), 3), 196, np.float32)
     out = []
-    for what, colors in (("in color", np.asarray(surface.colors)), ("its shape alone", clay)):
+    for what, colors in (("in color", np.asarray(surface.colors)), ("shape only", clay)):
         for name, camera, pose in views:
             faces = surface_faces(g, surface, pose)
             image = drawing.render_colored(vertices, faces, colors, camera, pose)
@@ -74,24 +74,25 @@ def surface_views(g: Gathered) -> tuple[list[Picture], list[str]]:
 def error_view(
     g: Gathered, vertices: np.ndarray, faces: np.ndarray, camera: Camera, pose: np.ndarray, what: str
 ) -> Picture:
-    """Draw a mesh (v, 3), (f, 3) in the colors of its distance to the true surface."""
+    """Render a mesh (v, 3), (f, 3) colored by its distance to the true surface."""
     raster = rasterize_mesh(vertices, faces, camera, pose)
     hit = raster.face >= 0
     distance = np.zeros(hit.shape)
-    distance[hit] = g.truth.distance(raster.interpolate(faces, vertices)[hit])
+    distance[hit] = present(g.truth).distance(raster.interpolate(faces, vertices)[hit])
     return _error_picture(distance, hit, raster.depth, camera, what)
 
 
 def missing_view(g: Gathered, near: NearSurface, camera: Camera, pose: np.ndarray, what: str) -> Picture:
-    """Draw the true surface in the colors of its distance to the scene, where the video shows it at all."""
-    vertices, faces = g.truth.mesh_in_scene
-    base = np.concatenate([np.full(len(e.mesh.faces), e.base) for e in g.truth.known.entities])
+    """Render the true surface colored by its distance to the scene (`near`), where it is visible in the video."""
+    truth = present(g.truth)
+    vertices, faces = truth.mesh_in_scene
+    base = np.isin(truth.known.face_ids, [e.id for e in truth.known.base])
     faces = faces[~base | drawing.facing(vertices, faces, pose)]
     raster = rasterize_mesh(vertices, faces, camera, pose)
     hit = raster.face >= 0
-    points = g.truth.alignment.to_true(raster.interpolate(faces, vertices)[hit])
+    points = truth.alignment.to_true(raster.interpolate(faces, vertices)[hit])
     distance, filmed = np.zeros(hit.shape), np.zeros(hit.shape, bool)
-    distance[hit], filmed[hit] = near.distance(points), g.truth.seen(points)
+    distance[hit], filmed[hit] = near.distance(points), truth.seen(points)
     return _error_picture(distance, filmed, raster.depth, camera, what)
 
 
@@ -108,7 +109,7 @@ def _error_picture(
 
 
 def scene_views(g: Gathered) -> list[Picture]:
-    """The assembled scene from three sides; with a truth also its error, and what of the truth it lacks."""
+    """Render the assembled scene from three sides; with true meshes also error maps in both directions."""
     views = side_views(g)
     out = []
     for name, camera, pose in views:
@@ -122,12 +123,12 @@ def scene_views(g: Gathered) -> list[Picture]:
     vertices, faces = joined(g.meshes)
     near = NearSurface(sample(g.truth.alignment.to_true(vertices), faces, 400_000))
     for name, camera, pose in views:
-        out.append(missing_view(g, near, camera, pose, f"what the scene lacks of the truth, {name}"))
+        out.append(missing_view(g, near, camera, pose, f"distance from the truth to the scene, {name}"))
     return out
 
 
 def _open_room(mesh: PlacedMesh, pose: np.ndarray) -> TexturedMesh:
-    """Return a mesh without the walls that stand between the camera and the room."""
+    """Return a mesh without back-facing faces if it is a base surface, to look into the room."""
     if not mesh.base:
         return mesh.visual
     return replace(mesh.visual, faces=mesh.faces[drawing.facing(mesh.vertices, mesh.faces, pose)])

@@ -1,4 +1,4 @@
-// Turntables, zoomed pictures (arrow keys flip through neighbors, which compares them), the current section.
+// Turntables, zoomed images (arrow keys step through their row), highlight of the current section.
 document.documentElement.classList.add("js");
 
 for (const turn of document.querySelectorAll(".turn")) {

@@ -1,11 +1,12 @@
-"""What the report says, section by section: each function turns what was gathered into blocks of the page."""
+"""Build the sections of the report: one function per section, from the gathered inputs to blocks."""
 
 import json
-from typing import Any
 
 import numpy as np
 
+from reconstruction.core.types import Camera
 from reconstruction.measure.report import drawing, object_pictures, pictures, plots, scene_pictures
+from reconstruction.measure.report.against_truth import truth_section
 from reconstruction.measure.report.blocks import (
     Block,
     Card,
@@ -26,25 +27,22 @@ from reconstruction.measure.report.blocks import (
 )
 from reconstruction.measure.report.collect import Gathered
 from reconstruction.measure.report.contact_sheet import anchor_text
+from reconstruction.measure.report.outline_section import outline_section
+from reconstruction.measure.report.report_card import cost_section, notes_section, physics_section
 
 
 def all_sections(g: Gathered) -> list[Section]:
     """Return the page's sections in order."""
-    from reconstruction.measure.report.against_truth import truth_section
-    from reconstruction.measure.report.outline_section import outline_section
-    from reconstruction.measure.report.report_card import cost_section, notes_section, physics_section
-
     makers = (
         truth_section, outline_section, cameras_section, depth_section, gaussians_section, surface_section,
-        instances_section, objects_section, graph_section, assembly_section, kept_out_section, physics_section,
+        instances_section, objects_section, graph_section, assembly_section, held_out_section, physics_section,
         cost_section, notes_section,
     )  # fmt: skip
-    made = [maker(g) for maker in makers]
-    return [section for section in made if section is not None]
+    return [section for maker in makers if (section := maker(g)) is not None]
 
 
 def summary_tiles(g: Gathered) -> Tiles:
-    """The figures to see at a glance."""
+    """Return the highlighted figures at the top of the page."""
     scene, report = g.scene, g.scene["report"]
     physics, scale = report["physics"], scene["scale"]
     tiles = [Tile(str(len(scene["objects"])), "objects", detail=f"{len(scene['base'])} base surfaces")]
@@ -54,7 +52,7 @@ def summary_tiles(g: Gathered) -> Tiles:
         tiles.append(Tile(f"{rate:.0%}", "stable", graded(rate, 1.0, 0.8), detail))
     if "spawn_penetration_mm" in physics:
         depth = physics["spawn_penetration_mm"]
-        tiles.append(Tile(f"{depth:.1f} mm", "deepest overlap", graded(-depth, -1.0, -5.0)))
+        tiles.append(Tile(f"{depth:.1f} mm", "deepest contact at spawn", graded(-depth, -1.0, -5.0)))
     sigma = scale["uncertainty"]
     status = "bad" if sigma is None else graded(-sigma, -0.05, -0.2)
     tiles.append(Tile(_uncertainty(scale), "scale", status, scale["method"].replace("-", " ")))
@@ -70,12 +68,12 @@ def summary_tiles(g: Gathered) -> Tiles:
 
 
 def _uncertainty(scale: dict) -> str:
-    """Return the relative uncertainty of metres as text; a scene of unknown scale has none."""
+    """Format the relative uncertainty of the metric scale."""
     return "unknown" if scale["uncertainty"] is None else f"± {scale['uncertainty']:.0%}"
 
 
 def cameras_section(g: Gathered) -> Section:
-    """Keyframes, camera path, registration and scale."""
+    """Return keyframes, camera path, registration and scale."""
     blocks: list[Block] = []
     if g.posed is None:
         blocks.append(left_out("Keyframes", g.why_missing("poses", "world")))
@@ -90,13 +88,8 @@ def cameras_section(g: Gathered) -> Section:
     ]
     found = scene["report"].get("registration")
     if found:
-        rows.append(
-            (
-                "registration",
-                f"{found['registered']} of {found['keyframes']} keyframes, "
-                f"reprojection error {found['reprojection_error_px']:.2f} px",
-            )
-        )
+        error_px = f"reprojection error {found['reprojection_error_px']:.2f} px"
+        rows.append(("registration", f"{found['registered']} of {found['keyframes']} keyframes, {error_px}"))
     c = g.camera
     rows.append(("camera", f"{c.width}×{c.height}, focal length {c.fx:.0f} px, field of view {_fov(c):.0f}°"))
     scale = scene["scale"]
@@ -105,95 +98,85 @@ def cameras_section(g: Gathered) -> Section:
     rows.append(("scale", f"{scale['method']}{spread}{detail}"))
     world = scene.get("world")
     if world:
-        floor = "seen" if world["floor_observed"] else "assumed below everything seen"
+        floor = "observed" if world["floor_observed"] else "assumed below the lowest observed point"
         rows.append(
             ("gravity", f"{world['gravity_method']}, ± {world['gravity_sigma_deg']:.1f}°; floor {floor}")
         )
-    path = Pictures(
-        [pictures.camera_path(g)],
-        1,
-        phone_columns=1,
-        caption="The assembled scene from above. Full dots are keyframes, empty dots kept-out frames; lines show where "
-        "the camera looks.",
+    caption = (
+        "The assembled scene from above. Full dots are keyframes, empty dots held-out frames; lines are viewing "
+        "directions."
     )
+    path = Pictures([pictures.camera_path(g)], 1, phone_columns=1, caption=caption)
     blocks.append(Split(path, facts(rows)))
     return Section("cameras", "Video and cameras", blocks, short="Cameras")
 
 
-def _fov(camera: Any) -> float:
+def _fov(camera: Camera) -> float:
     return float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
 
 
 def depth_section(g: Gathered) -> Section:
-    """Depth and normals beside color, and the error."""
-    section = Section("depth", "Depth", [])
+    """Return color, depth, normals and depth errors of keyframes."""
     if g.posed is None or g.depth is None:
-        section.blocks.append(left_out("Depth and normals", g.why_missing("poses", "depth", "world")))
-        return section
+        missing = left_out("Depth and normals", g.why_missing("poses", "depth", "world"))
+        return Section("depth", "Depth", [missing])
     items, errors = pictures.depth_rows(g)
     heads = ["color", "depth", "normals"] + (["error"] if pictures.depth_is_compared(g) else [])
-    section.blocks.append(
-        Pictures(items, len(heads), heads, phone_columns=len(heads) if len(heads) == 4 else 3)
-    )
-    section.blocks.append(Legend(drawing.gradient("turbo_r"), "near", "far", "depth; gray: unknown"))
+    blocks: list[Block] = [
+        Pictures(items, len(heads), heads, phone_columns=len(heads)),
+        Legend(drawing.gradient("turbo_r"), "near", "far", "depth; gray: unknown"),
+    ]
     if errors:
         limit = f"{100 * pictures.DEPTH_ERROR_M:.0f} cm or more"
-        section.blocks.append(Legend(drawing.gradient(drawing.ERROR_MAP), "0", limit, "error of the depth"))
+        blocks.append(_error_legend(limit, "depth error"))
     elif g.truth is not None:
-        section.blocks.append(left_out("The depth's error map", "no true depth of these frames is known"))
-    section.blocks.append(
-        Text(
-            "Normals have world axes as colors: the floor is even lavender, facing walls are even red or green."
-        )
-    )
-    return section
+        blocks.append(left_out("The depth's error map", "no true depth of these frames is known"))
+    text = "Colors of normals are world axes: the floor is uniformly lavender, a wall has one color."
+    return Section("depth", "Depth", [*blocks, Text(text)])
 
 
 def surface_section(g: Gathered) -> Section:
-    """The fused surface from three sides."""
-    section = Section("surface", "Surface", [])
-    if g.surface is None:
-        section.blocks.append(left_out("The fused surface", g.why_missing("surface")))
-        return section
-    items, heads = scene_pictures.surface_views(g)
-    section.blocks.append(Pictures(items, 3, heads, phone_columns=3))
-    if g.truth is not None and g.truth.has_meshes:
-        section.blocks.append(_distance_legend())
-    elif g.truth is not None:
-        section.blocks.append(left_out("The surface's error map", "the truth has no meshes"))
+    """Return the fused surface from three sides, and its error maps."""
     surface = g.surface
+    if surface is None:
+        return Section("surface", "Surface", [left_out("The fused surface", g.why_missing("surface"))])
+    items, heads = scene_pictures.surface_views(g)
+    blocks: list[Block] = [Pictures(items, 3, heads, phone_columns=3)]
+    if g.truth is not None and g.truth.has_meshes:
+        blocks.append(_distance_legend())
+    elif g.truth is not None:
+        blocks.append(left_out("The surface's error map", "the truth has no meshes"))
     unseen = (np.asarray(surface.space.state) == 0).mean()
-    section.blocks.append(
-        Text(
-            f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, voxels of "
-            f"{1000 * surface.voxel_size_m:.0f} mm; {unseen:.0%} of the room's box was not looked into."
-        )
+    text = (
+        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, voxels of "
+        f"{1000 * surface.voxel_size_m:.0f} mm; {unseen:.0%} of the room's bounding box is unobserved."
     )
-    return section
+    return Section("surface", "Surface", [*blocks, Text(text)])
 
 
 def _distance_legend() -> Legend:
     limit = f"{100 * scene_pictures.SURFACE_ERROR_M:.0f} cm or more"
-    return Legend(
-        drawing.gradient(drawing.ERROR_MAP), "0", limit, "distance to the true surface; gray: never filmed"
-    )
+    return _error_legend(limit, "distance to the true surface; gray: not visible in the video")
+
+
+def _error_legend(limit: str, text: str) -> Legend:
+    return Legend(drawing.gradient(drawing.ERROR_MAP), "0", limit, text)
 
 
 def instances_section(g: Gathered) -> Section:
-    """Instances outlined and numbered on frames."""
-    section = Section("instances", "Instances", [])
+    """Return frames with outlined, numbered instances."""
     if g.posed is None or g.instances is None:
-        section.blocks.append(left_out("Outlines on frames", g.why_missing("poses", "world", "instances")))
-        return section
+        missing = left_out("Outlines on frames", g.why_missing("poses", "world", "instances"))
+        return Section("instances", "Instances", [missing])
     true = g.truth is not None and g.truth.has_meshes
     items = pictures.instance_frames(g, 4 if true else 6)
-    heads = ["found", "true, colored as matched"] if true else []
-    section.blocks.append(Pictures(items, 2 if true else 3, heads, phone_columns=2 if true else 1))
-    return section
+    heads = ["found", "true, in the color of the match"] if true else []
+    shown = Pictures(items, 2 if true else 3, heads, phone_columns=2 if true else 1)
+    return Section("instances", "Instances", [shown])
 
 
 def objects_section(g: Gathered) -> Section:
-    """Each object's views, turntable and facts."""
+    """Return each object's turntable, facts and views."""
     scores = {o["match"]: o for o in (g.evaluation or {}).get("objects", []) if o["match"] is not None}
     meshes = {m.id: m for m in g.object_meshes}
     cards = []
@@ -221,34 +204,25 @@ def objects_section(g: Gathered) -> Section:
 
 def _object_facts(item: dict, score: dict | None) -> list[tuple[str, str]]:
     size = " × ".join(f"{100 * side:.0f}" for side in item["scale"])
+    kind, observed = "movable" if item["dynamic"] else "fixed", item["provenance"]["observed_fraction"]
     out = [
         ("size", f"{size} cm"),
-        (
-            "mass",
-            f"{item['mass_kg']:.2f} kg, {item['material']}, {'movable' if item['dynamic'] else 'fixed'}",
-        ),
-        (
-            "seen",
-            f"{item['provenance']['observed_fraction']:.0%} of its surface, in {len(item['views'])} frames",
-        ),
+        ("mass", f"{item['mass_kg']:.2f} kg, {item['material']}, {kind}"),
+        ("observed", f"{observed:.0%} of its surface, in {len(item['views'])} frames"),
         ("shape", f"{item['provenance']['geometry']}; {len(item['collision'])} collision parts"),
-        ("label", f"{item['label']}, sure to {item['label_confidence']:.0%}"),
+        ("label", f"{item['label']}, confidence {item['label_confidence']:.0%}"),
     ]
     if "anchor" in item:
         out.append(("for --overrides", anchor_text(item)))
     if score is not None:
-        out.append(
-            (
-                "truth",
-                f"{score['name'].replace('_', ' ')}: box IoU {score['box_iou']:.2f}, "
-                f"Chamfer {score['cd_cm']:.1f} cm, F 1 cm {score['f_1cm']:.0f}%",
-            )
-        )
+        surface = f"Chamfer {score['cd_cm']:.1f} cm, F 1 cm {score['f_1cm']:.0f}%"
+        name = score["name"].replace("_", " ")
+        out.append(("truth", f"{name}: box IoU {score['box_iou']:.2f}, {surface}"))
     return out
 
 
 def graph_section(g: Gathered) -> Section:
-    """The scene graph, drawn and as a table."""
+    """Return the scene graph, drawn and as a table."""
     edges = sorted(g.scene["graph"]["edges"], key=lambda e: e["child"])
     colors = {item: drawing.css_color(color) for item, color in g.colors.items()}
     wrong = {o["match"] for o in (g.evaluation or {}).get("objects", []) if o.get("relation_right") is False}
@@ -263,16 +237,16 @@ def graph_section(g: Gathered) -> Section:
         ]
         for e in edges
     ]
-    text = "Solid: supported by. Dashed: attached to. The fainter, the less sure."
+    text = "Solid: supported by. Dashed: attached to. Fainter: less confident."
     blocks: list[Block] = [
         Plots([plots.scene_graph(edges, g.names, colors)], wide=True, caption=text),
-        Table(["object", "relation", "parent", "sure", "said by", "evidence"], rows, numeric=[3]),
+        Table(["object", "relation", "parent", "confidence", "source", "evidence"], rows, numeric=[3]),
     ]
     return Section("graph", "Scene graph", blocks)
 
 
 def assembly_section(g: Gathered) -> Section:
-    """The scene before and after assembly, what moved, and the result from three sides."""
+    """Return the scene before and after assembly, the displacements, and the result from three sides."""
     shown, moved = pictures.assembly_view(g)
     blocks: list[Block] = []
     if g.seen_poses is None:
@@ -282,72 +256,65 @@ def assembly_section(g: Gathered) -> Section:
     rows = [
         [
             Cell(g.names[o["id"]], swatch=drawing.css_color(g.colors[o["id"]])),
-            Cell(
-                f"{100 * o['assembly']['moved_m']:.1f} cm", "warn" if o["assembly"]["moved_m"] > 0.02 else ""
-            ),
-            Cell(f"{o['assembly']['turned_deg']:.1f}°", "warn" if o["assembly"]["turned_deg"] > 5 else ""),
+            Cell(f"{100 * done['moved_m']:.1f} cm", "warn" if done["moved_m"] > 0.02 else ""),
+            Cell(f"{done['turned_deg']:.1f}°", "warn" if done["turned_deg"] > 5 else ""),
             Cell("movable" if o["dynamic"] else "fixed"),
-            Cell(o["assembly"]["repair"] or "–"),
+            Cell(done["repair"] or "–"),
         ]
         for o in g.objects
-        if "assembly" in o
+        if (done := o.get("assembly"))
     ]
     if rows:
-        blocks.append(Table(["object", "moved", "turned", "kind", "what was done"], rows, numeric=[1, 2]))
-    true = g.truth is not None and g.truth.has_meshes
+        blocks.append(Table(["object", "moved", "turned", "kind", "repair"], rows, numeric=[1, 2]))
     blocks.append(Pictures(scene_pictures.scene_views(g), 3, phone_columns=3))
-    if true:
-        text = "Second row: how far the scene is from the true surface. Third: the other way around."
+    if g.truth is not None and g.truth.has_meshes:
+        text = (
+            "Second row: distance from the scene to the true surface. Third row: from the truth to the scene."
+        )
         blocks += [Text(text), _distance_legend()]
     return Section("assembly", "Assembly", blocks)
 
 
 def gaussians_section(g: Gathered) -> Section:
-    """Color, depth and normals of the Gaussians at the cameras of kept-out frames."""
-    section = Section("gaussians", "Gaussians", [])
+    """Return color, depth and normals of the Gaussians at held-out cameras."""
+    missing = ""
     if g.posed is None or g.gaussians is None:
-        section.blocks.append(left_out("The Gaussians", g.why_missing("poses", "world", "gaussians")))
-        return section
-    if not len(g.posed.held_out_indices):
-        section.blocks.append(left_out("The Gaussians", "no kept-out frame could be registered"))
-        return section
+        missing = g.why_missing("poses", "world", "gaussians")
+    elif not len(g.posed.held_out_indices):
+        missing = "no held-out frame could be registered"
+    if g.gaussians is None or missing:
+        return Section("gaussians", "Gaussians", [left_out("The Gaussians", missing)])
     heads = ["frame", "color", "depth", "normals"]
-    section.blocks.append(Pictures(pictures.gaussian_rows(g), len(heads), heads, phone_columns=2))
-    section.blocks.append(
-        Text(
-            f"{len(g.gaussians):,} disks, fitted to the keyframes and drawn at the cameras of frames that they were "
-            "never shown. Normals have world axes as colors."
-        )
+    text = (
+        f"{len(g.gaussians):,} disks, fitted to the keyframes and rendered at the cameras of held-out frames. Colors "
+        "of normals are world axes."
     )
-    return section
+    shown = Pictures(pictures.gaussian_rows(g), len(heads), heads, phone_columns=2)
+    return Section("gaussians", "Gaussians", [shown, Text(text)])
 
 
-def kept_out_section(g: Gathered) -> Section:
-    """Frames that nothing was fitted to, beside whatever can be rendered at their cameras."""
-    section = Section("kept-out", "Kept-out frames", [], short="Kept out")
+def held_out_section(g: Gathered) -> Section:
+    """Return held-out frames beside the renderings at their cameras."""
+    blocks: list[Block] = []
+    missing = ""
     if g.posed is None:
-        section.blocks.append(left_out("Kept-out frames", g.why_missing("poses", "world")))
-        return section
-    if not len(g.posed.held_out_indices):
-        section.blocks.append(left_out("Kept-out frames", "no kept-out frame could be registered"))
-        return section
+        missing = g.why_missing("poses", "world")
+    elif not len(g.posed.held_out_indices):
+        missing = "no held-out frame could be registered"
+    if missing:
+        return Section(
+            "kept-out", "Held-out frames", [left_out("Held-out frames", missing)], short="Held out"
+        )
     if "gaussians" in g.stages.missing:
-        section.blocks.append(left_out("Gaussians", g.why_missing("gaussians")))
+        blocks.append(left_out("Gaussians", g.why_missing("gaussians")))
     renderers = pictures.renderers(g)
-    items, scores = pictures.kept_out_frames(g, renderers)
+    items, scores = pictures.held_out_frames(g, renderers)
     heads = ["frame"] + [head for name in renderers for head in (name, f"error of the {name}")]
-    section.blocks.append(Pictures(items, len(heads), heads, phone_columns=3))
-    limit = f"{pictures.COLOR_ERROR:.0f} of 255"
-    section.blocks.append(
-        Legend(drawing.gradient(drawing.ERROR_MAP), "0", limit, "color error; gray: nothing there")
-    )
+    blocks.append(Pictures(items, len(heads), heads, phone_columns=3))
+    blocks.append(_error_legend(f"{pictures.COLOR_ERROR:.0f} of 255", "color error; gray: not covered"))
     for name, found in scores.items():
         if found:
             psnr, ssim, covered = np.mean(found, axis=0)
-            section.blocks.append(
-                Text(
-                    f"The {name} in the {len(found)} frames shown: PSNR {psnr:.1f} dB, SSIM {ssim:.2f}, "
-                    f"coverage {covered:.0%}."
-                )
-            )
-    return section
+            figures = f"PSNR {psnr:.1f} dB, SSIM {ssim:.2f}, coverage {covered:.0%}"
+            blocks.append(Text(f"The {name} in the {len(found)} frames shown: {figures}."))
+    return Section("kept-out", "Held-out frames", blocks, short="Held out")

@@ -1,36 +1,36 @@
-"""The truth beside what was reconstructed: true depth and ids of a frame, distances between the two surfaces."""
+"""Compare with ground truth: true depth and ids of a frame, distances to the true surface."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera
 from reconstruction.measure.alignment import Alignment, align
 from reconstruction.measure.ground_truth import GroundTruth
-from reconstruction.measure.scene import bundle_poses, joined
+from reconstruction.measure.scene import bundle_poses
 from reconstruction.measure.surfaces import Samples, sample
 from reconstruction.measure.visibility import seen_points
 from registry import SceneBundle
 from registry.geometry import transform_points
 
-_SAMPLES = 400_000
-_SEEN_FROM = 24  # true cameras that decide what could have been seen
-_FAR_M = 5.0
+_SAMPLES = 400_000  # of the true surface
+_SEEN_FROM = 24  # number of true cameras for visibility
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of a scene, with the similarity that takes the scene's world to the true one."""
+    """The ground truth of a scene, and the similarity from the scene's world to the true one."""
 
     known: GroundTruth
     alignment: Alignment
 
     @classmethod
     def of(cls, bundle: SceneBundle, ground_truth: GroundTruth) -> "Truth":
-        """Align a bundle with its truth.
+        """Align a bundle with its ground truth.
 
         Raises:
             UsageError: the truth is not of the same video.
@@ -39,17 +39,17 @@ class Truth:
 
     @property
     def has_meshes(self) -> bool:
-        """Tell whether the true surfaces are known, not just cameras and a sensor's depth."""
+        """Whether the truth has meshes, not just cameras and depth images."""
         return bool(self.known.entities)
 
-    @cached_property
+    @property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """All true surfaces as one mesh: vertices (v, 3), true world; faces (f, 3)."""
-        return joined([entity.mesh for entity in self.known.entities])
+        return self.known.mesh
 
     @cached_property
     def mesh_in_scene(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same in the scene's own world."""
+        """The same mesh in the scene's world."""
         vertices, faces = self.mesh
         return transform_points(np.linalg.inv(self.alignment.true_from_estimated), vertices), faces
 
@@ -58,7 +58,7 @@ class Truth:
     ) -> tuple[np.ndarray, np.ndarray | None] | None:
         """Return true depth (metres) and entity ids of a video frame, at the size of `camera`; None if unknown.
 
-        The truth's own images are used where there are some; otherwise its meshes are drawn at the aligned camera.
+        They come from the truth's images, or else from its meshes, rendered at the aligned `pose`.
         """
         depth, ids = self.known.depth(index), self.known.instances(index)
         if depth is not None and (ids is not None or not self.has_meshes):
@@ -67,15 +67,13 @@ class Truth:
             return depth, None if ids is None else cv2.resize(ids, size, interpolation=cv2.INTER_NEAREST)
         if not self.has_meshes:
             return None
-        vertices, faces = self.mesh
-        raster = rasterize_mesh(vertices, faces, camera, self.alignment.pose_to_true(pose))
-        owners = np.concatenate([np.full(len(e.mesh.faces), e.id) for e in self.known.entities])
-        ids = np.where(raster.face >= 0, owners[np.maximum(raster.face, 0)], 0)
+        raster = rasterize_mesh(*self.mesh, camera, self.alignment.pose_to_true(pose))
+        ids = np.where(raster.face >= 0, self.known.face_ids[np.maximum(raster.face, 0)], 0)
         return raster.depth, ids.astype(np.uint16)
 
     def seen(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points (n, 3) of the true surface, true world, the video shows within 5 m."""
-        poses = list(self.known.world_from_camera.values())
+        """Return which points (n, 3) of the true surface, true world, are visible in the video within 5 m."""
+        poses = self.known.poses
         return seen_points(points, *self.mesh, self.known.camera, poses[:: max(1, len(poses) // _SEEN_FROM)])
 
     @cached_property
@@ -83,23 +81,20 @@ class Truth:
         return NearSurface(sample(*self.mesh, _SAMPLES))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance (n,) in true metres of points (n, 3) of the scene's world to the true surface."""
+        """Return the distances (n,), in true metres, of points (n, 3) of the scene's world to the true surface."""
         return self._surface.distance(self.alignment.to_true(points))
 
 
 class NearSurface:
-    """Distances to a surface that is given by samples; the plane of the nearest sample bridges their spacing."""
+    """Distances to a sampled surface: point-to-plane at the nearest sample, to reduce the effect of their spacing."""
 
     def __init__(self, samples: Samples) -> None:
-        """Index the samples."""
-        from scipy.spatial import cKDTree
-
-        self._samples, self._tree = samples, cKDTree(samples.points)
+        self._samples, self._tree = samples, KDTree(samples.points)
         pairs, _ = self._tree.query(samples.points[:: max(1, len(samples.points) // 2000)], k=2)
         self._spacing_m = 3 * float(np.median(pairs[:, 1]))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance (n,) of points (n, 3) to the surface."""
+        """Return the distances (n,) of points (n, 3) to the surface."""
         distance, nearest = self._tree.query(points, workers=-1)
         offset = np.asarray(points) - self._samples.points[nearest]
         height = np.abs(np.einsum("nc,nc->n", offset, self._samples.normals[nearest]))

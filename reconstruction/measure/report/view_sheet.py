@@ -1,4 +1,4 @@
-"""The contact sheet of the stage `views`: for every thing its views, and below each the same without what hides it."""
+"""Draw contact sheets of the stage `views`: the views of each object, and below each the view without occluders."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,22 +12,22 @@ from reconstruction.measure.report.contact_page import save_picture
 from reconstruction.views import SceneViews, View
 
 _TILE_PX, _GAP_PX, _CAPTION_PX, _TITLE_PX = 220, 8, 20, 28
-_ROWS = 6  # things on a sheet
+_ROWS = 6  # objects per sheet
 _INK, _FAINT, _LINE = (28, 31, 36), (104, 110, 120), (255, 40, 160)
 
 
 def write_view_sheets(views: SceneViews, names: Mapping[int, str], folder: Path) -> list[Path]:
-    """Write `views_01.jpg` and so on, six things on each; return their paths. The same views give the same files.
+    """Write `views_01.jpg` and so on, with six objects each; return their paths. Deterministic.
 
     Args:
-        views: of the stage.
-        names: what each thing is called, by id.
-        folder: created where it is missing.
+        views: result of the stage.
+        names: name of each object by id.
+        folder: created if missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
     width = max((len(target.views) for target in views.targets), default=0)
     rows = [
-        _thing_row(f"{target.ids[0]} {names.get(target.ids[0], '')}", target.views, width)
+        _object_row(f"{target.ids[0]} {names.get(target.ids[0], '')}", target.views, width)
         for target in views.targets
     ]
     written = []
@@ -37,15 +37,15 @@ def write_view_sheets(views: SceneViews, names: Mapping[int, str], folder: Path)
     return written
 
 
-def _thing_row(title: str, views: tuple[View, ...], columns: int) -> np.ndarray:
-    """Return the views of one thing beside each other, uint8 (h, w, 3)."""
+def _object_row(title: str, views: tuple[View, ...], columns: int) -> np.ndarray:
+    """Draw the views of one object side by side: uint8 (h, w, 3)."""
     width = max(_GAP_PX + columns * (_TILE_PX + _GAP_PX), 460)
     height = _TITLE_PX + (2 * _TILE_PX + _CAPTION_PX + 2 * _GAP_PX if views else _CAPTION_PX)
     image = Image.new("RGB", (width, height), (255, 255, 255))
     draw = ImageDraw.Draw(image)
     draw.text((_GAP_PX, _TITLE_PX // 2), title, font=drawing.font(15), fill=_INK, anchor="lm")
     if not views:
-        words = "can be seen from nowhere in free space"
+        words = "not visible from any point in free space"
         draw.text((_GAP_PX, _TITLE_PX + 8), words, font=drawing.font(12, ""), fill=_FAINT, anchor="lm")
     for column, view in enumerate(views):
         left = _GAP_PX + column * (_TILE_PX + _GAP_PX)
@@ -60,7 +60,7 @@ def _thing_row(title: str, views: tuple[View, ...], columns: int) -> np.ndarray:
 
 
 def _outlined(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return a picture with a line around the mask, uint8 (_TILE_PX, _TILE_PX, 3)."""
+    """Resize an image to a tile uint8 (_TILE_PX, _TILE_PX, 3) and outline a mask."""
     scale = _TILE_PX / max(picture.shape[:2])
     size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)

@@ -1,8 +1,7 @@
-"""Poses that the user already has: COLMAP, nerfstudio, Record3D, Polycam.
+"""Import poses from COLMAP, nerfstudio, Record3D or Polycam and assign them to frames by image name.
 
-Images are told apart by file name. For a folder of images they are the names in that folder. For a video
-either the import has one image per video frame (then name order is frame order), or the last number in a name
-is the number of the video frame, from 0.
+For a folder of images, names are the file names of that folder. For a video, either the import has one image per video
+frame (name order is frame order), or the last number in a name is the video frame number, from 0.
 """
 
 import re
@@ -32,7 +31,11 @@ _MIN_COMMON_FRAMES = 8
 
 
 def read_poses(path: Path, frames: FrameSet) -> ImportedPoses:
-    """Read poses and assign them to frames."""
+    """Read poses and assign them to frames; intrinsics are rescaled to the frames.
+
+    Raises:
+        UsageError: the format is unknown, the images have another shape, or too few keyframes have a pose.
+    """
     found = _read(path)
     camera, named = found.camera, found.named
     numbers = _frame_numbers([name for name, _ in named], frames)
@@ -56,7 +59,7 @@ def read_poses(path: Path, frames: FrameSet) -> ImportedPoses:
 
 
 def _read(path: Path) -> NamedPoses:
-    """Tell the format and read it."""
+    """Detect the format and read it."""
     export = find_export(path)
     if export is not None:
         return read_record3d(export) if export.kind == "record3d" else read_polycam(export)
@@ -73,14 +76,14 @@ def _read(path: Path) -> NamedPoses:
 
 
 def _frame_numbers(names: list[str], frames: FrameSet) -> list[int]:
-    """Return the video frame number of each image name (sorted by name)."""
+    """Return the video frame number of each of the sorted image names; -1 where there is none."""
     source = Path(frames.source.file)
     export = find_export(source)
     if export is not None:
         order = {Path(name).name: number for number, name in enumerate(export.images)}
         return [order.get(Path(name).name, -1) for name in names]
     if source.is_dir():
-        # The same reading of the folder as in stage 1, so that order and left-out files agree.
+        # Listed as in stage 1, so that order and left-out files agree.
         order = {path.name: number for number, path in enumerate(ImageFolder(source).files)}
         return [order.get(Path(name).name, -1) for name in names]
     if len(names) == frames.source.frame_count:

@@ -1,4 +1,4 @@
-"""A COLMAP model folder."""
+"""Read poses from a COLMAP model folder."""
 
 from pathlib import Path
 
@@ -9,7 +9,11 @@ from registry.errors import UsageError
 
 
 def read_colmap(path: Path) -> NamedPoses:
-    """Read cameras and images; the points are triangulated anew."""
+    """Read camera and images, without the points.
+
+    Raises:
+        UsageError: the model cannot be read, or its images use more than one camera.
+    """
     import pycolmap
 
     try:
@@ -18,9 +22,7 @@ def read_colmap(path: Path) -> NamedPoses:
         raise UsageError(f"poses: the COLMAP model in {path} cannot be read: {error}") from error
     used = [model.image(i).camera_id for i in model.reg_image_ids()]
     if len(set(used)) != 1:
-        raise UsageError(
-            f"poses: {path} has {len(set(used))} cameras in use; one camera for all frames is needed"
-        )
+        raise UsageError(f"poses: {path} uses {len(set(used))} cameras; one camera for all frames is needed")
     named = []
     for image_id in sorted(model.reg_image_ids(), key=lambda i: model.image(i).name):
         camera_from_world = np.eye(4)

@@ -1,4 +1,4 @@
-"""Imported cameras as a COLMAP model, and whether they fit the pictures."""
+"""Build a COLMAP model from imported poses, and check that they fit the images."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from reconstruction.core.types import FrameSet
 from reconstruction.phone_exports.named_poses import ImportedPoses
+from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
 from reconstruction.poses.refine import drop_weak_frames, filter_points
@@ -14,8 +15,8 @@ from registry.errors import UsageError
 
 def model_from_poses(
     imported: ImportedPoses, frames: FrameSet, features: list[Features], database_path: Path
-) -> object:
-    """Return a pycolmap.Reconstruction with the imported cameras and no points, to triangulate into."""
+) -> Reconstruction:
+    """Return a model with the imported cameras and no points, to triangulate into."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -44,8 +45,8 @@ def model_from_poses(
     return model
 
 
-def check_consistency(model: object, config: PosesConfig) -> None:
-    """Filter the triangulated points; raise `UsageError` where the poses do not fit the pictures."""
+def check_consistency(model: Reconstruction, config: PosesConfig) -> None:
+    """Filter the triangulated points; raise `UsageError` where too few are left, as the poses do not fit the images."""
     filter_points(model, config.max_point_error_px, config.min_track_length)
     if model.num_points3D() < 100:
         raise UsageError(

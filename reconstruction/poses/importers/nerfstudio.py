@@ -1,4 +1,4 @@
-"""A nerfstudio `transforms.json`."""
+"""Read poses from a nerfstudio `transforms.json`."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,11 @@ from registry.errors import UsageError
 
 
 def read_transforms(path: Path) -> NamedPoses:
-    """Read the lens and one camera for each frame."""
+    """Read intrinsics and poses.
+
+    Raises:
+        UsageError: the file is malformed, focal lengths differ, or k3 or k4 is used.
+    """
     import pycolmap
 
     try:
@@ -19,13 +23,8 @@ def read_transforms(path: Path) -> NamedPoses:
         lens = {**(listed[0] if listed else {}), **data}
         width, height = int(lens["w"]), int(lens["h"])
         fx = float(lens["fl_x"]) if "fl_x" in lens else width / 2 / np.tan(float(lens["camera_angle_x"]) / 2)
-        params = [
-            fx,
-            float(lens.get("fl_y", fx)),
-            float(lens.get("cx", width / 2)),
-            float(lens.get("cy", height / 2)),
-            *(float(lens.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2")),
-        ]
+        defaults = {"fl_y": fx, "cx": width / 2, "cy": height / 2, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+        params = [fx, *(float(lens.get(key, default)) for key, default in defaults.items())]
         named = []
         for frame in sorted(listed, key=lambda f: f["file_path"]):
             if abs(float(frame.get("fl_x", fx)) - fx) > 0.01 * fx:
@@ -35,9 +34,8 @@ def read_transforms(path: Path) -> NamedPoses:
     except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
         if isinstance(error, UsageError):
             raise
-        raise UsageError(
-            f"poses: {path} is not a usable transforms.json: {type(error).__name__} {error}"
-        ) from error
+        why = f"{type(error).__name__} {error}"
+        raise UsageError(f"poses: {path} is not a usable transforms.json: {why}") from error
     if any(abs(float(lens.get(k, 0.0))) > 1e-9 for k in ("k3", "k4")):
         raise UsageError(f"poses: {path} has k3 or k4 distortion; only k1, k2, p1 and p2 are supported")
     camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", params[0], width, height)

@@ -1,22 +1,22 @@
-"""The part of `simrecon doctor` about learned models: all of them are optional, and none is loaded to look."""
+"""Checks of learned models, all optional: packages, weights and services are looked for, no model is loaded."""
 
 import importlib.metadata
 import os
 from pathlib import Path
 
 from reconstruction.depth.config import DepthConfig
-from reconstruction.doctor import Check
+from reconstruction.doctor.check import Check
 from reconstruction.instances.masks.load import DEFAULT_MODELS
 from reconstruction.instances.naming.load import DEFAULT_CLIP_MODEL
 from reconstruction.learned.models import EXTRA
 from reconstruction.world.config import WorldConfig
 
 _WEIGHTS = ("*.safetensors", "*.bin")
-_PATIENCE_S = 3.0
+_PATIENCE_S = 3.0  # for the answer of a service
 
 
 def learned_checks() -> list[Check]:
-    """Look for transformers, the weights of each backend's own choice, the endpoint of a VLM, and generators."""
+    """Check transformers, weights of default models, the endpoint of a vision-language model, and generators."""
     return [*_models(), _endpoint(), *generator_checks()]
 
 
@@ -41,13 +41,13 @@ def _models() -> list[Check]:
 
 
 def hub_cache() -> Path:
-    """Return where the Hugging Face hub keeps what it downloaded."""
+    """Return the cache folder of the Hugging Face hub."""
     home = Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface")
     return Path(os.environ.get("HF_HUB_CACHE") or home / "hub").expanduser()
 
 
 def has_weights(model: str) -> bool:
-    """Tell whether the weights of a model, named as on the hub, lie in its cache."""
+    """Return whether the weights of a model, named as on the hub, are in its cache."""
     snapshots = hub_cache() / f"models--{model.replace('/', '--')}" / "snapshots"
     return any(True for pattern in _WEIGHTS for _ in snapshots.glob(f"*/{pattern}"))
 
@@ -81,7 +81,7 @@ def _served_models(url: str) -> list[str]:
 
 
 def generator_checks() -> list[Check]:
-    """Look which backends could generate objects; nothing is generated, and no picture is sent."""
+    """Check each generator, without generating an object or sending a picture."""
     return [_rodin(), _hunyuan(), *_local_generators()]
 
 
@@ -108,7 +108,7 @@ def _hunyuan() -> Check:
     name, url = "assets.generator=hunyuan3d", os.environ.get(HUNYUAN_VARIABLE) or HUNYUAN_URL
     fix = f"start its api_server.py, or set {HUNYUAN_VARIABLE} (docs/generation.md)"
     try:
-        # Its servers know this page since 2.1; before that, "not found" is an answer, too.
+        # The page exists since 2.1; "not found" is an answer, too.
         requests.get(f"{url.rstrip('/')}/health", timeout=_PATIENCE_S)
     except requests.RequestException as error:
         return Check(name, False, f"nobody answers at {url} ({type(error).__name__})", fix, False)
