@@ -7,7 +7,7 @@ Transforms are named `b_from_a`: `x_b = b_from_a @ x_a`. Quaternions are wxyz. S
 import numpy as np
 
 # From glTF axes (+Y up, +Z towards the viewer) to object or world axes (+Z up).
-WORLD_FROM_GLTF = np.array([[1.0, 0.0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 GLTF_FROM_WORLD = WORLD_FROM_GLTF.T
 # SAPIEN camera: +x forward, +y left, +z up. OpenCV camera: +x right, +y down, +z forward.
 SAPIEN_CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])

@@ -61,13 +61,14 @@ def physics_report(
         timestep_s: Time step of the simulation.
 
     Returns:
-        JSON. Rates are shares of the movable objects, and 1.0 if there is none (see `dynamic_objects`).
+        JSON. Rates are shares of the movable objects; with no such object, the criteria count as met.
     """
     specs = list(specs)
     names = {spec.id: spec.name for spec in specs}
     near = spawn_contacts(specs, _PROBE_M)
     deepest = min(near, key=lambda c: c.separation_m, default=None)
     penetration = 0.0 if deepest is None else max(0.0, -deepest.separation_m * 1e3)
+    between = [names[deepest.first], names[deepest.second]] if deepest and penetration else []
     physics = build_physics(specs, timestep_s)
     moving = [spec for spec in specs if spec.dynamic and not spec.base]
     steps, early_steps = round(duration_s / timestep_s), round(_FLOAT_WINDOW_S / timestep_s)
@@ -82,26 +83,20 @@ def physics_report(
         energy = physics.energy_of_motion(spec.id, before[spec.id], max(last_steps, 1) * timestep_s)
         objects.append(_object_entry(spec, physics, early[spec.id], _depth_mm(near, spec.id), energy))
     fixed = [spec for spec in specs if not spec.dynamic and not spec.base]
-
-    def rate(key: str, empty: float) -> float:
-        return float(np.mean([o[key] for o in objects])) if objects else empty
-
     return {
         "duration_s": duration_s,
         "timestep_s": timestep_s,
         "dynamic_objects": len(objects),
         "fixed_objects": len(fixed),
         "without_collision": [spec.name for spec in fixed if not spec.parts],
-        "stable_rate": rate("stable", 1.0),
-        "stable_rate_10cm_0.1rad": rate("stable_10cm_0.1rad", 1.0),
-        "stable_rate_5cm_drop_5deg": rate("stable_5cm_drop_5deg", 1.0),
-        "floating_rate": rate("floating", 0.0),
+        "stable_rate": _rate(objects, "stable", 1.0),
+        "stable_rate_10cm_0.1rad": _rate(objects, "stable_10cm_0.1rad", 1.0),
+        "stable_rate_5cm_drop_5deg": _rate(objects, "stable_5cm_drop_5deg", 1.0),
+        "floating_rate": _rate(objects, "floating", 0.0),
         "spawn_penetration_mm": round(penetration, 4),
-        "spawn_penetration_between": [names[deepest.first], names[deepest.second]]
-        if deepest and penetration
-        else [],
+        "spawn_penetration_between": between,
         "energy_at_rest_j": float(f"{sum(entry['energy_j'] for entry in objects):.3g}"),
-        "at_rest_rate": rate("at_rest", 1.0),
+        "at_rest_rate": _rate(objects, "at_rest", 1.0),
         "contacts": contact_graph(specs, edges, push, near),
         "objects": objects,
         "fixed": [{"id": s.id, "name": s.name, "spawn_penetration_mm": _depth_mm(near, s.id)} for s in fixed],
@@ -208,6 +203,10 @@ def _object_entry(
         "energy_j": float(f"{energy:.3g}"),
         "at_rest": bool(energy <= REST_J_PER_KG * spec.mass_kg),
     }
+
+
+def _rate(objects: list[dict[str, Any]], key: str, empty: float) -> float:
+    return float(np.mean([o[key] for o in objects])) if objects else empty
 
 
 def _pushes(physics: Physics, steps: int) -> dict[tuple[int, int], float]:

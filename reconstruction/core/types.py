@@ -352,12 +352,12 @@ class TexturedMesh:
     vertices: np.ndarray  # float32 (v, 3) metres, +z up, in the space that its owner names
     faces: np.ndarray  # int32 (f, 3) rows of `vertices`
     uvs: np.ndarray  # float32 (v, 2) in [0, 1], origin at the lower left
-    texture: np.ndarray  # uint8 (t, t, 3) sRGB, row 0 at v = 1
+    texture: np.ndarray  # uint8 (h, w, 3) sRGB, row 0 at v = 1
 
     def __post_init__(self) -> None:
         """Check dtypes and shapes."""
         check_arrays(
-            self, vertices="float32 v 3", faces="int32 f 3", uvs="float32 v 2", texture="uint8 t t 3"
+            self, vertices="float32 v 3", faces="int32 f 3", uvs="float32 v 2", texture="uint8 h w 3"
         )
 
 

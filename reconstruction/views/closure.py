@@ -22,10 +22,8 @@ _OUTLIERS = (0.5, 99.5)  # percentiles outside of which points are dropped
 _SMOOTH = 1.2  # standard deviation of the smoothing for normals, in cells
 _LEAST_SIDE = 0.05  # smallest area of a cell side, relative to that of a side parallel to the surface
 _OWN_CELLS = 2  # surface cells this near to the target are its own if nothing else has Gaussians there
-_NEAR_M, _NEAR_SHARE = (
-    0.12,
-    0.4,
-)  # margin of the fine grid around the target; its cell relative to the scene's grid
+_NEAR_M = 0.12  # margin of the fine grid around the target's box
+_NEAR_SHARE = 0.4  # cell of the fine grid relative to that of the scene's grid
 _MOST_RINGS = 6  # of sample points on a disk
 _STANDS_M = 0.01  # surface lower than this above the target's bottom supports it and does not occlude
 

@@ -9,10 +9,8 @@ from reconstruction.views.cameras import look_at, square_camera
 from reconstruction.views.config import AvoConfig
 from reconstruction.views.scene import Target, ViewScene
 
-_ZOOM, _WIDEST = (
-    1.1,
-    0.8,
-)  # radius in view relative to the target's sphere; largest sine of half the field of view
+_ZOOM = 1.1  # radius of the view at the target relative to its bounding sphere
+_WIDEST = 0.8  # largest sine of half the field of view
 _AZIMUTHS, _PITCHES_DEG = 12, (6.0, 25.0, 45.0, 65.0)  # directions from the target to the camera
 _LOW_PITCHES_DEG = (-4.0, -10.0)
 _SHARES = (1.0, 1.2, 0.8, 0.62, 0.48)  # of the target distance, tried in this order until a position is free

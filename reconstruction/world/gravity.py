@@ -20,7 +20,7 @@ _SEARCH_DEG = 60.0  # largest angle between candidates and the camera prior
 _MAX_ROLL_COST = 1.8  # in log votes: six times the surface outweighs any roll
 _VOTE_WIDTH_DEG = 5.0  # standard deviation of a normal's vote
 _WALL_SHARE = (
-    0.35  # weight of vertical surface: it leaves one rotation free, and furniture has many upright faces
+    0.35  # weight of vertical surface: one rotation stays free, and furniture has many upright faces
 )
 _PLANE_SIGMA_DEG = 0.6  # standard deviation of floors, tables and walls from level or plumb
 _SYSTEMATIC_DEG = 0.15  # lower bound of the reported standard deviation

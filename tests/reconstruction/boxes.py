@@ -33,7 +33,7 @@ def ball_part(radius: float) -> ConvexPart:
 def mesh_of(parts) -> TexturedMesh:
     starts = np.cumsum([0] + [len(p.vertices) for p in parts])
     vertices = np.concatenate([p.vertices for p in parts])
-    faces = np.concatenate([p.faces + s for p, s in zip(parts, starts)])
+    faces = np.concatenate([p.faces + s for p, s in zip(parts, starts)]).astype(np.int32)
     return TexturedMesh(vertices, faces, np.zeros((len(vertices), 2), np.float32), TEXTURE)
 
 

@@ -335,7 +335,7 @@ def test_a_bowl_stands_in_the_plate_whose_collision_shape_has_no_hollow():
 
 
 def test_overrides_say_what_can_move_but_not_of_what_hangs():
-    items = [Instance(i, "box", 0.9, np.zeros(3), np.full(3, 0.2), 0.0, 1, i == 11) for i in (10, 11)]
+    items = [Instance(i, "box", 0.9, np.zeros(3), 0.0, np.full(3, 0.2), 1, i == 11) for i in (10, 11)]
     pointer = Pointer(
         InstanceSet(np.zeros(0, np.int32), (), tuple(items), np.zeros((0, 0, 0), np.uint16)), None
     )

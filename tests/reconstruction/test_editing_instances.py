@@ -7,6 +7,7 @@ from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.editing.anchors import Footage
 from reconstruction.editing.instances import apply_overrides
+from reconstruction.editing.overrides import Overrides
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
@@ -251,3 +252,10 @@ def test_a_click_may_count_in_another_size(scene):
     twice = {"frame": click["frame"], "x": 2 * click["x"], "y": 2 * click["y"], "size": [640, 480]}
     out = apply_overrides(found, surface, [{"pixel": twice, "relabel": "red"}], footage)
     assert labels_of(out, surface, RED_TOP) == "red"
+
+
+@pytest.mark.parametrize("change", ["mesh: 3", "material: [wood]", "mass_kg: true", "mass_kg: null"])
+def test_values_of_the_wrong_type_are_refused_when_the_file_is_read(tmp_path, change):
+    (tmp_path / "fixes.yaml").write_text(f"- {{id: 3, {change}}}")
+    with pytest.raises(UsageError, match=r"entry 1: (mesh|material|mass_kg) must be"):
+        Overrides.load(tmp_path / "fixes.yaml")

@@ -89,7 +89,7 @@ def test_the_options_of_the_stage_are_those_of_avo(tmp_path):
     run = run_with(tmp_path, "avo.strategy=canonical", "avo.views=2")
     (stage,) = (s for s in STAGES if s.name == "views")
     assert run.options_of(stage) == AvoConfig(strategy="canonical", views=2)
-    with pytest.raises(UsageError, match="is not one of"):
+    with pytest.raises(UsageError, match="there is no such backend"):
         run_with(tmp_path, "avo.strategy=blind")
 
 
@@ -130,10 +130,11 @@ def test_what_things_hide_from_all_frames_is_of_the_target_and_open_holes_are_no
 def frames(found: InstanceSet) -> PosedFrames:
     """One black keyframe."""
     image = np.zeros((1, 24, 32, 3), np.uint8)
-    nothing = np.zeros(0)
+    poses, points = np.eye(4)[None], np.zeros((0, 3))
     return PosedFrames(
-        None, room.CAMERA, image, np.zeros(1, np.int32), nothing, np.eye(4)[None], nothing, image[:0], nothing, nothing,
-        nothing, nothing, nothing, nothing, nothing, 1, True, 0.0,
+        None, room.CAMERA, image, np.zeros(1, np.int32), np.zeros(1), poses, np.zeros(1, np.float32), image[:0],
+        np.zeros(0, np.int32), np.zeros(0), poses[:0], points, points.astype(np.uint8), np.zeros(0, np.float32),
+        np.zeros((0, 2), np.int32), 1, True, 0.0,
     )  # fmt: skip
 
 

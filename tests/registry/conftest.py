@@ -1,4 +1,4 @@
-"""A small bundle of our own making: a floor, a table and a cup on it."""
+"""Fixtures for a small handmade bundle: a floor, a table and a cup on it."""
 
 import copy
 import json
@@ -12,7 +12,7 @@ from registry import seal_bundle
 
 
 def _glb_bytes(document: dict | None = None) -> bytes:
-    """Return a binary glTF file that holds only a JSON chunk."""
+    """Return a binary glTF file with only a JSON chunk."""
     text = json.dumps(document or {"asset": {"version": "2.0"}}).encode()
     text += b" " * (-len(text) % 4)
     return struct.pack("<5I", 0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A) + text
@@ -104,19 +104,19 @@ SCENE = {
 
 @pytest.fixture
 def scene() -> dict:
-    """A valid scene.json, free to change."""
+    """Return a new, valid scene.json."""
     return copy.deepcopy(SCENE)
 
 
 @pytest.fixture
 def glb_bytes():
-    """Return a function that makes a binary glTF file of a JSON document."""
+    """Return a function that creates a binary glTF file from a JSON document."""
     return _glb_bytes
 
 
 @pytest.fixture
 def write_files():
-    """Return a function that writes the mesh files which `scene` names."""
+    """Return a function that writes the mesh files named in `scene`."""
     return _write_files
 
 

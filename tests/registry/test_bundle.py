@@ -1,4 +1,4 @@
-"""A bundle round-trips, its revision is its content, and a damaged or hostile one is refused."""
+"""Bundles: round trip, content addresses, rejection of damaged or malicious ones."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The index migrates, nests transactions, refuses a newer schema and says when it is damaged."""
+"""Index: migrations, nested transactions, rejection of a newer schema and of a damaged file."""
 
 import sqlite3
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Messages name what was probably meant."""
+"""Error messages suggest the closest known name."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from registry.errors import did_you_mean
     [
         ("kitchn", 0.6, " Did you mean 'kitchen'?"),
         ("kt", 0.6, ""),
-        ("kt", 0.4, " Did you mean 'kitchen'?"),  # 2 of 2 and of 7 letters: alike by 4 / 9
+        ("kt", 0.4, " Did you mean 'kitchen'?"),  # 2 of 2 and of 7 letters: similarity 4 / 9
         ("garage", 0.6, ""),
         ("", 0.6, ""),
     ],

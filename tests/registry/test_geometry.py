@@ -1,4 +1,4 @@
-"""Transforms form groups, conversions round-trip, and Umeyama finds a known similarity."""
+"""Transforms: group axioms, round trips of conversions, Umeyama on a known similarity."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Every kind of mistake in a scene.json is refused with its place in the message."""
+"""Every kind of mistake in a scene.json raises an error that names its place."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from registry.schema import referenced_files
 
 
 def put(scene: dict, place: str, value: object) -> None:
-    """Set `objects[0].mass_kg` and the like."""
+    """Set the value at a JSON place such as `objects[0].mass_kg`."""
     target = scene
     keys = [int(k) if k.isdigit() else k for k in place.replace("[", ".").replace("]", "").split(".")]
     for key in keys[:-1]:

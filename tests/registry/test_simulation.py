@@ -1,4 +1,4 @@
-"""The physics report card against cases whose outcome mechanics dictates."""
+"""Physics report card on cases with analytically known results."""
 
 import json
 from dataclasses import replace
@@ -10,12 +10,7 @@ import pytest
 from registry.errors import BundleError, SimReconError
 from registry.geometry import rigid
 from registry.report_card import failures, physics_report, spawn_contacts
-from registry.simulation import (
-    BodySpec,
-    build_physics,
-    pose_change,
-    specs_from_bundle,
-)
+from registry.simulation import BodySpec, build_physics, pose_change, specs_from_bundle
 
 
 def corners(x: float, y: float, z: float) -> np.ndarray:
@@ -51,7 +46,7 @@ def test_object_in_the_air_floats_and_lands():
     assert report["floating_rate"] == 0.5
     assert floating["drop_m"] == pytest.approx(0.06, abs=1e-3)
     assert not floating["stable"]
-    assert floating["stable_10cm_0.1rad"]  # the looser threshold lets 6 cm pass
+    assert floating["stable_10cm_0.1rad"]  # the looser threshold accepts 6 cm
     assert not floating["stable_5cm_drop_5deg"]
 
 
@@ -188,7 +183,7 @@ def test_a_bridge_has_one_parent_and_a_lesser_carrier():
     assert report["stable_rate"] == 1.0
     assert report["contacts"]["support_edges_real"] == 3
     assert report["contacts"]["supports_without_edge"] == []
-    assert report["contacts"]["lesser_supports"] == 1  # it rests on the other pier, too
+    assert report["contacts"]["lesser_supports"] == 1  # it also rests on the other pier
 
 
 def test_what_cannot_move_must_be_near_its_parent():

@@ -1,4 +1,4 @@
-"""A scene is in the registry whole or not at all, whoever publishes, dies or reads at the same time."""
+"""Publishing is atomic with concurrent writers, readers and killed processes."""
 
 import errno
 import gc
@@ -151,7 +151,7 @@ def test_bad_ids_are_refused_before_anything_is_touched(reg, make_staging):
     assert not reg.root.exists()
 
 
-# ---- Disks that refuse.
+# ---- Disk errors.
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
@@ -312,7 +312,7 @@ def test_a_kill_shows_nothing_and_the_next_publish_cleans_up(reg, make_staging, 
         victim.start()
         victim.join(60)
         assert victim.exitcode == -signal.SIGKILL
-    assert len(tree(reg.root / "scenes")) > 20  # it really left something
+    assert len(tree(reg.root / "scenes")) > 20  # it left temporary files
     assert reg.list() == [old]
     assert reg.verify("scene0001").ok
     reg.publish(make_staging(), "scene0003")

@@ -1,4 +1,4 @@
-"""Every task, robot and observation mode: the checkers of Gymnasium and stable-baselines3, and ManiSkill's ways."""
+"""Every task, robot and observation mode: the checkers of Gymnasium and stable-baselines3, and ManiSkill's rules."""
 
 import os
 from pathlib import Path
@@ -29,8 +29,8 @@ MATRIX = [
     for task in (*tasks, *(("navigate",) if robot == "fetch" else ()))
     for mode in (*STATE_MODES, *PICTURE_MODES)
 ]
-# Pictures do not depend on the task: one task for each scene, robot and picture mode is drawn in all test runs, the
-# whole matrix (an hour without a GPU) where somebody asks for it.
+# Images do not depend on the task: by default, test one task per scene, robot and image mode. The whole matrix takes an
+# hour without a GPU.
 WHOLE = os.environ.get("SIMRECON_TEST_WHOLE_MATRIX") == "1"
 DRAWN = {
     (scene, tasks[(number + step) % len(tasks)], robot, mode)

@@ -1,4 +1,4 @@
-"""What is read and driven straight through SAPIEN, in NumPy, is what ManiSkill's structs and controllers give."""
+"""`cpu_env` and `inverse_kinematics` give the numbers of ManiSkill's structs and controllers."""
 
 import functools
 from pathlib import Path
@@ -66,14 +66,14 @@ def _same_by_both(root: Path, monkeypatch: pytest.MonkeyPatch, task: str, robot:
             seen.setdefault(key, set()).add(float(value[0]))
         if done:
             break
-    assert max(len(values) for values in seen.values()) > 5  # something did move
+    assert max(len(values) for values in seen.values()) > 5  # objects moved
     env.close()
     other.close()
 
 
 def _compare(ours: torch.Tensor, theirs: torch.Tensor) -> None:
     assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
-    # Heights of what is lifted are differences of nearly equal numbers.
+    # Lift heights are differences of nearly equal numbers.
     torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=2e-5)
 
 
@@ -82,7 +82,7 @@ def test_what_moved_is_read_and_computed_anew(scenes_root: Path) -> None:
         "things", registry=scenes_root, task="put_cube_in_crate", max_episode_steps=10_000
     )
     scene, shift = env.unwrapped, np.array([0.02, 0.03, 0.0])
-    for seed in range(2):  # the second reset has moved everything to another PhysX scene
+    for seed in range(2):  # the second reset moves all bodies to a new PhysX scene
         env.reset(seed=seed)
         for _ in range(30):
             env.step(np.zeros(env.action_space.shape, np.float32))
@@ -97,7 +97,7 @@ def test_what_moved_is_read_and_computed_anew(scenes_root: Path) -> None:
         np.testing.assert_allclose(scene.measures.position(scene.target_id) - here, shift[None], atol=1e-6)
         assert float(after["target_to_goal_m"]) != float(before["target_to_goal_m"])
     extra = sapien.Entity()
-    scene.scene.sub_scenes[0].add_entity(extra)  # not where it was among the entities that are packed
+    scene.scene.sub_scenes[0].add_entity(extra)  # changes the order of the packed entities
     scene.evaluate()
     _read_as_sapien_has_them(scene)
     env.close()
@@ -126,7 +126,7 @@ def test_contacts_are_asked_for_only_where_they_decide(
     env.reset(seed=0)
     stage = scene.task_object.stages[0]
     row = scene.measures._row[stage.subject]
-    for _ in range(3):  # what was moved away is awake, and carried wherever it is
+    for _ in range(3):  # moved objects are awake and supported
         env.step(still)
     assert row not in asked
     body = scene.builder.objects[stage.subject].actor._bodies[0]
@@ -172,7 +172,7 @@ def test_what_sleeps_far_from_the_hand_is_judged_once(
     assert count >= 1
     assert float(info["target_to_goal_m"]) > 0.8
     tip = scene.agent.tcp._objs[0].entity_pose.p
-    subject.entity.pose = sapien.Pose(tip)  # where the hand may hold it
+    subject.entity.pose = sapien.Pose(tip)  # within reach of the hand
     subject.put_to_sleep()
     monkeypatch.setattr(scene, "_sim_steps_per_control", 0)
     assert judgements()[0] == 3
@@ -212,14 +212,14 @@ def test_joints_get_the_targets_of_the_controllers(
         agent.controller.set_state(state)
         drive.set_action(torch.from_numpy(action)[None], action, action.tolist())
         if "_ee_" in mode:
-            # The hand goes to the same place, as far as ManiSkill solves for it; the elbow nearly does.
+            # Equal hand poses within ManiSkill's tolerance; nearly equal elbow.
             ours = _targets(joints)
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-2)
             kinematics = agent.controller.controllers["arm"].kinematics
             hands = [_hand(kinematics, targets[:, 0]) for targets in (ours, theirs)]
             np.testing.assert_allclose(*hands, rtol=0, atol=2e-4)
         else:
-            # Doubles are rounded once, ManiSkill's floats after every operation.
+            # Doubles are rounded once, ManiSkill's floats in every operation.
             np.testing.assert_allclose(_targets(joints), theirs, rtol=5e-7, atol=1e-7)
         env.step(action)
     env.close()
@@ -240,7 +240,7 @@ def test_the_hand_gets_where_it_can_in_few_steps(scenes_root: Path) -> None:
         agent.controller.set_state(state)
         drive.set_action(torch.from_numpy(action)[None], action, action.tolist())
         ours, here = arm._target_qpos.numpy(), arm._start_qpos.numpy()
-        # Where the hand cannot get, both leave the arm where it is.
+        # Out of reach, both hold the arm.
         assert np.array_equal(theirs, here) == np.array_equal(ours, here)
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=0.05)
         moved.append(not np.array_equal(ours, here))
@@ -282,7 +282,7 @@ def test_arms_are_those_of_the_robots_model(scenes_root: Path, robot: str) -> No
             inverse_kinematics.product(base_from[-1], home, after)
             np.testing.assert_allclose(matrix[:, joint], 1e5 * _screw(tips, after), rtol=0, atol=1e-4)
 
-        # The same steps as the solver's that ManiSkill uses.
+        # Steps equal those of ManiSkill's solver.
         action = generator.uniform(-1, 1, 6).astype(np.float32)
         turn = 0.2 * action[3:] / max(np.linalg.norm(action[3:]), 1)
         goal = sapien.Pose(0.1 * action[:3]) * pose
@@ -314,7 +314,7 @@ def test_the_way_to_a_goal_leads_there() -> None:
         here = np.column_stack(
             [Rotation.from_rotvec(generator.normal(size=3)).as_matrix(), generator.normal(size=3)]
         )
-        # What the screw motion, in the base's axes at the place, makes of the place.
+        # Apply the twist, in base axes at the pose.
         local = np.zeros((4, 4))
         local[:3, :3], local[:3, 3] = np.cross(np.eye(3), screw[3:]), screw[:3]
         motion = scipy.linalg.expm(local)
@@ -323,22 +323,22 @@ def test_the_way_to_a_goal_leads_there() -> None:
         np.testing.assert_allclose(way, screw, rtol=0, atol=1e-8)
         assert size == pytest.approx(np.linalg.norm(screw), abs=1e-8)
     half = np.column_stack([np.diag([1.0, -1.0, -1.0]), np.zeros(3)])
-    assert inverse_kinematics.away(np.eye(4)[:3], half, way) == np.inf  # not taken for being there
+    assert inverse_kinematics.away(np.eye(4)[:3], half, way) == np.inf  # not taken for converged
 
 
 def _euler(turn: np.ndarray) -> np.ndarray:
-    """Return the quaternion wxyz of the turn about z, after that y, after that x, of the base (3,) (rad)."""
+    """Return the quaternion wxyz of rotations about base z, then y, then x (3,) (rad)."""
     return np.roll(Rotation.from_euler("XYZ", turn).as_quat(), 1)
 
 
 def _screw(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the small motion (6,) between two places (3, 4), in the base's axes."""
+    """Return the small twist (6,) between two poses (3, 4), in base axes."""
     turned = Rotation.from_matrix(after[:, :3] @ before[:, :3].T).as_rotvec()
     return np.concatenate([after[:, 3] - before[:, 3], turned])
 
 
 def _hand(kinematics: object, qpos: np.ndarray) -> np.ndarray:
-    """Return the hand's pose (4, 4) where the joints are at `qpos` (d,)."""
+    """Return the hand's pose (4, 4) at joint positions `qpos` (d,)."""
     model = kinematics.pmodel
     model.compute_forward_kinematics(qpos[kinematics.pmodel_active_joint_indices.numpy()])
     return model.get_link_pose(kinematics.end_link_idx).to_transformation_matrix()

@@ -1,4 +1,4 @@
-"""Where a gripper can take hold of a thing: across it, at its neck, by its wall, and not where there is no room."""
+"""Grasps across an object, at its neck and at its wall; none without clearance."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_an_open_box_is_gripped_by_a_wall_with_a_finger_on_each_side() -> None:
     for grasp in grasps:
         assert np.abs(grasp.offset[:2]).max() == pytest.approx(side, abs=0.012)
         assert grasp.width_m < 0.03
-    assert _grasps(parts, mass_kg=3.0) == []  # it would turn out of the hand
+    assert _grasps(parts, mass_kg=3.0) == []  # the torque is too large
     assert _grasps([_box(1, (wide, wide, high), (0, 0, 0))]) == []  # a solid one has no wall
 
 
@@ -67,9 +67,7 @@ def test_fingers_and_palm_need_room() -> None:
         _box(2, (0.05, 0.05, 0.05), (x, y, 0)) for x, y in ((0.06, 0), (-0.06, 0), (0, 0.06), (0, -0.06))
     ]
     assert _grasps([box, *close]) == []
-    tall = _box(
-        2, (0.05, 0.4, 0.30), (0.065, 0, 0)
-    )  # room for a finger, along y only; none for the palm across it
+    tall = _box(2, (0.05, 0.4, 0.30), (0.065, 0, 0))  # clearance for a finger along y only; none for the palm
     for grasp in _grasps([box, tall]):
         assert abs(np.cos(grasp.yaw_rad)) < 0.5
     assert _grasps([box, _box(2, (0.3, 0.3, 0.02), (0, 0, 0.10))]) == []  # under a shelf board

@@ -1,4 +1,4 @@
-"""Options of environments: randomization, cameras, several at once, many scenes, hostile actions."""
+"""Options of environments: randomization, cameras, vectorization, many scenes, invalid actions."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def _make(root: Path, scene: str = "things", **kwargs: object) -> gym.Env:
 
 
 def _outline(env: gym.Env, key: int) -> np.ndarray:
-    """Return where an object's outline (h, 2) is now."""
+    """Return the current outline (h, 2) of an object."""
     scene = env.unwrapped
     item = next(o for o in scene.bundle.objects if o.id == key)
     stacks = [stack for group in scene._randomizer._groups for stack in group.stacks]
@@ -49,12 +49,12 @@ def test_poses_stay_on_their_support_and_apart(scenes_root: Path) -> None:
         heights = [float(env.unwrapped.measures.position(key)[0, 2]) for key in env.unwrapped.movable_ids]
         expected = [env.unwrapped.facts.targets[key].center[2] for key in env.unwrapped.movable_ids]
         np.testing.assert_allclose(heights, expected, atol=1e-3)
-    assert np.std(seen, axis=0).min() > 0.01  # every thing did move
+    assert np.std(seen, axis=0).min() > 0.01  # every object moved
     env.close()
 
 
 def _add_bumpy_table(writer: BundleWriter) -> None:
-    """Add a table that is 4 mm higher at one side, where x > 0.1 m."""
+    """Add a table that is 4 mm higher where x > 0.1 m."""
     table = np.eye(4)
     table[:2, 3] = 0, 0.9
     parts = [box((1.2, 0.8, 0.4)), box((0.5, 0.8, 0.404), at=(0.35, 0.0))]
@@ -98,7 +98,7 @@ def test_what_leans_over_another_moves_with_it_and_nothing_is_thrown(tmp_path: P
             env.step(np.zeros(env.action_space.shape, np.float32))
         scene.measures.refresh()
         assert np.linalg.norm(scene.measures.poses[0, :, :3] - start, axis=1).max() < 0.006
-    np.testing.assert_allclose(gaps, gaps[0], atol=2e-4)  # they come to rest after they were moved
+    np.testing.assert_allclose(gaps, gaps[0], atol=2e-4)  # after the settle check
     assert min(heights) == pytest.approx(0.4, abs=1e-4)
     assert max(heights) == pytest.approx(0.404, abs=1e-3)  # where the table is higher
     assert np.std(moved, axis=0).min() > 0.01
@@ -106,7 +106,7 @@ def test_what_leans_over_another_moves_with_it_and_nothing_is_thrown(tmp_path: P
 
 
 def _posts_on_bumpy_table(folder: Path) -> Path:
-    """Publish a scene "posts": two posts, so slim that they fall from the edge of what is 4 mm higher."""
+    """Publish a scene "posts": two posts that tip over on a step of 4 mm."""
     writer = BundleWriter(folder / "made")
     add_room(writer)
     _add_bumpy_table(writer)
@@ -160,7 +160,7 @@ def test_what_stands_in_the_place_of_what_fell_goes_back_too(tmp_path: Path) -> 
     env.close()
 
 
-def test_a_rehearsed_start_is_the_same_whatever_was_before(scenes_root: Path) -> None:
+def test_a_settled_start_does_not_depend_on_earlier_episodes(scenes_root: Path) -> None:
     env = _make(scenes_root, randomize="start")
     runs = []
     for seeds in ((5,), (1, 2, 5), (5,)):
@@ -220,7 +220,7 @@ def test_mass_and_friction_stay_within_the_ranges_of_the_bundle(scenes_root: Pat
         assert max(values) - min(values) > 0.6 * (high - low)
         assert values[7] == values[-1]
     other = scene.builder.objects[BLOCK].actor._bodies[0]
-    assert other.mass == pytest.approx(0.8)  # without ranges, it is what it is
+    assert other.mass == pytest.approx(0.8)  # without ranges, it does not change
     env.close()
 
 
@@ -331,7 +331,7 @@ def test_many_scenes_in_one_environment(scenes_root: Path) -> None:
     assert {scene for scene, _ in first} == {"room", "things"}
     assert list(env.unwrapped.skipped) == ["bare"]
     assert len(env.unwrapped._made) == 2
-    env.unwrapped._size = 1  # then the one that was not used for longest is closed
+    env.unwrapped._size = 1  # then the least recently used one is closed
     env.unwrapped._made.pop("room").close()
     assert env.reset(options={"scene": "room"})[1]["scene"] == "room"
     assert list(env.unwrapped._made) == ["room"]

@@ -1,4 +1,4 @@
-"""Importing registers scenes, fast and light; ids and specs behave as Gymnasium wants them."""
+"""Importing registers scenes without heavy imports; ids and specs conform to Gymnasium."""
 
 import json
 import os

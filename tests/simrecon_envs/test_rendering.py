@@ -1,4 +1,4 @@
-"""Pictures: observation modes, the render camera, glTF axes, videos."""
+"""Rendering: observation modes, the render camera, glTF axes, videos."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def test_rgbd_observations_show_the_target(robot: str, scenes_root: Path) -> Non
     )
     obs, _ = env.reset(seed=0)
     cameras = obs["sensor_data"]
-    assert len(cameras) >= 2  # the base camera, and those that the robot carries
+    assert len(cameras) >= 2  # the base camera and those of the robot
     base = cameras["base_camera"]
     assert base["rgb"].shape == (1, 128, 128, 3)
     assert base["rgb"].dtype == torch.uint8

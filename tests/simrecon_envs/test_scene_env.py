@@ -1,4 +1,4 @@
-"""The environment on the hand-made room: API, physics at rest, determinism, the pick task, errors."""
+"""`SceneEnv` on a handmade room: API, physics at rest, determinism, the pick task, errors."""
 
 import dataclasses
 import functools
@@ -36,7 +36,7 @@ def _make(root: Path, scene: str = "room", **kwargs: object) -> gym.Env:
 
 @pytest.fixture(scope="module", params=ROBOTS)
 def env(request: pytest.FixtureRequest, scenes_root: Path) -> gym.Env:
-    """Return the room with each robot, state observations."""
+    """Return environments of the room with each robot and state observations."""
     made = _make(scenes_root, robot_uids=request.param)
     yield made
     made.close()
@@ -78,7 +78,7 @@ def test_seeded_runs_are_identical_whatever_was_before(robot: str, task: str, sc
     assert torch.equal(first, again)
     assert torch.equal(first, elsewhere)
     poses = 7 * len(env.unwrapped.movable_ids)  # the last numbers of the state
-    assert (first[-1, 0, -poses:] - first[0, 0, -poses:]).abs().max() > 0.05  # something was touched
+    assert (first[-1, 0, -poses:] - first[0, 0, -poses:]).abs().max() > 0.05  # the robot moved an object
     env.close()
     new.close()
 
@@ -173,7 +173,7 @@ def test_a_script_can_do_the_task(robot: str, scenes_root: Path) -> None:
     assert bool(info["success"])
     assert rewards[-1] == pytest.approx(1.0)
     assert float(info["lift_m"]) >= env.unwrapped.task_config.lift_m
-    # Reaching, gripping and lifting each earn more than what went before.
+    # The reward increases from reaching to grasping to lifting.
     assert rewards[0] < rewards[len(rewards) // 2] < rewards[-1]
     env.close()
 
