@@ -261,7 +261,8 @@ def test_frame_without_points_borrows_its_range(corner) -> None:
 
 
 def test_no_points_is_an_input_error(corner) -> None:
-    empty = replace(corner[0], points=np.zeros((0, 3)), observations=np.zeros((0, 2), np.int32))
+    none = {"point_colors": np.zeros((0, 3), np.uint8), "point_errors_px": np.zeros(0, np.float32)}
+    empty = replace(corner[0], points=np.zeros((0, 3)), observations=np.zeros((0, 2), np.int32), **none)
     with pytest.raises(InputError, match="sparse points"):
         estimate_depth(empty, CONFIG)
 

@@ -190,7 +190,7 @@ def test_metric_models_are_turned_into_inverse_depth_and_serve_the_scale(tmp_pat
     assert np.allclose(inverse[0], 1.0 / metres, rtol=1e-5)
     scale = load_backend(WorldConfig(metric_depth="transformers", metric_depth_model=metric))
     assert np.allclose(scale.predict(image, CAMERA.resized(80, 60)), metres)
-    with pytest.raises(UsageError, match="without a scale"):
+    with pytest.raises(UsageError, match="without scale"):
         load_backend(WorldConfig(metric_depth="transformers", metric_depth_model=relative))
 
 
