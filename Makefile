@@ -23,6 +23,7 @@ test-slow: setup
 lint: setup
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/pyright --pythonpath $(PYTHON_IN_VENV)
 
 format: setup
 	$(VENV)/bin/ruff format .

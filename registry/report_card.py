@@ -30,9 +30,20 @@ _FAR_AWAY_M = 1e3  # distance (down) reported for a diverged body, because JSON 
 class GraphEdge(Protocol):
     """An edge of the scene graph, from a bundle or a stage."""
 
-    child: int
-    relation: str
-    parent: int
+    @property
+    def child(self) -> int:
+        """Return the id of the object that is supported or attached."""
+        ...
+
+    @property
+    def relation(self) -> str:
+        """Return "supported_by" or "attached_to"."""
+        ...
+
+    @property
+    def parent(self) -> int:
+        """Return the id of the support."""
+        ...
 
 
 def spawn_contacts(specs: Sequence[BodySpec], max_separation_m: float = 0.0) -> list[Contact]:

@@ -7,7 +7,6 @@ bounds; `PlacedObject.repair` says how.
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -100,9 +99,7 @@ def _build_up(
 def _report(assets: AssetSet, placed: dict[int, Placement], base: list[BodySpec]) -> dict:
     """Measure the placed scene, with bodies in the order of the bundle, as its readers will."""
     in_order = [placed[o.id] for o in assets.objects]
-    # GraphEdge declares writable fields, but edges are frozen.
-    edges: Any = [p.edge for p in in_order]
-    return physics_report(scene_specs(in_order, base), edges)
+    return physics_report(scene_specs(in_order, base), [p.edge for p in in_order])
 
 
 def scene_specs(placements: Iterable[Placement], base: list[BodySpec]) -> list[BodySpec]:

@@ -1,4 +1,4 @@
-"""What several verbs share: arguments, and the error of an output folder."""
+"""Arguments that several verbs share, and the error of an output folder that cannot be written."""
 
 import argparse
 import textwrap

@@ -213,8 +213,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
         from registry.simulation import specs_from_bundle
 
         bundle = registry.load(arguments.scene)
-        # GraphEdge declares writable fields, but edges are frozen.
-        result["physics"] = physics_report(specs_from_bundle(bundle), bundle.edges)  # pyright: ignore[reportArgumentType]
+        result["physics"] = physics_report(specs_from_bundle(bundle), bundle.edges)
     if arguments.json:
         print(json.dumps(result, indent=2, default=str))
     else:

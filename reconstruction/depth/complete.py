@@ -195,7 +195,9 @@ class _Views:
         if by_rim:
             _fill_regions(label, cost, self.maps[i] > 0, self._color(i).astype(np.float32))
         size = (self.camera.width, self.camera.height)
-        label = cv2.resize(label.astype(np.int16), size, interpolation=cv2.INTER_NEAREST)
+        label = np.asarray(
+            cv2.resize(label.astype(np.int16), size, interpolation=cv2.INTER_NEAREST), np.int16
+        )
         y, x = np.nonzero((label >= 0) & (self.out[i] == 0))
         rays = self.camera.unproject(x + 0.5, y + 0.5, np.ones(len(x)))
         plane = local[label[y, x]]

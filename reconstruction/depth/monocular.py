@@ -35,6 +35,7 @@ class MonocularBackend(Protocol):
 
     def predict(self, images: list[np.ndarray]) -> list[np.ndarray]:
         """Return inverse depth up to a positive scale and a shift, float32 (h, w), of RGB images uint8 (h, w, 3)."""
+        ...
 
 
 class TransformersMonocular:

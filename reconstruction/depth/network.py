@@ -63,10 +63,10 @@ class Mending(nn.Module):
         self.unet = UNet(4 * FEATURES, tuple(widths))
         self.candidates = len(OFFSETS)
         self.leave = nn.Conv2d(widths[0], 4 * (self.candidates + 1 + 2 * len(OFFSETS_PX)), 1)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
+        for values in self.leave.parameters():
+            nn.init.zeros_(values)
         with torch.no_grad():
-            self.leave.bias[:4] = 3.0
+            self.leave.get_parameter("bias")[:4] = 3.0
 
     def forward(self, features: torch.Tensor):
         """Return logits (b, candidates + 1, h, w), the last of "none", and affinity logits (b, 6, h, w).
@@ -93,8 +93,8 @@ class Aggregation(nn.Module):
         self.unet = UNet(40 + 12, tuple(widths))
         outputs = BINS + 1 + 2 * len(OFFSETS_PX)
         self.leave = nn.Conv2d(widths[0], 4 * outputs, 1)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
+        for values in self.leave.parameters():
+            nn.init.zeros_(values)
 
     def forward(self, correlation: torch.Tensor, smoothed: torch.Tensor, color: torch.Tensor):
         """Return logits (b, bins, h, w), offset in bins (b, h, w) and affinity logits (b, 6, h, w).

@@ -1,4 +1,4 @@
-"""What every step of the depth stage works on: keyframes, their plan, settings, and threads."""
+"""Input of every step of the depth stage: keyframes, their view plan, settings and progress."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -60,8 +60,8 @@ def _warp_row(source, height, width, h_inf, shift, rho, y, out, inside):  # prag
         ix, iy = np.int32(u), np.int32(v)
         fx, fy = u - np.float32(ix), v - np.float32(iy)
         p = np.uint32(iy * stride + ix)
-        a, b = load_only_read(source, p), load_only_read(source, p + right)
-        c, d = load_only_read(source, p + below), load_only_read(source, p + below + right)
+        a, b = load_only_read(source, p), load_only_read(source, p + right)  # pyright: ignore[reportCallIssue]
+        c, d = load_only_read(source, p + below), load_only_read(source, p + below + right)  # pyright: ignore[reportCallIssue]
         top = a + fx * (b - a)
         low = c + fx * (d - c)
         store_apart(out, x, top + fy * (low - top))

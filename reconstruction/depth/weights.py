@@ -37,7 +37,8 @@ def load_network(kind: str, weights: Path):
     network.eval()
     for module in network.modules():
         if isinstance(module, torch.nn.Sequential) and isinstance(module[0], torch.nn.Conv2d):
-            module[0], module[1] = fuse_conv_bn_eval(module[0], module[1]), torch.nn.Identity()
+            fused = fuse_conv_bn_eval(module[0], module[1])  # pyright: ignore[reportArgumentType]
+            module[0], module[1] = fused, torch.nn.Identity()
     return network
 
 

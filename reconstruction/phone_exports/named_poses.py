@@ -14,7 +14,7 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class NamedPoses:
-    """What a reader returns: the shared intrinsics and a pose per image name."""
+    """Result of a reader: shared intrinsics, and one pose per image name."""
 
     camera: "pycolmap.Camera"  # at the size of the images
     named: list[tuple[str, np.ndarray]]  # image name, world_from_camera (4, 4) OpenCV; sorted by name

@@ -59,7 +59,7 @@ class RelationBackend(Protocol):
 
 @dataclass(frozen=True)
 class Decision:
-    """What merging did with an edge of a view, and why."""
+    """Outcome of merging one edge of a view into the scene graph, with its reason."""
 
     child: int
     relation: str

@@ -20,7 +20,7 @@ _FOOT_M = 0.012  # vertices up to this height above the bottom belong to the foo
 
 
 class SceneFacts:
-    """What the tasks of one robot need of a bundle; expensive properties are computed on first use.
+    """Facts of a bundle for the tasks of one robot; expensive properties are computed on first use.
 
     Objects are named by their id in the bundle. Positions are in world space, as captured.
     """
