@@ -1,12 +1,12 @@
 # make demo   set up, reconstruct the shipped video, and show what came out
-# make test   set up and run the tests (a few minutes); make test-slow runs the long ones
+# make test   set up and run the tests (minutes); make test-unit runs the quickest, make test-all the long ones too
 VENV ?= .venv
 # Test files are spread over two processes; JOBS=0 runs them in one, in order.
 JOBS ?= 2
 SPREAD = -n $(JOBS) --dist loadfile
 PYTHON_IN_VENV = $(VENV)/bin/python
 
-.PHONY: setup demo test test-slow lint format build clean
+.PHONY: setup demo test test-unit test-all lint format build clean
 
 setup:
 	@VENV=$(VENV) tools/setup.sh
@@ -17,8 +17,11 @@ demo: setup
 test: setup
 	$(PYTHON_IN_VENV) -m pytest $(SPREAD)
 
-test-slow: setup
-	$(PYTHON_IN_VENV) -m pytest $(SPREAD) -m "slow and not gpu"
+test-unit: setup
+	$(PYTHON_IN_VENV) -m pytest $(SPREAD) -m unit
+
+test-all: setup
+	$(PYTHON_IN_VENV) -m pytest $(SPREAD) -m "not gpu"
 
 lint: setup
 	$(VENV)/bin/ruff check .

@@ -1,17 +1,58 @@
-"""Fixtures that all tests share: a filmed room with known truth, and the shipped video."""
+"""The four lanes of the tests, a filmed room with known truth, and the shipped video.
 
+A test's lane is a marker. Tests in `simrecon_envs/` are `env`, all others without a marker `unit`; of two markers
+`end_to_end` counts. A unit test has ten seconds and starts no process.
+"""
+
+import subprocess
 from pathlib import Path
 
 import pytest
+from kept import kept
 
 from synthetic.capture import SyntheticCapture, make_test_capture
 
+LANES = (
+    "end_to_end",
+    "stage",
+    "env",
+    "unit",
+)  # the longest first, so that no process ends long after the others
 DEMO_VIDEO = Path(__file__).parents[1] / "examples" / "data" / "demo_room.mp4"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark every test with its lane, and order the files by lanes."""
+    rank: dict[Path, int] = {}
+    for item in items:
+        lane = next((lane for lane in LANES if item.get_closest_marker(lane)), None)
+        if lane is None:
+            lane = "env" if "simrecon_envs" in item.path.parts else "unit"
+            item.add_marker(lane)
+        if lane == "unit" and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(10))
+        rank[item.path] = min(LANES.index(lane), rank.get(item.path, len(LANES)))
+    items.sort(key=lambda item: rank[item.path])
+
+
+@pytest.fixture(autouse=True)
+def _no_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forbid unit tests to start processes."""
+    if request.node.get_closest_marker("unit"):
+
+        def refuse(*_: object, **__: object) -> None:
+            raise AssertionError("a unit test starts a process: mark it `stage` or `end_to_end`")
+
+        monkeypatch.setattr(subprocess, "Popen", refuse)
 
 
 @pytest.fixture(scope="session")
 def small_capture() -> SyntheticCapture:
     """Twelve 320x240 frames of the generated room, world space, true cameras, depth, ids and entities."""
+    return kept(_small_capture)
+
+
+def _small_capture() -> SyntheticCapture:
     return make_test_capture()
 
 

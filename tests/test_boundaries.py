@@ -11,6 +11,8 @@ import pytest
 from reconstruction.code_digest import imported_modules
 from reconstruction.pipeline import STAGES
 
+pytestmark = pytest.mark.stage
+
 ROOT = Path(__file__).resolve().parent.parent
 HEAVY = ("torch", "sapien", "mani_skill", "numba", "pycolmap", "trimesh", "cv2", "scipy", "coacd", "skimage")
 

@@ -11,6 +11,8 @@ from benchmarks.assembly_rooms import SHIFT_M, room_task
 from benchmarks.results import load_results
 from registry.simulation import pose_change
 
+pytestmark = pytest.mark.stage
+
 
 def test_rooms_are_off_by_as_much_as_is_said_and_the_same_twice():
     task, again = room_task(3, 14), room_task(3, 14)

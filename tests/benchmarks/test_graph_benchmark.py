@@ -1,6 +1,7 @@
 """The scene graph benchmark on a few rooms: its figures, its lies, its page."""
 
 import numpy as np
+import pytest
 
 from benchmarks.graph import Disturbance, disturbed, kind_of, main, measure_geometry, room_specs
 from benchmarks.graph_page import KINDS
@@ -8,6 +9,8 @@ from benchmarks.lying import LyingRelations, TrueRelations
 from reconstruction.scene_graph import Question
 from synthetic.procedural import plan_room, unpainted
 from synthetic.true_assets import true_assets, true_edges
+
+pytestmark = pytest.mark.stage
 
 
 def test_rooms_hold_every_kind_of_relation():

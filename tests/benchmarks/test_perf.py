@@ -11,6 +11,8 @@ import pytest
 
 from benchmarks.perf.ratios import BASELINE, complain
 
+pytestmark = pytest.mark.stage
+
 ROOT = Path(__file__).resolve().parents[2]
 STORED = {"tolerance": 1.5, "ratios": {"sgm": 2.0}}
 
@@ -35,7 +37,7 @@ def test_every_kernel_has_a_stored_ratio():
     assert stored["tolerance"] == 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_every_kernel_runs_and_a_slower_one_fails(tmp_path):
     line = [sys.executable, "-m", "benchmarks.perf", "--rounds", "3"]
     # Within a worker of pytest-xdist, pytest-benchmark does not measure.

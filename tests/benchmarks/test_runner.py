@@ -20,6 +20,8 @@ from synthetic.film import film_room, prepare
 from synthetic.room import build_room
 from synthetic.videos import write_not_a_video, write_video
 
+pytestmark = pytest.mark.stage
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -147,7 +149,7 @@ def _film_with_truth(folder: Path) -> None:
     write_ground_truth(folder / "ground_truth", room, film_set, camera, path, 12.0)
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
     _film_with_truth(tmp_path / "captures" / "room")
     out, page = tmp_path / "out", tmp_path / "page.md"

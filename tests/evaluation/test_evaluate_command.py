@@ -10,6 +10,8 @@ from reconstruction.measure import GroundTruth
 from registry import SceneRegistry
 from registry.errors import UsageError
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def registry(truth, tmp_path_factory):

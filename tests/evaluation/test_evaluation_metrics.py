@@ -9,6 +9,8 @@ from reconstruction.measure.matching import box_iou, graph_f1, match
 from registry.errors import UsageError
 from registry.geometry import rigid
 
+pytestmark = pytest.mark.stage
+
 GEOMETRY = ("cd_cm", "f_5cm", "nc")
 OBJECTS = (
     "object_recall_25", "object_recall_50", "object_precision_25", "object_precision_50", "object_cd_cm",

@@ -9,6 +9,8 @@ from reconstruction.measure.surfaces import compare, sample_seen
 from reconstruction.measure.visibility import seen_points
 from registry.geometry import rigid
 
+pytestmark = pytest.mark.end_to_end
+
 pytest.importorskip("embreex", reason="the reference casts exact rays with embreex (pip install embreex)")
 POINTS = 300_000
 

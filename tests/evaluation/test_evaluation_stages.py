@@ -18,6 +18,8 @@ from registry.geometry import rigid, split_similarity
 from synthetic.capture import SyntheticCapture, make_test_capture, write_ground_truth
 from synthetic.film import prepare
 
+pytestmark = pytest.mark.stage
+
 KINDS = ["table", "carton", "can", "book"]
 
 

@@ -23,7 +23,7 @@ def simrecon(home: Path, *arguments: object) -> subprocess.CompletedProcess:
     return done
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 @pytest.mark.parametrize("name", sorted(CI_CAPTURES))
 def test_a_generated_room_end_to_end(name, tmp_path):
     write_capture(CI_CAPTURES[name], tmp_path / name)

@@ -22,6 +22,8 @@ from reconstruction.measure.stage_results import StageResults
 from registry import SceneRegistry
 from registry.errors import UsageError
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def registry(truth, tmp_path_factory):

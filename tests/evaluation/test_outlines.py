@@ -14,6 +14,8 @@ from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
 from registry.geometry import rigid
 
+pytestmark = pytest.mark.stage
+
 RATES = ("outline_recall_25", "outline_recall_50", "outline_precision_25", "outline_precision_50")
 
 

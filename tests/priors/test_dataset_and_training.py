@@ -12,32 +12,9 @@ from priors.rooms import HELD_OUT, SPLITS, draw_film, families_of
 from priors.samples import border_of, draw_sample, load_sample, open_rooms
 from reconstruction.depth.channels import BINS
 
-FRAMES = 4
+pytestmark = pytest.mark.end_to_end
 
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    """One small room of each split that the tests need."""
-    out = tmp_path_factory.mktemp("data")
-    common = [
-        "--rooms",
-        "1",
-        "--frames",
-        str(FRAMES),
-        "--processes",
-        "1",
-        "--keep",
-        "costs",
-        "winner",
-        "depth",
-    ]
-    for split in ("train", "shapes"):
-        # Of some rooms four keyframes measure too little; those are left out.
-        for seed in range(4):
-            assert dataset.main([str(out), "--split", split, "--seed", str(seed), *common]) == 0
-            if open_rooms(out / split):
-                break
-    return out
+FRAMES = 6
 
 
 def test_held_out_families_never_occur_in_training():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from priors import dataset, partition
+from priors import partition
 from priors.partition_figures import area_under_curve, by_truth
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, example, film_of
@@ -16,16 +16,7 @@ from priors.partition_trees import PAIRS, arrays_of, mean_of
 from priors.samples import open_rooms
 from reconstruction.instances.partition.model import FEATURES, TREES, load_models
 
-FRAMES = 6
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    out = tmp_path_factory.mktemp("data")
-    for split in ("train", "shapes"):
-        arguments = [str(out), "--split", split, "--rooms", "1", "--frames", str(FRAMES), "--processes", "1"]
-        assert dataset.main([*arguments, "--keep", "depth"]) == 0
-    return out
+pytestmark = pytest.mark.end_to_end
 
 
 @pytest.fixture(scope="module")

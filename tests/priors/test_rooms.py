@@ -10,6 +10,8 @@ from priors.rooms import draw_film
 from registry.errors import InputError
 from synthetic.film import render_truth
 
+pytestmark = pytest.mark.stage
+
 
 def things_in_view(film, pose) -> int:
     _, ids = render_truth(film.film_set, film.camera(160, 120), pose)

@@ -23,6 +23,8 @@ from reconstruction.runner import Run
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from registry.errors import UsageError
 
+pytestmark = pytest.mark.stage
+
 
 def cut(posed, depth, voxel_size_m: float) -> Pointer:
     config = SurfaceConfig(voxel_size_m=voxel_size_m)

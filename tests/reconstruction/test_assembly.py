@@ -19,6 +19,8 @@ from registry.errors import SimReconError, UsageError
 from registry.geometry import rigid, transform_points
 from registry.simulation import build_physics, pose_change
 
+pytestmark = pytest.mark.stage
+
 
 def build(assets: AssetSet, **options) -> tuple[AssembledScene, dict]:
     graph = infer_scene_graph(assets, SceneGraphConfig())

@@ -13,6 +13,8 @@ from reconstruction.assets.solid import Solid, to_manifold
 from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, Surface
 from registry.geometry import transform_points
 
+pytestmark = pytest.mark.stage
+
 CONFIG = AssetsConfig(
     cells_along_longest=40, max_voxels=150_000, texture_max_px=128, texture_frames=4, base_texel_m=0.05
 )

@@ -133,7 +133,7 @@ def test_decimation_keeps_parts_thinner_than_its_tolerance():
     assert light.volume == pytest.approx(ball.volume, rel=0.11)
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_a_ball_dropped_into_a_cup_stays_there():
     sapien = pytest.importorskip("sapien")
     import tempfile

@@ -25,6 +25,8 @@ from reconstruction.views.search import Search
 from reconstruction.views.strategies import STRATEGIES
 from registry.errors import UsageError
 
+pytestmark = pytest.mark.stage
+
 QUICK = AvoConfig(
     side_px=64, scan_side_px=48, steps=12, restarts=1, picture_side_px=96, remaining_share=0.0, min_gain=1e-4
 )

@@ -17,6 +17,8 @@ from reconstruction.cache import (
 from reconstruction.core.types import Edge, SceneGraph
 from registry.errors import EnvironmentMissing
 
+pytestmark = pytest.mark.stage
+
 GRAPH = SceneGraph(edges=(Edge(1, "supported_by", 0, 1.0, ""),))
 CODE = ["a digest"]
 

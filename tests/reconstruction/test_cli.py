@@ -11,6 +11,8 @@ import pytest
 from registry import SceneRegistry
 from synthetic.videos import BAD_VIDEOS, HARD_VIDEOS
 
+pytestmark = pytest.mark.end_to_end
+
 ROOT = Path(__file__).resolve().parents[2]
 NEEDS_POSES = ("pure_rotation",)  # Refused only after matching, so the test of it is slow.
 
@@ -36,7 +38,7 @@ def assert_refused(done: subprocess.CompletedProcess, exit_code: int, home: Path
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow) if n in NEEDS_POSES else n for n in BAD_VIDEOS],
+    [pytest.param(n, marks=pytest.mark.end_to_end) if n in NEEDS_POSES else n for n in BAD_VIDEOS],
 )
 def test_hopeless_input_is_refused(name, tmp_path):
     video = tmp_path / f"{name}.mp4"

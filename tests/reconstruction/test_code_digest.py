@@ -7,6 +7,8 @@ import pytest
 from reconstruction.code_digest import code_digest, modules_behind, tree_digest
 from reconstruction.pipeline import STAGES
 
+pytestmark = pytest.mark.stage
+
 FILES = {
     "__init__.py": "",
     "stage/__init__.py": "from house.stage.work import run\nfrom house import shared\n",

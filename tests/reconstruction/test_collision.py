@@ -24,6 +24,8 @@ from synthetic import containers, furnishing
 from synthetic.furniture import Workshop
 from synthetic.things import Place, Thing
 
+pytestmark = pytest.mark.stage
+
 manifold3d = pytest.importorskip("manifold3d")
 MARBLE_M = 0.005  # radius
 DROPPED_FROM_M = 0.02

@@ -12,6 +12,8 @@ from numba.core.dispatcher import Dispatcher
 
 import reconstruction
 
+pytestmark = pytest.mark.stage
+
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = """
 import hashlib
@@ -50,7 +52,7 @@ def test_kernels_that_may_reorder_sums_are_inlined_into_their_callers():
         assert inlined, f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__} needs forceinline=True"
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_the_first_run_and_the_second_give_the_same_bits(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PYTHONPATH": str(ROOT)}
     runs = [

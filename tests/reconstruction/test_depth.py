@@ -11,6 +11,8 @@ from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.depth.views import depth_ranges, frame_parts, plan_views
 from registry.errors import InputError
 
+pytestmark = pytest.mark.stage
+
 CAMERA = Camera(240, 180, 210.0, 210.0, 120.0, 90.0)
 CONFIG = DepthConfig(depth_side_px=240, sweep_side_px=160, planes=64, min_speckle_px=20)
 BLANK = (np.array([-0.5, 0.35]), np.array([0.1, 0.7]))  # x and z of the wall's blank patch

@@ -17,6 +17,8 @@ from reconstruction.depth.mending import candidate_shares, mending_features
 from reconstruction.depth.weights import load_network
 from synthetic.capture import make_test_capture
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def step():

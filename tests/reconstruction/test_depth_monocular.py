@@ -14,6 +14,8 @@ from reconstruction.depth.scene import DepthScene
 from reconstruction.depth.views import plan_views
 from registry.errors import EnvironmentMissing, UsageError
 
+pytestmark = pytest.mark.stage
+
 HOLE = (slice(20, 110), slice(60, 180))  # over the wall and the box: no plane fills it
 
 

@@ -9,6 +9,8 @@ from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera, PosedFrames, VideoSource
 from reconstruction.depth import DepthConfig, estimate_depth
 
+pytestmark = pytest.mark.stage
+
 CAMERA = Camera(240, 180, 210.0, 210.0, 120.0, 90.0)
 CONFIG = DepthConfig(depth_side_px=240, sweep_side_px=160, planes=64, min_speckle_px=20, prior="none")
 FLOOR, WALL, TABLE, BOX = 0, 1, 2, 3

@@ -10,6 +10,8 @@ from chat_server import Server
 
 from reconstruction.doctor import Check, format_checks, learned, machine, packages, process, run_checks
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def checks() -> dict[str, Check]:

@@ -12,6 +12,8 @@ from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def scene():

@@ -17,7 +17,7 @@ from registry.geometry import transform_points, umeyama
 from synthetic.videos import HARD_VIDEOS, standard_film, write_video
 
 ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.end_to_end
 
 
 def command(video: Path, home: Path, *flags: object) -> tuple[list[str], dict[str, str]]:

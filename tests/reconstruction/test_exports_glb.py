@@ -15,6 +15,8 @@ from gltf_validator import gltf_issues
 from reconstruction.exports import export_scene
 from registry.geometry import GLTF_FROM_WORLD, transform_points
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def file(bundle, tmp_path_factory):
@@ -101,7 +103,7 @@ def in_blender(file):
     return json.loads(line.removeprefix("SCENE "))
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_blender_has_every_thing_at_its_place_in_metres(bundle, in_blender):
     assert set(in_blender["objects"]) == set(names(bundle).values())
     assert in_blender["metres_a_unit"] == 1.0
@@ -112,7 +114,7 @@ def test_blender_has_every_thing_at_its_place_in_metres(bundle, in_blender):
         np.testing.assert_allclose([found["low"], found["high"]], world_box(bundle, item), atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_blender_has_looks_and_facts(bundle, in_blender):
     for item in bundle.objects:
         found = in_blender["objects"][names(bundle)[item.id]]

@@ -124,7 +124,7 @@ def test_it_rests_for_two_seconds(model):
         assert turned < 1.0, name
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_it_rests_for_ten_seconds_within_the_thresholds_of_the_report_card(model):
     changes = _rest(model, 10.0)
     stable = [moved < 0.02 and turned < 5.0 for moved, turned in changes.values()]
@@ -132,7 +132,7 @@ def test_it_rests_for_ten_seconds_within_the_thresholds_of_the_report_card(model
     assert np.mean(stable) >= 0.95, changes
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 @pytest.mark.parametrize(("seed", "objects"), [(2, 15), (7, 40)])
 def test_generated_rooms_with_stacks_and_containers_rest_for_ten_seconds(seed, objects, tmp_path):
     scene = generated_room(tmp_path, seed, objects)

@@ -20,6 +20,8 @@ from synthetic.videos import (
     write_video,
 )
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def film():
@@ -325,7 +327,7 @@ def test_presets_are_configs_and_memory_is_bounded():
     assert (config.max_keyframes + config.max_held_out) * bytes_each < 300e6
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak from Linux' /proc")
 def test_4k_at_60_frames_per_second_needs_little_memory(tmp_path):
     """Frames are scaled down one by one; 240 of them at once would be 6 GB."""

@@ -22,6 +22,8 @@ from synthetic.procedural import RoomSpec, build_procedural_room, furnish, plan_
 from synthetic.random_rooms import draw_room
 from synthetic.shapes import COARSE, signed_volume
 
+pytestmark = pytest.mark.stage
+
 ROUGH = {"step_m": COARSE, "density": 0.03}
 ALL = tuple(FURNITURE_FAMILIES)
 KEYS = [*furniture_keys(ALL), *CLOTH_KINDS]

@@ -15,6 +15,8 @@ from reconstruction.gaussians.optimizer import SplatState, prune, split
 from reconstruction.gaussians.seeding import seed_from_depth
 from registry.errors import InputError
 
+pytestmark = pytest.mark.stage
+
 SMALL = GaussiansConfig(
     iterations=120, side_px=160, coarse_side_px=120, max_gaussians=9000, densify_every=30, seed=3
 )

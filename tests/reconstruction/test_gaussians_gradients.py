@@ -16,6 +16,8 @@ from reconstruction.gaussians.losses import FrameTarget, LossWeights, image_loss
 from reconstruction.gaussians.rasterizer import RasterSettings, rasterize, rasterize_backward
 from reconstruction.gaussians.torch_losses import TorchImage, TorchTarget, torch_loss
 
+pytestmark = pytest.mark.stage
+
 CAMERA = Camera(36, 28, 40.0, 41.0, 18.3, 13.2)
 UNCUT = RasterSettings(
     sigma_cutoff=9.0, alpha_min=1e-14, transmittance_stop=0.0, near=0.05, reference_depth=2.0

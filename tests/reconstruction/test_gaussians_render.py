@@ -19,6 +19,8 @@ from reconstruction.gaussians.seeding import disks
 from registry.errors import BundleError, EnvironmentMissing, UsageError
 from registry.geometry import matrix_from_quat
 
+pytestmark = pytest.mark.stage
+
 CAMERA = Camera(48, 40, 50.0, 50.0, 24.0, 20.0)
 EYE = np.eye(4)
 

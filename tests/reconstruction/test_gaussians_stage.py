@@ -17,6 +17,8 @@ from reconstruction.gaussians import (
 from reconstruction.pipeline import STAGES
 from registry.geometry import matrix_from_quat
 
+pytestmark = pytest.mark.stage
+
 CONFIG = GaussiansConfig(
     iterations=200, side_px=240, coarse_side_px=160, max_gaussians=20_000, densify_every=30, seed=3
 )

@@ -22,6 +22,8 @@ from synthetic.furnishing import (
     make_table,
 )
 
+pytestmark = pytest.mark.stage
+
 BOUND = AssetsConfig().generator_filling
 HOLLOW = [
     (make_table, 0.0), (make_round_table, 0.0), (make_bench, 0.0), (make_stool, 0.0), (make_chair, 0.0),

@@ -11,6 +11,8 @@ from reconstruction.assets.registration import SeenSurface, register
 from synthetic.containers import make_bowl, make_mug, make_tray
 from synthetic.furnishing import make_cabinet, make_chair
 
+pytestmark = pytest.mark.stage
+
 NOISE_M = 0.002
 
 

@@ -25,6 +25,8 @@ from registry.geometry import transform_points
 from synthetic.containers import make_bowl, make_mug
 from synthetic.furnishing import make_chair
 
+pytestmark = pytest.mark.stage
+
 NAMES = ("can", "bowl", "book")
 EMPTY = Surface(*(np.zeros((0, 3), kind) for kind in ("f4", "i4", "f4", "u1")), np.zeros(0, "f4"), 0.01, None)
 

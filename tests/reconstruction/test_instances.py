@@ -11,6 +11,8 @@ from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.core.types import InstanceSet, Surface
 from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig, find_instances
 
+pytestmark = pytest.mark.stage
+
 
 def run(surface: Surface, progress=NO_PROGRESS) -> InstanceSet:
     posed, depth = frames_of(surface, 480, 360)

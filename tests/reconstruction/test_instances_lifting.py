@@ -25,6 +25,8 @@ from reconstruction.instances.superpoints import superpoints
 from reconstruction.video_to_scene import reconstruct
 from registry.errors import UsageError
 
+pytestmark = pytest.mark.stage
+
 WHITE = (200, 200, 190)
 # The floor, a table, a box on it, a book of the table's color beside it, a cup on the book, a bin on the floor, a wall
 # and a picture in it.

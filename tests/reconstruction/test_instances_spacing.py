@@ -8,6 +8,8 @@ from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.core.types import Instance
 from reconstruction.instances import InstancesConfig, find_instances
 
+pytestmark = pytest.mark.stage
+
 WOOD = (120, 80, 50)
 
 

@@ -13,6 +13,8 @@ from reconstruction.instances.labels import ShapeFacts, coarse_label, shape_fact
 from reconstruction.measure.labels import Guess, overconfidence, reliability
 from reconstruction.surface import SurfaceConfig, fuse_surface
 
+pytestmark = pytest.mark.stage
+
 GRAY = (128, 128, 128)
 
 

@@ -24,6 +24,8 @@ from reconstruction.depth.weights import load_network
 from registry.errors import EnvironmentMissing
 from synthetic.capture import make_test_capture
 
+pytestmark = pytest.mark.stage
+
 
 def test_a_bin_has_the_least_cost_of_its_planes():
     cost = np.random.default_rng(0).integers(0, 255, (3, 4, PLANES)).astype(np.uint8)

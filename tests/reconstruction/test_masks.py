@@ -14,6 +14,8 @@ from reconstruction.instances.masks import KeyframeMasks, flatten_masks, load_ma
 from reconstruction.learned.models import ModelRequest, transformers_class
 from registry.errors import EnvironmentMissing
 
+pytestmark = pytest.mark.stage
+
 pytest.importorskip("transformers")
 
 HEIGHT, WIDTH, FRAMES = 48, 64, 2

@@ -17,6 +17,8 @@ from synthetic.procedural import RoomSpec, furnish, plan_room
 from synthetic.sensor import Sensor, draw_sensor
 from synthetic.walks import WALKS, draw_walk, walk_path
 
+pytestmark = pytest.mark.stage
+
 _BEFORE = "5c9b9e668df2deaf15d1832482c30f157a71b0c2062229699a36d56389d985bb"
 _BEFORE_BLURRED = "9f9f24897a5a8315342e16af45327b097156457f3273e9d34aa4fdff983969bf"
 _DRAWN = ("near", "strafe", "pan", "sit", "handheld_wander")

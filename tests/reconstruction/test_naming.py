@@ -25,6 +25,8 @@ from reconstruction.instances.naming.vlm import VlmNamer
 from reconstruction.learned.vlm import Endpoint, VlmClient
 from registry.errors import EnvironmentMissing, UsageError
 
+pytestmark = pytest.mark.stage
+
 HEIGHT, WIDTH = 60, 80
 
 

@@ -27,6 +27,8 @@ from reconstruction.instances.partition.model import load_models
 from reconstruction.instances.sightings import sightings
 from registry.errors import EnvironmentMissing
 
+pytestmark = pytest.mark.stage
+
 TABLE = box((-0.3, -0.3, 0.0), (0.3, 0.3, 0.3), (120, 80, 50))
 TOY = box((-0.05, -0.05, 0.3), (0.07, 0.05, 0.42), (200, 30, 30))
 

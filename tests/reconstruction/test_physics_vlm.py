@@ -15,6 +15,8 @@ from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.instances import InstancesConfig, make_instances
 from registry.errors import EnvironmentMissing
 
+pytestmark = pytest.mark.stage
+
 ID = 2  # of the crate: the floor is 1
 GOOD = {"id": ID, "material": "wood", "filling": "open", "lightest_kg": 2.0, "heaviest_kg": 8.0}
 

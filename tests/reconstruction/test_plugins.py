@@ -35,6 +35,8 @@ from reconstruction.views import load_inpainter, load_strategy
 from reconstruction.world import WorldConfig, metric_depth
 from registry.errors import EnvironmentMissing, UsageError
 
+pytestmark = pytest.mark.stage
+
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "extending.md").read_text()
 SECTION = PAGE.partition("## Add a mask backend from another package\n")[2].partition("\n## ")[0]
 NO_ASSETS = AssetSet((), ())

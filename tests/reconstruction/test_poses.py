@@ -15,6 +15,8 @@ from registry.geometry import split_similarity, umeyama
 from synthetic.camera_paths import pan_path
 from synthetic.videos import short_film
 
+pytestmark = pytest.mark.stage
+
 
 class Notes:
     """Collects what the stage reports."""

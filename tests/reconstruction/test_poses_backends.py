@@ -12,6 +12,8 @@ from reconstruction.poses.backends import PredictedPoses, load_pose_backend
 from registry.errors import EnvironmentMissing
 from registry.geometry import transform_points, umeyama
 
+pytestmark = pytest.mark.stage
+
 
 class RoughTruth:
     """Predicts true cameras, 2.5 degrees, 4 cm and 4 % of the focal length off."""

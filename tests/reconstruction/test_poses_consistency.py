@@ -73,7 +73,7 @@ def test_parts_and_the_bridges_between_them():
     assert propose_bridges(parts, scores, [(0, 6, True), (1, 5, False)]) == [(1, 5, True)]
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_of_two_rooms_the_longer_part_is_kept_and_the_other_named(small_capture, tmp_path):
     like, images = small_capture.frame_set(), []
     for seed, count in ((1, 14), (2, 9)):

@@ -16,6 +16,8 @@ from reconstruction.frames import FramesConfig, load_frames
 from reconstruction.poses import PosesConfig, estimate_poses
 from registry.errors import InputError
 
+pytestmark = pytest.mark.stage
+
 # ARKit's world has +y up.
 ARKIT_FROM_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 

@@ -11,6 +11,8 @@ from reconstruction.poses import PosesConfig, estimate_poses
 from registry.errors import UsageError
 from registry.geometry import invert_rigid
 
+pytestmark = pytest.mark.stage
+
 
 def write_colmap_model(folder, truth: PosedFrames, size_factor: int = 1) -> None:
     """Write cameras of all frames as a COLMAP text model by hand, independent of the reader."""

@@ -16,6 +16,8 @@ from synthetic.procedural import RoomSpec, build_procedural_room, furnish, plan_
 from synthetic.shapes import COARSE, moved, signed_volume
 from synthetic.suites import CI_CAPTURES, PRESETS, SUITE
 
+pytestmark = pytest.mark.stage
+
 ROUGH = {"step_m": COARSE, "density": 0.05}  # geometry is the same, only coarsely painted
 
 
@@ -53,7 +55,7 @@ def test_rooms_are_possible_and_everything_stands(rooms, objects, seed):
     assert check.physics["spawn_penetration_mm"] < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 @pytest.mark.parametrize("objects", [5, 12, 20, 40])
 @pytest.mark.parametrize("seed", [100, 101])

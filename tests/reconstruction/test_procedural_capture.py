@@ -17,6 +17,8 @@ from synthetic.procedural import RoomSpec, plan_room
 from synthetic.suites import CI_CAPTURES, PRESETS, SUITE, drawn_captures
 from synthetic.walks import walk_path
 
+pytestmark = pytest.mark.stage
+
 SMALL = CaptureSpec(
     RoomSpec(seed=3, objects=6, step_m=0.15, density=0.2),
     frames=12,

@@ -11,6 +11,8 @@ import pytest
 from reconstruction.core.profiling import UsageMeter
 from reconstruction.costs import cost_rows, costs_json, describe_costs
 
+pytestmark = pytest.mark.stage
+
 ROOT = Path(__file__).resolve().parents[2]
 _MB = 2**20
 # A child that touches a known amount of memory, burns a known amount of CPU time, and ends.

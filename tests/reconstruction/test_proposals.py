@@ -13,6 +13,8 @@ from reconstruction.instances.partition.graph import LABELS, Scores
 from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES, proposal_features
 from reconstruction.instances.partition.proposals import best_disjoint, members_of, propose
 
+pytestmark = pytest.mark.stage
+
 
 def test_the_choice_is_as_good_as_trying_all():
     rng = np.random.default_rng(0)

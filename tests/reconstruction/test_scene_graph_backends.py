@@ -24,6 +24,8 @@ from reconstruction.scene_graph.looking import RegionViewer
 from reconstruction.scene_graph.relations import GeometryRelations
 from registry.errors import EnvironmentMissing
 
+pytestmark = pytest.mark.stage
+
 THINGS = (BOX, PANEL, BALL)
 CONFIG = SceneGraphConfig(picture_side_px=256)
 

@@ -21,6 +21,8 @@ from reconstruction.scene_graph.merge import GraphMerge
 from reconstruction.scene_graph.set_of_marks import id_map, number_things
 from synthetic.true_assets import true_assets, true_edges
 
+pytestmark = pytest.mark.stage
+
 TRUTH = {10: FLOOR, 11: 10, 12: 11, 13: 10, 14: 13}
 
 

@@ -10,6 +10,8 @@ from synthetic.layout import KINDS
 from synthetic.shape_families import SHAPE_FAMILIES, random_look
 from synthetic.shapes import COARSE, signed_volume
 
+pytestmark = pytest.mark.stage
+
 _ALL = {key: kind for family in SHAPE_FAMILIES.values() for key, kind in family.items()}
 _KEYS = list(_ALL)
 

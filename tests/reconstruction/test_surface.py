@@ -12,6 +12,8 @@ from reconstruction.measure.surfaces import sample
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from registry.errors import InputError
 
+pytestmark = pytest.mark.stage
+
 CENTER, RADIUS = np.array([0.0, 0.0, 0.15]), 0.15
 CAMERA = Camera(120, 90, 110.0, 110.0, 60.0, 45.0)
 BLUE, RED = np.array([40, 60, 200], np.uint8), np.array([200, 50, 40], np.uint8)

@@ -16,6 +16,8 @@ from reconstruction.surface.base_planes import plane_axes
 from reconstruction.surface.planes import find_planes
 from synthetic.capture import SyntheticCapture, make_test_capture
 
+pytestmark = pytest.mark.stage
+
 GRAY, BROWN, BLUE = (200, 200, 190), (120, 80, 50), (30, 60, 200)
 CONFIG = SurfaceConfig(voxel_size_m=0.012)
 

@@ -12,6 +12,8 @@ from synthetic.film import prepare
 from synthetic.room import NORTH_M, build_room
 from synthetic.shapes import COARSE, box, lathe, signed_volume
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def room(small_capture):

@@ -12,6 +12,8 @@ from reconstruction.world import WorldConfig, find_world, rescale_for_object
 from registry.errors import InputError, UsageError
 from registry.geometry import matrix_from_quat, rigid, split_similarity
 
+pytestmark = pytest.mark.stage
+
 CAMERA = Camera(240, 180, 200.0, 200.0, 120.0, 90.0)
 BOX_FACES = np.array(
     [

@@ -13,6 +13,8 @@ from reconstruction.world.markers import measure_markers, printed_cells
 from registry.errors import UsageError
 from registry.geometry import rigid
 
+pytestmark = pytest.mark.stage
+
 CAMERA = Camera(640, 480, 533.0, 533.0, 320.0, 240.0)
 CELL_PX = 16
 PAPER_PX, WALL_PX = 32, 200
@@ -115,7 +117,7 @@ def test_markers_as_phones_film_them_are_measured_within_half_a_percent() -> Non
     assert measured[:, 1].max() < 0.005
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_over_many_films_the_worst_is_within_a_percent_and_the_sigma_is_honest() -> None:
     measured = errors_and_sigmas(range(100, 136))
     error, sigma = np.abs(measured[:, 0]), measured[:, 1]

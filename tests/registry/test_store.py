@@ -16,6 +16,8 @@ from registry import BundleError, EnvironmentMissing, SceneBundle, SceneBusy, Sc
 from registry import store as store_module
 from registry.db import SceneRow
 
+pytestmark = pytest.mark.stage
+
 FORK = multiprocessing.get_context("fork")
 
 

@@ -1,12 +1,14 @@
 """Fixtures: a small generated room, reconstructed and published, with its ground truth."""
 
 import json
+import shutil
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pytest
+from kept import kept_folder
 
 from reconstruction.assembly import AssemblyConfig, assemble
 from reconstruction.assets import AssetsConfig, build_assets
@@ -49,8 +51,7 @@ class Reconstructed:
     @cached_property
     def evaluation(self) -> dict:
         """The scene's evaluation, from few samples."""
-        bundle, stages = self.open()
-        return evaluate_scene(bundle, self.truth, stages=stages, composition_points=40_000).to_json()
+        return json.loads((self.home / "evaluation.json").read_text())
 
     def open(self) -> tuple[SceneBundle, StageResults]:
         """Read the bundle and its stage results."""
@@ -60,8 +61,13 @@ class Reconstructed:
 
 @pytest.fixture(scope="session")
 def reconstructed(tmp_path_factory) -> Reconstructed:
+    """Return a generated room, reconstructed coarsely; tests may write to it."""
+    home = shutil.copytree(kept_folder(_reconstruct), tmp_path_factory.mktemp("report") / "home")
+    return Reconstructed(home, home / "truth")
+
+
+def _reconstruct(home: Path) -> None:
     """Reconstruct a generated room coarsely, from true cameras and nearly true depth."""
-    home = tmp_path_factory.mktemp("report")
     capture = make_test_capture(9, 256, 192, objects=THINGS)
     sfm_from_world = np.diag([SFM_SCALE, SFM_SCALE, SFM_SCALE, 1.0])
     noise = 1 + 0.002 * np.random.default_rng(0).standard_normal(capture.depth.depth.shape)
@@ -107,20 +113,24 @@ def reconstructed(tmp_path_factory) -> Reconstructed:
     }
     publish(home, results, PipelineConfig(surface=SurfaceConfig(voxel_size_m=0.016)))
     write_truth(capture, home / "truth")
-    return Reconstructed(home, home / "truth")
+    made = Reconstructed(home, home / "truth")
+    bundle, stages = made.open()
+    found = evaluate_scene(bundle, made.truth, stages=stages, composition_points=40_000).to_json()
+    (home / "evaluation.json").write_text(json.dumps(found))
+    (home / "page.html").write_text(build_page(bundle, stages))
+    (home / "page_with_truth.html").write_text(build_page(bundle, stages, made.truth, made.evaluation))
 
 
 @pytest.fixture(scope="session")
 def page(reconstructed) -> str:
     """The page without ground truth."""
-    return build_page(*reconstructed.open())
+    return (reconstructed.home / "page.html").read_text()
 
 
 @pytest.fixture(scope="session")
 def page_with_truth(reconstructed) -> str:
     """The page with ground truth."""
-    bundle, stages = reconstructed.open()
-    return build_page(bundle, stages, reconstructed.truth, reconstructed.evaluation)
+    return (reconstructed.home / "page_with_truth.html").read_text()
 
 
 def publish(home: Path, results: dict, config: PipelineConfig) -> None:

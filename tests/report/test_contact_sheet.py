@@ -18,6 +18,8 @@ from reconstruction.measure.report.contact_sheet import ContactSheet, anchor_tex
 from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
 
+pytestmark = pytest.mark.stage
+
 
 @pytest.fixture(scope="module")
 def sheet(reconstructed) -> ContactSheet:

@@ -9,6 +9,8 @@ import pytest
 from reconstruction.cli import main
 from reconstruction.measure.report.graph_sheet import draw_step, draw_tree, write_graph_steps
 
+pytestmark = pytest.mark.stage
+
 NAMES = {1: "floor", 2: "wall", 3: "table", 4: "book", 5: "mug", 6: "picture"}
 
 

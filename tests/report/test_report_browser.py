@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from browser import Page, browser_page, find_browser
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.end_to_end]
 
 # Every picture and plot: its size on the page, and how much its pixels differ.
 _MEASURE = """[...document.querySelectorAll("img, svg")].map((item) => {

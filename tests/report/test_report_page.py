@@ -22,6 +22,8 @@ from reconstruction.measure.report.page import build_page
 from reconstruction.measure.report.truth import Truth
 from reconstruction.measure.stage_results import StageResults
 
+pytestmark = pytest.mark.stage
+
 SECTIONS = [
     "cameras", "depth", "gaussians", "surface", "instances", "objects", "graph", "assembly", "kept-out", "physics",
     "cost", "notes",

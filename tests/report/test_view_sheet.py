@@ -11,6 +11,8 @@ from benchmarks.avo import gradient_error
 from reconstruction.cli import main
 from reconstruction.views import AvoConfig, make_target, prepare_scene
 
+pytestmark = pytest.mark.stage
+
 QUICK = [
     "--set",
     "avo.views=1",

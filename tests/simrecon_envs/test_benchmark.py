@@ -302,13 +302,13 @@ def test_the_command_line_runs_compares_and_explains(
         assert message in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_a_process_that_dies_is_one_clear_error() -> None:
     with Workers(2) as workers, pytest.raises(EnvironmentMissing, match="fewer --jobs"):
         list(workers.map(os._exit, [3, 3]))
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_jobs_change_nothing(scenes_root: Path) -> None:
     config = replace(SUITE_CONFIG, kinds=(*KINDS, "sequence"), per_scene=6)
     one, two = (generate_suite(["things"], config, registry=scenes_root, jobs=jobs) for jobs in (1, 2))

@@ -125,7 +125,7 @@ def test_a_missing_pyarrow_is_one_error_that_names_the_extra(monkeypatch: pytest
 
 
 @pytest.mark.render
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_pictures_become_videos(suite: Suite, scenes_root: Path, tmp_path: Path) -> None:
     import av
     import pyarrow.parquet as pq

@@ -46,7 +46,7 @@ def _parameters() -> list:
     for case in MATRIX:
         if case[3] in PICTURE_MODES and case not in DRAWN and not WHOLE:
             continue
-        marks = [pytest.mark.slow, *([pytest.mark.render] if case[3] in PICTURE_MODES else [])]
+        marks = [pytest.mark.end_to_end, *([pytest.mark.render] if case[3] in PICTURE_MODES else [])]
         slow.append(pytest.param(*case, marks=marks, id="-".join(case)))
     return fast + [case for case in slow if case.values not in FAST]
 
@@ -73,7 +73,7 @@ def _run_at_the_bounds(env: gym.Env, steps: int) -> None:
             env.reset()
 
 
-@pytest.mark.parametrize("steps", [300, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [300, pytest.param(10_000, marks=pytest.mark.end_to_end)])
 def test_actions_at_the_bounds_give_finite_numbers(steps: int, scenes_root: Path) -> None:
     env = simrecon_envs.make(
         "things", registry=scenes_root, task="rearrange", randomize="all", max_episode_steps=10**9
@@ -83,7 +83,7 @@ def test_actions_at_the_bounds_give_finite_numbers(steps: int, scenes_root: Path
     env.close()
 
 
-@pytest.mark.parametrize("resets", [60, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("resets", [60, pytest.param(500, marks=pytest.mark.end_to_end)])
 def test_memory_does_not_grow_with_resets(resets: int, scenes_root: Path) -> None:
     env = simrecon_envs.make("things", registry=scenes_root, task="rearrange", randomize="all")
     process = psutil.Process()

@@ -21,7 +21,7 @@ TASKS = (
     "push_block",
     "put_cube_in_crate-then-pick_cup",
     *(
-        pytest.param(task, marks=pytest.mark.slow)
+        pytest.param(task, marks=pytest.mark.end_to_end)
         for task in (
             "reach_crate",
             "place_cube_on_shelf",

@@ -267,7 +267,7 @@ def test_actions_that_mean_nothing_are_refused(action: np.ndarray, scenes_root: 
     env.close()
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 @pytest.mark.render
 def test_cameras_show_what_their_names_say_and_randomization_changes_them(scenes_root: Path) -> None:
     env = _make(
@@ -301,7 +301,7 @@ def test_several_environments_at_once(kind: str, scenes_root: Path) -> None:
     single.close()
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_environments_in_processes_of_their_own(scenes_root: Path) -> None:
     vec = simrecon_envs.make_vec("things", 2, kind="async", registry=scenes_root, task="reach_cube")
     obs, _ = vec.reset(seed=[1, 2])

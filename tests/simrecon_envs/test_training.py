@@ -321,7 +321,7 @@ def test_the_command_prints_results_as_json(
     assert printed.err == ""
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_a_killed_run_goes_on_to_the_same_number_of_steps(scenes_root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = [sys.executable, "-m", "reconstruction.cli", "train", "things", "--registry", str(scenes_root)]
@@ -346,14 +346,14 @@ def test_a_killed_run_goes_on_to_the_same_number_of_steps(scenes_root: Path, tmp
     assert resume(RunFolder.open(out), video=False)["training"]["steps"] == 3000
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 def test_reach_is_learned(scenes_root: Path, tmp_path: Path) -> None:
     config = TrainConfig(scene="things", steps=30_000, envs=2, registry=str(scenes_root))
     found = train(config, tmp_path / "run", video=False)
     assert found["evaluation"]["success_rate"] >= 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.end_to_end
 @pytest.mark.render
 def test_pictures_are_learned_from_and_the_end_is_filmed(scenes_root: Path, tmp_path: Path) -> None:
     settings = parse_settings(
