@@ -29,14 +29,14 @@ MATRIX = [
     for task in (*tasks, *(("navigate",) if robot == "fetch" else ()))
     for mode in (*STATE_MODES, *PICTURE_MODES)
 ]
-# Images do not depend on the task: by default, test one task per scene, robot and image mode. The whole matrix takes an
-# hour without a GPU.
+# Images do not depend on the task: by default, test one scene and task per robot and image mode. The whole matrix takes
+# an hour without a GPU.
 WHOLE = os.environ.get("SIMRECON_TEST_WHOLE_MATRIX") == "1"
 DRAWN = {
     (scene, tasks[(number + step) % len(tasks)], robot, mode)
-    for number, (scene, tasks) in enumerate(SCENES.items())
-    for step, robot in enumerate(("panda", "fetch"))
-    for step, mode in enumerate(PICTURE_MODES, start=step)
+    for number, robot in enumerate(("panda", "fetch"))
+    for step, mode in enumerate(PICTURE_MODES)
+    for scene, tasks in [list(SCENES.items())[(number + step) % len(SCENES)]]
 }
 
 
