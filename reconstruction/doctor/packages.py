@@ -14,8 +14,9 @@ PIP = f"{sys.executable} -m pip"
 # The dependencies in pyproject.toml, except OpenCV.
 _REQUIRED = (
     "av", "coacd", "fast-simplification", "gymnasium", "imageio", "jinja2", "mani_skill", "manifold3d", "matplotlib",
-    "numba", "numpy", "pillow", "psutil", "pycolmap", "pydantic", "pyyaml", "requests", "safetensors", "sapien",
-    "scikit-image", "scipy", "stable_baselines3", "tensorboard", "threadpoolctl", "torch", "tqdm", "trimesh", "xatlas",
+    "numba", "numpy", "pillow", "plyfile", "psutil", "pycolmap", "pydantic", "pyyaml", "requests", "safetensors",
+    "sapien", "scikit-image", "scipy", "stable_baselines3", "tensorboard", "threadpoolctl", "torch", "tqdm", "trimesh",
+    "xatlas",
 )  # fmt: skip
 _SHOWN = ("mani_skill", "torch", "numba", "pycolmap")
 _OPENCV_WHEELS = (

@@ -62,10 +62,8 @@ def _range(values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
 
 def quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> np.ndarray:
     """Return quantiles of values (n,) weighted by area, which do not depend on how densely a mesh is sampled."""
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(np.maximum(weights, 1e-12)[order])
-    index = np.searchsorted(total, np.asarray(shares) * total[-1])
-    return np.asarray(values, np.float64)[order[np.minimum(index, len(order) - 1)]]
+    values, weights = np.asarray(values, np.float64), np.maximum(weights, 1e-12)
+    return np.quantile(values, shares, weights=weights, method="inverted_cdf")
 
 
 def with_bottom(box: UprightBox, bottom: float) -> UprightBox:

@@ -30,7 +30,7 @@ from reconstruction.core.types import (
 from reconstruction.costs import OTHER, PUBLISH
 from reconstruction.gaussians import write_ply
 from reconstruction.instances import backends as instance_backends
-from reconstruction.instances.gaussian_ids import add_instances_to_ply, gaussian_instances
+from reconstruction.instances.gaussian_ids import gaussian_instances
 from reconstruction.publish.instance_views import write_views
 from reconstruction.publish.phrases import Described, phrases
 from reconstruction.publish.preview import render_preview
@@ -152,12 +152,11 @@ def _cameras(posed: PosedFrames) -> dict:
 
 def _gaussians(run: "Run", folder: Path) -> dict:
     gaussians = run.results["gaussians"].in_world(run.results["world"])
-    write_ply(gaussians, folder / "gaussians.ply")
     found, kept = run.results["instances"], run.results["assets"]
     published = [item.id for item in (*kept.base, *kept.objects)]
     labels = np.where(np.isin(found.vertex_instance, published), found.vertex_instance, 0)
     instances = gaussian_instances(gaussians.means, run.results["surface"].vertices, labels)
-    add_instances_to_ply(folder / "gaussians.ply", instances)
+    write_ply(gaussians, folder / "gaussians.ply", instances)
     return {"file": "gaussians.ply", "count": len(gaussians)}
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.types import ObjectAsset
@@ -20,18 +21,12 @@ def dbscan(points: np.ndarray, radius: float, min_points: int) -> np.ndarray:
         return labels
     neighbors = cKDTree(points).query_ball_point(points, radius)
     core = np.array([len(found) >= min_points for found in neighbors])
-    count = 0
-    for seed in range(n):
-        if not core[seed] or labels[seed] >= 0:
-            continue
-        stack = [seed]
-        labels[seed] = count
-        while stack:
-            for other in neighbors[stack.pop()]:
-                if core[other] and labels[other] < 0:
-                    labels[other] = count
-                    stack.append(other)
-        count += 1
+    cores = np.flatnonzero(core)
+    if len(cores):
+        links = cKDTree(points[cores]).sparse_distance_matrix(
+            cKDTree(points[cores]), radius, output_type="coo_matrix"
+        )
+        labels[cores] = connected_components(links, directed=False)[1]
     for i in np.flatnonzero(~core):
         reachable = [j for j in neighbors[i] if core[j]]
         if reachable:

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from reconstruction.core.mesh_graph import MeshGraph, pieces
 
@@ -23,22 +25,11 @@ def horizontal_levels(graph: MeshGraph, chosen: np.ndarray, min_area_m2: float) 
 
 
 def joined_levels(levels: list[np.ndarray], of_one: Callable[[int, int], bool]) -> list[np.ndarray]:
-    """Union-find: merge levels i < j where `of_one(i, j)`, transitively; return the sorted vertices of each group."""
-    parent = list(range(len(levels)))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            i = parent[i]
-        return i
-
-    for i in range(len(levels)):
-        for j in range(i + 1, len(levels)):
-            if of_one(i, j):
-                parent[max(root(i), root(j))] = min(root(i), root(j))
-    groups: dict[int, list[np.ndarray]] = {}
-    for i, piece in enumerate(levels):
-        groups.setdefault(root(i), []).append(piece)
-    return [np.sort(np.concatenate(group)) for group in groups.values()]
+    """Merge levels i < j where `of_one(i, j)`, transitively; return the sorted vertices of each group."""
+    count = len(levels)
+    joined = [[i < j and of_one(i, j) for j in range(count)] for i in range(count)]
+    groups, group = connected_components(csr_array(np.reshape(joined, (count, count))), directed=False)
+    return [np.sort(np.concatenate([levels[i] for i in np.flatnonzero(group == g)])) for g in range(groups)]
 
 
 def _split_by_height(graph: MeshGraph, piece: np.ndarray) -> list[np.ndarray]:

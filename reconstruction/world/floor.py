@@ -89,9 +89,8 @@ def _settle(samples: SurfaceSamples, level: np.ndarray, height: float, band: flo
     for _ in range(5):
         off = samples.points[level, 2] - height
         near = np.abs(off) < 2 * band
-        order = np.argsort(off[near])
-        total = np.cumsum(samples.weights[level][near][order] / samples.depths[level][near][order] ** 2)
-        height += float(off[near][order][np.searchsorted(total, 0.5 * total[-1])])
+        weights = samples.weights[level][near] / samples.depths[level][near] ** 2
+        height += float(np.quantile(off[near], 0.5, weights=weights, method="inverted_cdf"))
     return height
 
 

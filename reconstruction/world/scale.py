@@ -90,8 +90,7 @@ def _by_marker(posed: PosedFrames, config: WorldConfig, progress: Progress) -> M
         return None
     weights = np.array([1 / s.relative_sigma**2 for s in sides])
     logs = np.log([s.side for s in sides])
-    order = np.argsort(logs)
-    centre = logs[order][np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]  # weighted median
+    centre = np.quantile(logs, 0.5, weights=weights, method="inverted_cdf")
     agree = np.abs(logs - centre) < 0.05
     if not agree.all():
         others = ", ".join(str(s.id) for s, good in zip(sides, agree) if not good)

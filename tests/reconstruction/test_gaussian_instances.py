@@ -5,8 +5,7 @@ import pytest
 
 from reconstruction.gaussians import read_ply, write_ply
 from reconstruction.gaussians.model import from_packed
-from reconstruction.instances.gaussian_ids import add_instances_to_ply, gaussian_instances
-from registry.errors import BundleError
+from reconstruction.instances.gaussian_ids import gaussian_instances
 
 
 def some_gaussians(count: int = 50):
@@ -28,10 +27,9 @@ def test_nearest_labeled_surface():
 def test_ids_in_the_file_and_everything_else_as_before(tmp_path):
     path, plain = tmp_path / "a.ply", tmp_path / "b.ply"
     gaussians = some_gaussians()
-    write_ply(gaussians, path)
-    write_ply(gaussians, plain)
     ids = np.arange(50, dtype=np.int32) * 1000
-    add_instances_to_ply(path, ids)
+    write_ply(gaussians, path, ids)
+    write_ply(gaussians, plain)
     one, two = read_ply(path), read_ply(plain)
     np.testing.assert_array_equal(one.means, two.means)
     np.testing.assert_array_equal(one.colors, two.colors)
@@ -43,7 +41,5 @@ def test_ids_in_the_file_and_everything_else_as_before(tmp_path):
 
 
 def test_wrong_number_of_ids(tmp_path):
-    path = tmp_path / "a.ply"
-    write_ply(some_gaussians(), path)
-    with pytest.raises(BundleError, match="expected 49 Gaussians"):
-        add_instances_to_ply(path, np.zeros(49, np.int32))
+    with pytest.raises(ValueError, match="50"):
+        write_ply(some_gaussians(), tmp_path / "a.ply", np.zeros(49, np.int32))

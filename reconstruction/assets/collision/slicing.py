@@ -95,8 +95,7 @@ def _plateaus(height: np.ndarray, area: np.ndarray, wanted: float, side: float) 
             break
         if not taken[k]:
             near = slice(first[k], until[k])
-            share = np.cumsum(area[near]) / area[near].sum()
-            outer = height[near][np.searchsorted(share, _OUTER_SHARE)]
+            outer = np.quantile(height[near], _OUTER_SHARE, weights=area[near], method="inverted_cdf")
             found.append((float(covered[k]), float(side * (outer + _OFF_M))))
             taken |= np.abs(height - height[k]) <= 2 * _NOISE_M
     return found
