@@ -5,17 +5,16 @@ lower left here, at the upper left in glTF.
 """
 
 import io
-import json
-import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from reconstruction.core.types import ConvexPart, TexturedMesh
 from registry.errors import BundleError
 from registry.geometry import GLTF_FROM_WORLD, WORLD_FROM_GLTF
+from registry.glb import write_glb_chunks
 
-_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT, _ARRAY, _ELEMENTS = 5126, 5125, 34962, 34963
 _CLAMP = 33071
 
@@ -77,13 +76,7 @@ def write_glb(mesh: TexturedMesh, path: Path) -> None:
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
     }  # fmt: skip
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    body = binary.getvalue()
-    with Path(path).open("wb") as file:
-        file.write(struct.pack("<3I", _MAGIC, 2, 12 + 8 + len(text) + 8 + len(body)))
-        file.write(struct.pack("<2I", len(text), _JSON) + text)
-        file.write(struct.pack("<2I", len(body), _BIN) + body)
+    write_glb_chunks(path, document, binary.getvalue())
 
 
 def read_glb(path: Path) -> TexturedMesh:
@@ -92,48 +85,21 @@ def read_glb(path: Path) -> TexturedMesh:
     Raises:
         BundleError: the file is no such .glb.
     """
-    import cv2
+    import trimesh
 
     try:
-        raw = Path(path).read_bytes()
-        magic, version, _, length, kind = struct.unpack("<5I", raw[:20])
-        if magic != _MAGIC or version != 2 or kind != _JSON:
-            raise ValueError("not a binary glTF 2.0 file")
-        document = json.loads(raw[20 : 20 + length])
-        body = raw[28 + length :]
-        primitive = document["meshes"][0]["primitives"][0]
-        vertices = _accessor(document, body, primitive["attributes"]["POSITION"])
-        uvs = _accessor(document, body, primitive["attributes"]["TEXCOORD_0"]).copy()
-        faces = _accessor(document, body, primitive["indices"]).reshape(-1, 3)
-        view = document["bufferViews"][document["images"][0]["bufferView"]]
-        start = view.get("byteOffset", 0)
-        image = cv2.imdecode(
-            np.frombuffer(body[start : start + view["byteLength"]], np.uint8), cv2.IMREAD_COLOR
-        )
-        if image is None:
-            raise ValueError("its texture cannot be decoded")
-    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        uvs, texture = loaded.visual.uv, loaded.visual.material.baseColorTexture.convert("RGB")
+    except Exception as error:  # trimesh raises whatever its readers raise
         raise BundleError(
             f"{path}: cannot read it as a textured .glb ({error}). Write it with write_glb."
         ) from error
-    uvs[:, 1] = 1.0 - uvs[:, 1]
     return TexturedMesh(
-        np.ascontiguousarray(vertices @ WORLD_FROM_GLTF[:3, :3].T, np.float32),
-        faces.astype(np.int32),
-        uvs.astype(np.float32),
-        np.ascontiguousarray(image[..., ::-1]),
+        np.ascontiguousarray(loaded.vertices @ WORLD_FROM_GLTF[:3, :3].T, np.float32),
+        np.asarray(loaded.faces, np.int32),
+        np.asarray(uvs, np.float32),
+        np.asarray(texture),
     )
-
-
-def _accessor(document: dict, body: bytes, number: int) -> np.ndarray:
-    """Return the array (n,) or (n, width) of a glTF accessor."""
-    item = document["accessors"][number]
-    view = document["bufferViews"][item["bufferView"]]
-    kinds = {5121: np.uint8, 5123: np.uint16, _UINT: np.uint32, _FLOAT: np.float32}
-    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[item["type"]]
-    start = view.get("byteOffset", 0) + item.get("byteOffset", 0)
-    out = np.frombuffer(body, kinds[item["componentType"]], item["count"] * width, start)
-    return out if width == 1 else out.reshape(-1, width)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 45.0) -> np.ndarray:

@@ -1,14 +1,12 @@
 """Merge the `.glb` files of a scene into one `scene.glb`: one named node per body, its properties in `extras`."""
 
-import json
-import struct
 from pathlib import Path
 
 from reconstruction.exports.scene import ExportBody, ExportScene
 from registry.errors import BundleError
 from registry.geometry import GLTF_FROM_WORLD, WORLD_FROM_GLTF, quat_from_matrix
+from registry.glb import read_glb_json, write_glb_chunks
 
-_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 # Top-level arrays of a glTF document that are concatenated, in the order of the file.
 _LISTS = ("nodes", "meshes", "materials", "textures", "images", "samplers", "accessors", "bufferViews")
 
@@ -30,12 +28,7 @@ def write_glb_scene(scene: ExportScene, folder: Path) -> list[str]:
         _append(document, binary, body)
     document["buffers"] = [{"byteLength": len(binary)}]
     document = {key: value for key, value in document.items() if value != []}
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    with (folder / "scene.glb").open("wb") as file:
-        file.write(struct.pack("<3I", _MAGIC, 2, 12 + 8 + len(text) + 8 + len(binary)))
-        file.write(struct.pack("<2I", len(text), _JSON) + text)
-        file.write(struct.pack("<2I", len(binary), _BIN) + binary)
+    write_glb_chunks(folder / "scene.glb", document, binary)
     return ["scene.glb"]
 
 
@@ -120,20 +113,16 @@ def _textures_shifted(material: dict, shift: int) -> dict:
 
 def _read(path: Path) -> tuple[dict, bytes]:
     """Read the JSON and binary chunks of a `.glb`; reject what cannot be merged by shifting indices."""
+    document, start = read_glb_json(path, str(path))
     try:
-        raw = path.read_bytes()
-        magic, _, _, length, kind = struct.unpack("<5I", raw[:20])
-        if magic != _MAGIC or kind != _JSON:
-            raise ValueError("not a binary glTF 2.0 file")
-        document = json.loads(raw[20 : 20 + length])
         if document.get("extensionsUsed") or any("sparse" in a for a in document.get("accessors", [])):
             raise ValueError("it uses glTF extensions or sparse accessors")
         if not document["meshes"] or not document["scenes"][document.get("scene", 0)]["nodes"]:
             raise ValueError("it has no mesh or no root node")
         size = document["buffers"][0]["byteLength"]
-        data = raw[28 + length : 28 + length + size]
+        data = path.read_bytes()[start : start + size]
         if len(document["buffers"]) != 1 or len(data) != size:
             raise ValueError("its buffer is external or truncated")
-    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
+    except (ValueError, KeyError, IndexError) as error:
         raise BundleError(f"{path}: cannot be merged into scene.glb ({error})") from error
     return document, data
