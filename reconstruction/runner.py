@@ -96,7 +96,7 @@ class Run:
 
     def lens(self) -> Lens:
         """Return the map from pixels of the video to pixels of the undistorted frames."""
-        return Lens.measure(self.results["frames"], self.results["poses"])
+        return Lens.of(self.results["poses"])
 
     def pointer(self, found: InstanceSet) -> Pointer:
         """Return the lookup of things and places that overrides refer to."""

@@ -133,6 +133,20 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class DistortedCamera:
+    """A camera with lens distortion, in COLMAP's terms; pixels as in `Camera`."""
+
+    model: str  # COLMAP's name: "SIMPLE_RADIAL", "RADIAL", "OPENCV", …
+    width: int
+    height: int
+    params: np.ndarray  # float64 (k,) focal lengths, principal point and distortion, in the model's order
+
+    def __post_init__(self) -> None:
+        """Check dtypes and shapes."""
+        check_arrays(self, params="float64 k")
+
+
+@dataclass(frozen=True)
 class PosedFrames:
     """Stage 2: undistorted frames with cameras and sparse points, in `sfm` space; `WorldFrame.apply_to` moves them."""
 
@@ -157,6 +171,9 @@ class PosedFrames:
     ordered: bool  # rows are in time order
     reprojection_error_px: float  # mean
     metric: bool = False  # `sfm` is in metres: poses were imported from a metric tracker (ARKit)
+    distorted: DistortedCamera | None = (
+        None  # of the frames as recorded, at this size; None: `camera` is theirs
+    )
 
     def __post_init__(self) -> None:
         """Check dtypes and shapes."""

@@ -67,9 +67,9 @@ class Footage:
         x, y = address.pixel
         if not (0 <= x <= width and 0 <= y <= height):
             raise UsageError(f"overrides: {address} lies outside the frame of {width} x {height} pixels")
-        working = np.array([[x / width * self.lens.width, y / height * self.lens.height]])
-        camera = self.depth.camera
-        scale = np.array([camera.width / self.lens.width, camera.height / self.lens.height])
+        filmed, camera = self.lens.camera, self.depth.camera
+        working = np.array([[x / width * filmed.width, y / height * filmed.height]])
+        scale = np.array([camera.width / filmed.width, camera.height / filmed.height])
         pixel = self.lens.straightened(working)[0] * scale
         if not ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all():
             raise UsageError(f"overrides: {address} lies in the margin that lens undistortion cuts off")

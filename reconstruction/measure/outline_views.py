@@ -92,10 +92,10 @@ def _faces_seen(
     """
     width, height = size
     camera = camera.resized(width, height)
-    if lens is None or lens.model is None:
+    if lens is None or lens.distorted is None:
         return rasterize_mesh(vertices, faces, camera, pose).face
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
-    scale = np.array([lens.width / width, lens.height / height])
+    scale = np.array([lens.camera.width / width, lens.camera.height / height])
     source = lens.straightened(grid * scale) / scale
     # The video frame can exceed the undistorted one, which is rendered with a margin as wide as needed.
     over = np.maximum(-source, source - np.array(size)).max(axis=0)

@@ -1,4 +1,4 @@
-"""Score a scene against a file of outlines: reads the labels, estimates the lens distortion, compares."""
+"""Score a scene against a file of outlines: reads the labels and the lens distortion, compares."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ def measure_outlines(
         bundle: the scene.
         meshes: all of its meshes, base included, in its world.
         labels: a file or folder for `load_outlines`.
-        stages: gives the frames to estimate the lens from; without them no distortion is assumed.
+        stages: gives the lens distortion; without the poses none is assumed.
         video: the scene's video or folder of images, if the stage results are missing.
 
     Raises:
@@ -40,8 +40,8 @@ def measure_outlines(
 def _lens(stages: StageResults) -> "Lens | None":
     from reconstruction.poses.lens import Lens
 
-    frames, posed = stages.get("frames"), stages.get("poses")
-    return None if frames is None or posed is None else Lens.measure(frames, posed)
+    posed = stages.get("poses")
+    return None if posed is None else Lens.of(posed)
 
 
 def _picture_names(bundle: SceneBundle, stages: StageResults, video: Path | None) -> list[str] | None:

@@ -188,8 +188,8 @@ def _package(
     errors = np.array([model.point3D(i).error for i in point_ids], np.float32)
     colors = _point_colors(model, point_ids, frames.images)
     held_rows = [row for row, _ in held_out]
-    distorted = [frames.images[registered], frames.held_out_images[held_rows]]
-    camera, (images, held_out_images) = undistort(model.cameras[min(model.cameras)], distorted)
+    recorded = [frames.images[registered], frames.held_out_images[held_rows]]
+    camera, (images, held_out_images), distorted = undistort(model.cameras[min(model.cameras)], recorded)
     return PosedFrames(
         source=frames.source,
         camera=camera,
@@ -209,6 +209,7 @@ def _package(
         chosen_frames=len(frames.images),
         ordered=frames.ordered,
         reprojection_error_px=float(model.compute_mean_reprojection_error()),
+        distorted=distorted,
     )
 
 

@@ -3,29 +3,35 @@
 import cv2
 import numpy as np
 
-from reconstruction.core.types import Camera
+from reconstruction.core.types import Camera, DistortedCamera
 from reconstruction.poses.colmap_types import ColmapCamera
 
 _NEGLIGIBLE_PX = 0.3  # displacement up to which images are left as they are, as resampling blurs
 
 
-def undistort(camera: ColmapCamera, image_sets: list[np.ndarray]) -> tuple[Camera, list[np.ndarray]]:
+def undistort(
+    camera: ColmapCamera, image_sets: list[np.ndarray]
+) -> tuple[Camera, list[np.ndarray], DistortedCamera | None]:
     """Return a pinhole camera of the same size whose view the images cover, and the images resampled to it.
 
     Args:
         camera: distorted camera of the images.
         image_sets: uint8 arrays (n, h, w, 3); returned as they are where the distortion is negligible.
+
+    Returns:
+        The pinhole camera, its images, and the distorted camera; None where the distortion is negligible.
     """
     width, height = camera.width, camera.height
     fx, fy = camera.focal_length_x, camera.focal_length_y
     pinhole = Camera(width, height, fx, fy, camera.principal_point_x, camera.principal_point_y)
     pixels = _pixel_grid(width, height)
     if np.abs(_source_pixels(camera, pinhole, pixels) - pixels).max() <= _NEGLIGIBLE_PX:
-        return pinhole, image_sets
+        return pinhole, image_sets, None
     pinhole = _covering_pinhole(camera)
     source = _source_pixels(camera, pinhole, pixels).reshape(height, width, 2).astype(np.float32)
     source -= np.float32(0.5)
-    return pinhole, [_resample(images, source) for images in image_sets]
+    distorted = DistortedCamera(camera.model_name, width, height, np.array(camera.params, np.float64))
+    return pinhole, [_resample(images, source) for images in image_sets], distorted
 
 
 def _resample(images: np.ndarray, source: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 from outline_drawing import FRAMES, draw, pieces, true_ids
 from truth_bundle import KINDS, Change, write_bundle
 
+from reconstruction.core.types import Camera, DistortedCamera
 from reconstruction.measure import LabelledFrame, Outline, load_outlines, score_outlines
 from reconstruction.measure.outline_labels import filled
 from reconstruction.measure.scene import placed_meshes
@@ -195,8 +196,9 @@ def test_the_lens_bends_the_scene_as_the_film(truth, room, tmp_path):
     """Outlines on a video with barrel distortion match the scene only with the lens."""
     width, height = truth.camera.width, truth.camera.height
     side = float(max(width, height))
-    center = [width / 2, height / 2]
-    lens = Lens(width, height, np.array([1.2 * side, 1.2 * side, *center, -0.45, 0.1, 0.001, -0.002]))
+    nominal = Camera(width, height, side, side, width / 2, height / 2)
+    params = np.array([1.2 * side, 1.2 * side, width / 2, height / 2, -0.45, 0.1, 0.001, -0.002])
+    lens = Lens(nominal, DistortedCamera("OPENCV", width, height, params))
     filmed = {index: lens.as_filmed(true_ids(truth, index)) for index in FRAMES}
     path = draw(truth, filmed).contract(tmp_path / "labels.json")
     bent, straight = scored(room, path, lens), scored(room, path)
@@ -211,8 +213,10 @@ def test_the_lens_bends_the_scene_as_the_film(truth, room, tmp_path):
 def test_a_film_that_shows_more_than_its_straightened_frames_is_drawn_to_its_borders(truth, room, tmp_path):
     """A lens that scales by 0.8 gives the image of a camera with 0.8 of the focal length."""
     width, height = truth.camera.width, truth.camera.height
-    zoom = 0.8 * max(width, height)
-    lens = Lens(width, height, np.array([zoom, zoom, width / 2, height / 2, 0, 0, 0, 0]))
+    side = float(max(width, height))
+    nominal = Camera(width, height, side, side, width / 2, height / 2)
+    params = np.array([0.8 * side, width / 2, height / 2])
+    lens = Lens(nominal, DistortedCamera("SIMPLE_PINHOLE", width, height, params))
     path = draw(truth).contract(tmp_path / "labels.json")
     through = scored(room, path, lens)
     wide = write_bundle(truth, tmp_path / "bundle")

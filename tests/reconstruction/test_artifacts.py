@@ -1,6 +1,7 @@
 """Artifacts survive a round trip bit for bit."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from reconstruction.core.types import (
     AssembledScene,
     Camera,
     DepthMaps,
+    DistortedCamera,
     Edge,
     PlacedObject,
+    PosedFrames,
     SceneGraph,
     SpaceGrid,
     Surface,
@@ -102,3 +105,13 @@ def test_what_another_version_wrote_is_refused_in_one_sentence(tmp_path):
     (tmp_path / "a" / "data.json").write_text(json.dumps(data))
     with pytest.raises(BundleError, match="PlacedObject is of another version"):
         artifacts.load(AssembledScene, tmp_path / "a")
+
+
+def test_posed_frames_keep_the_camera_of_the_recording(small_capture, tmp_path):
+    recording = DistortedCamera("RADIAL", 320, 240, np.array([300.0, 160.5, 119.5, -0.1, 0.02]))
+    for name, distorted in (("with", recording), ("without", None)):
+        artifacts.save(replace(small_capture.posed, distorted=distorted), tmp_path / name)
+    again = artifacts.load(PosedFrames, tmp_path / "with").distorted
+    assert (again.model, again.width, again.height) == ("RADIAL", 320, 240)
+    assert np.array_equal(again.params, recording.params)
+    assert artifacts.load(PosedFrames, tmp_path / "without").distorted is None

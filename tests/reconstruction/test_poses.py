@@ -9,6 +9,7 @@ import pytest
 
 from reconstruction.core.types import FrameSet, PosedFrames
 from reconstruction.poses import POSES_PRESETS, PosesConfig, estimate_poses
+from reconstruction.poses.lens import Lens
 from reconstruction.poses.undistort import undistort
 from registry.errors import InputError
 from registry.geometry import split_similarity, umeyama
@@ -159,6 +160,12 @@ def test_distorted_lens_is_straightened(frames, small_capture, tmp_path):
     assert len(posed.images) >= 11
     assert np.sqrt((errors**2).mean()) < 0.008
     assert not np.array_equal(posed.images[5], images[list(frames.indices).index(posed.indices[5])])
+    pixels = np.stack(np.meshgrid(np.linspace(10, 310, 16), np.linspace(10, 230, 12)), -1).reshape(-1, 2)
+    true_rays = np.column_stack([lens.cam_from_img(pixels), np.ones(len(pixels))])
+    wanted = np.stack(posed.camera.project(true_rays), axis=1)
+    error = np.linalg.norm(Lens.of(posed).straightened(pixels) - wanted, axis=1)
+    moved = np.linalg.norm(wanted - pixels, axis=1)
+    assert np.median(error) < 0.5 < np.median(moved)
 
 
 def distort(images: np.ndarray, lens) -> np.ndarray:
@@ -179,7 +186,7 @@ def test_undistorted_image_is_what_the_pinhole_camera_sees(k1):
     u, v = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
     # The picture shows where each of its own pixels lies, so the result tells where it was sampled.
     image = np.stack([u / 320 * 255, v / 240 * 255, 0 * u], -1).round().astype(np.uint8)
-    camera, (out,) = undistort(lens, [image[None]])
+    camera, (out,), _ = undistort(lens, [image[None]])
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
     expected = np.asarray(lens.img_from_cam(rays.reshape(-1, 3))).reshape(240, 320, 2)
     assert (expected > 0).all()
@@ -191,8 +198,9 @@ def test_undistorted_image_is_what_the_pinhole_camera_sees(k1):
 
 def test_images_without_distortion_are_not_resampled(frames):
     lens = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 266.0, 320, 240)
-    camera, (out,) = undistort(lens, [frames.images])
+    camera, (out,), distorted = undistort(lens, [frames.images])
     assert out is frames.images
+    assert distorted is None
     assert camera.fx == 266.0
 
 

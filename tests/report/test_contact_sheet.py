@@ -51,7 +51,7 @@ def pointer_into(stages) -> Pointer:
     """Return the lookup of anchors after a run."""
     posed, depth = stages.in_world()
     surface = stages.get("surface")
-    lens = Lens.measure(stages.get("frames"), stages.get("poses"))
+    lens = Lens.of(stages.get("poses"))
     return Pointer(stages.get("instances"), surface, Footage(posed, depth, surface, lens))
 
 
