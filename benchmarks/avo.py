@@ -52,9 +52,9 @@ def measure_capture(
     Returns:
         `objects`: a record each; `pictures`: RGB rows for the page.
     """
+    from benchmarks.true_views import TrueViews
     from reconstruction.measure.alignment import align
     from reconstruction.measure.ground_truth import GroundTruth
-    from reconstruction.measure.viewpoints import TrueViews
     from reconstruction.views import AvoConfig, find_views, make_target, prepare_scene
 
     run = stage_run(capture.source, work_of(out, capture), variant.arguments_for(capture))

@@ -50,13 +50,13 @@ def measure_capture(capture: Capture, out: Path, least_hidden: float, pictures: 
         least_hidden: only objects of which other things hide at least this share of the outline.
         pictures: how many objects are drawn.
     """
+    from benchmarks.true_views import TrueViews
     from reconstruction.assets.build import gather_evidence, object_shape
     from reconstruction.assets.config import ASSETS_PRESETS
     from reconstruction.assets.generation.load import RECORDS_VARIABLE
     from reconstruction.core.progress import NO_PROGRESS
     from reconstruction.measure.alignment import align
     from reconstruction.measure.ground_truth import GroundTruth
-    from reconstruction.measure.viewpoints import TrueViews
     from reconstruction.views import AvoConfig, make_views
 
     (variant,) = choose_variants(["oracle-instances"], [])

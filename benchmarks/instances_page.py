@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.breakdown import Share, breakdown
 from benchmarks.machine import machine_line
 from benchmarks.scaling import line_fit
 from benchmarks.table import table_lines
-from reconstruction.measure.breakdown import Share, breakdown
 
 GROWTH_FILE = "instances_growth.json"
 _BREAKDOWNS = {

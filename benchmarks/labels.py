@@ -11,10 +11,10 @@ from collections import Counter
 
 import numpy as np
 
+from benchmarks.label_calibration import UNKNOWN, Guess, overconfidence, reliability
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.core.types import DepthMaps, InstanceSet, PosedFrames, VideoSource
 from reconstruction.instances import InstancesConfig, find_instances
-from reconstruction.measure.labels import UNKNOWN, Guess, overconfidence, reliability
 from reconstruction.surface import SurfaceConfig, fuse_surface
 from synthetic.benchmark_capture import CaptureSpec, stage
 from synthetic.film import film_room, render_truth

@@ -60,6 +60,27 @@ def _falloff(rho):  # pragma: no cover - compiled
     return e * e
 
 
+@numba.njit(cache=True, inline="always", fastmath=_FAST)
+def splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx):  # pragma: no cover - compiled
+    """Return W, 1 / W, u, v, whether the disk determines rho (else the screen-space filter), and rho, at a pixel."""
+    w = w_row + wx * dx
+    inverse_w = _ONE / w
+    u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
+    rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+    on_disk = (w > dx - dx) & (rho3 <= rho2)
+    return w, inverse_w, u, v, on_disk, rho3 if on_disk else rho2
+
+
+@numba.njit(cache=True, inline="always")
+def tile_pixels(tile, tiles_x, image):  # pragma: no cover - compiled
+    """Return the bounds x0, y0, x1, y1 of a tile in the image, and the coordinates (16,) of its columns and rows."""
+    x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    xs, ys = np.empty(TILE, image.dtype), np.empty(TILE, image.dtype)
+    for j in range(TILE):
+        xs[j], ys[j] = x0 + j, y0 + j
+    return x0, y0, min(x0 + TILE, image.shape[1]), min(y0 + TILE, image.shape[0]), xs, ys
+
+
 @numba.njit(cache=True, nogil=True)
 def blend(
     start, stop, splats, boxes, tile_start, entries, tile_order, tiles_x, scalars, weights, features, contributions
@@ -82,18 +103,13 @@ def _blend_tile(
     tile, splats, boxes, tile_start, entries, tiles_x, scalars, weights, features, contributions
 ):  # pragma: no cover - compiled
     """Blend one tile; the inner loop runs over a row of 16 pixels without branches, so that it is vectorized."""
-    height, width = features.shape[0], features.shape[1]
     alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
     zero = alpha_max - alpha_max
     with_weights = weights.shape[0] > 0
-    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, features)
     image = np.zeros((N_FEATURES, TILE, TILE), features.dtype)
     light = np.ones((TILE, TILE), features.dtype)
-    xs, ys = np.empty(TILE, features.dtype), np.empty(TILE, features.dtype)
     factors = np.zeros((TILE, TILE), features.dtype)
-    for j in range(TILE):
-        xs[j], ys[j] = tx + j, ty + j
     if with_weights:
         contributions[tile_start[tile] : tile_start[tile + 1]] = 0
         for y in range(ty, y_end):
@@ -117,12 +133,7 @@ def _blend_tile(
             for j in range(TILE):
                 t = light[i, j]
                 dx = xs[j] - xc
-                w = w_row + wx * dx
-                inverse_w = _ONE / w
-                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
-                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
-                on_disk = (w > zero) & (rho3 <= rho2)
-                rho = rho3 if on_disk else rho2
+                w, _, _, _, on_disk, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
                 w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
                 w = w if on_disk else w_flat
                 inverse_z, z = w * inverse_zc, zc / w
@@ -182,19 +193,14 @@ def _blend_tile_backward(
     tile, splats, boxes, tile_start, entries, tiles_x, scalars, features, image_gradients, error, entry_gradients
 ):  # fmt: skip  # pragma: no cover - compiled
     """Differentiate one tile. One function despite its length: it recomputes the forward values that it needs."""
-    height, width = features.shape[0], features.shape[1]
     alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
     zero = alpha_max - alpha_max
-    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, features)
     light = np.ones((TILE, TILE), features.dtype)
     # Planes: gradients 0..8, error 9, sum over splats not passed yet 10, opacity 11, moments 12 and 13, first inverse
     # depth 14.
     given = np.zeros((15, TILE, TILE), features.dtype)
     lanes = np.empty((N_SPLAT_GRADIENTS, TILE), features.dtype)
-    xs, ys = np.empty(TILE, features.dtype), np.empty(TILE, features.dtype)
-    for j in range(TILE):
-        xs[j], ys[j] = tx + j, ty + j
     for y in range(ty, y_end):
         for x in range(tx, x_end):
             f, g, i, j = features[y, x], image_gradients[y, x], y - ty, x - tx
@@ -227,12 +233,7 @@ def _blend_tile_backward(
             for j in range(TILE):
                 t = light[i, j]
                 dx = xs[j] - xc
-                w = w_row + wx * dx
-                inverse_w = _ONE / w
-                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
-                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
-                on_disk = (w > zero) & (rho3 <= rho2)
-                rho = rho3 if on_disk else rho2
+                w, inverse_w, u, v, on_disk, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
                 w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
                 moves = on_disk | (w == w_flat)
                 w = w if on_disk else w_flat

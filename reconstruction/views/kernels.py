@@ -13,13 +13,22 @@ import math
 import numba
 import numpy as np
 
-from reconstruction.gaussians.blend_kernels import _FAST, _FLAT_HIGH, _FLAT_LOW, _HALF, _ONE, _TWO, _falloff
+from reconstruction.gaussians.blend_kernels import (
+    _FAST,
+    _FLAT_HIGH,
+    _FLAT_LOW,
+    _HALF,
+    _ONE,
+    _TWO,
+    _falloff,
+    splat_at,
+    tile_pixels,
+)
 from reconstruction.gaussians.kernels import (
     AX,
     AY,
     BX,
     BY,
-    N_SPLAT_GRADIENTS,
     OPACITY,
     REACH2,
     TILE,
@@ -98,16 +107,11 @@ def _blend_tile(
     tile, splats, boxes, own, worth, tile_start, tile_end, entries, tiles_x, scalars, image, contributions
 ):  # fmt: skip  # pragma: no cover - compiled
     """Blend one tile; the inner loop has no branches, so that it is vectorized."""
-    height, width = image.shape[0], image.shape[1]
     alpha_max, stop = scalars[0], scalars[1]
     zero = alpha_max - alpha_max
-    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, image)
     sums = np.zeros((N_PLANES, TILE, TILE), image.dtype)
     light = np.ones((TILE, TILE), image.dtype)
-    xs, ys = np.empty(TILE, image.dtype), np.empty(TILE, image.dtype)
-    for j in range(TILE):
-        xs[j], ys[j] = tx + j, ty + j
     row_sums = np.zeros(TILE, image.dtype)
     contributions[tile_start[tile] : tile_start[tile + 1]] = 0
     for e in range(tile_start[tile], tile_end[tile]):
@@ -127,12 +131,7 @@ def _blend_tile(
             for j in range(TILE):
                 t = light[i, j]
                 dx = xs[j] - xc
-                w = w_row + wx * dx
-                inverse_w = _ONE / w
-                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
-                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
-                on_disk = (w > zero) & (rho3 <= rho2)
-                rho = rho3 if on_disk else rho2
+                w, _, _, _, _, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
                 w = min(max(w, _FLAT_LOW), _FLAT_HIGH)
                 alpha = min(opacity * (_falloff(rho) - edge), alpha_max)
                 alpha = alpha if (rho <= reach2) & (t >= stop) else zero
@@ -172,18 +171,13 @@ def _blend_tile_backward(
     image_gradients, entry_gradients,
 ):  # fmt: skip  # pragma: no cover - compiled
     """Differentiate one tile. One function despite its length: it recomputes the forward values that it needs."""
-    height, width = image.shape[0], image.shape[1]
     alpha_max, stop = scalars[0], scalars[1]
     zero = alpha_max - alpha_max
-    tx, ty = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    x_end, y_end = min(tx + TILE, width), min(ty + TILE, height)
+    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, image)
     light = np.ones((TILE, TILE), image.dtype)
     # Planes: image gradients, then the sum over splats not passed yet.
     given = np.zeros((N_PLANES + 1, TILE, TILE), image.dtype)
     lanes = np.empty((N_GRADIENTS, TILE), image.dtype)
-    xs, ys = np.empty(TILE, image.dtype), np.empty(TILE, image.dtype)
-    for j in range(TILE):
-        xs[j], ys[j] = tx + j, ty + j
     for y in range(ty, y_end):
         for x in range(tx, x_end):
             for c in range(N_PLANES):
@@ -210,12 +204,7 @@ def _blend_tile_backward(
             for j in range(TILE):
                 t = light[i, j]
                 dx = xs[j] - xc
-                w = w_row + wx * dx
-                inverse_w = _ONE / w
-                u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
-                rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
-                on_disk = (w > zero) & (rho3 <= rho2)
-                rho = rho3 if on_disk else rho2
+                w, inverse_w, u, v, on_disk, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
                 w_near = min(max(w, _FLAT_LOW), _FLAT_HIGH)
                 inverse_near = _ONE / w_near
                 z = zc * inverse_near
@@ -254,14 +243,3 @@ def _blend_tile_backward(
             for j in range(TILE):
                 total += lanes[c, j]
             entry_gradients[e, c] = total
-
-
-@numba.njit(cache=True, nogil=True)
-def sum_entries(start, stop, entry_gradients, first, positions, rows, out):  # pragma: no cover - compiled
-    """Sum the entries of each splat start..stop, in order, into out (n, 18) at the Gaussians' rows."""
-    for r in range(start, stop):
-        for c in range(N_SPLAT_GRADIENTS):
-            out[rows[r], c] = 0
-        for i in range(first[r], first[r + 1]):
-            for c in range(N_GRADIENTS):
-                out[rows[r], c] += entry_gradients[positions[i], c]

@@ -188,7 +188,7 @@ class Objective:
         )  # fmt: skip
         splat_gradients = np.zeros((n, shared.N_SPLAT_GRADIENTS), dtype)
         run_over(
-            len(rows), kernels.sum_entries, entry_gradients, blended.bins[2], blended.bins[3], rows, splat_gradients
+            len(rows), shared.reduce_entries, entry_gradients, blended.bins[2], blended.bins[3], rows, splat_gradients
         )  # fmt: skip
         # Splats wholly behind the target have no gradient.
         relevant = np.flatnonzero(splat_gradients[rows].any(axis=1))

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from surfaces import Patchwork, merged, sheet, solid_box, surface_from
 
+from benchmarks.label_calibration import Guess, overconfidence, reliability
 from benchmarks.labels import compared, table
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.instances import InstancesConfig, find_instances
 from reconstruction.instances.boxes import upright_box
 from reconstruction.instances.labels import ShapeFacts, coarse_label, shape_facts
-from reconstruction.measure.labels import Guess, overconfidence, reliability
 from reconstruction.surface import SurfaceConfig, fuse_surface
 
 pytestmark = pytest.mark.stage

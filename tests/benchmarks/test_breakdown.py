@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.measure.breakdown import SIZE_EDGES_CM, breakdown, wilson
+from benchmarks.breakdown import SIZE_EDGES_CM, breakdown, wilson
 from reconstruction.measure.ground_truth import GroundTruth
 from reconstruction.measure.object_boxes import instance_boxes, match_boxes, object_records
 from reconstruction.measure.object_facts import longest_side, object_facts

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.true_views import TrueViews, winding_number
 from reconstruction.core.types import Camera
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
-from reconstruction.measure.viewpoints import TrueViews, winding_number
 from reconstruction.views.cameras import look_at
 
 CAMERA = Camera(320, 240, 280.0, 280.0, 160.0, 120.0)
