@@ -1,7 +1,7 @@
 """The four lanes of the tests, a filmed room with known truth, and the shipped video.
 
-A test's lane is a marker. Tests in `simrecon_envs/` are `env`, all others without a marker `unit`; of two markers
-`end_to_end` counts. A unit test has ten seconds and starts no process.
+A test's lane is a marker. Without a marker, tests in `simrecon_envs/` are `env`, tests of the filmed room `stage`, and
+all others `unit`; of two markers `end_to_end` counts. A unit test has twenty seconds and starts no process.
 """
 
 import subprocess
@@ -28,9 +28,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         lane = next((lane for lane in LANES if item.get_closest_marker(lane)), None)
         if lane is None:
             lane = "env" if "simrecon_envs" in item.path.parts else "unit"
+            if "small_capture" in getattr(item, "fixturenames", ()):
+                lane = "stage"
             item.add_marker(lane)
         if lane == "unit" and not item.get_closest_marker("timeout"):
-            item.add_marker(pytest.mark.timeout(10))
+            item.add_marker(pytest.mark.timeout(20, func_only=True))
         rank[item.path] = min(LANES.index(lane), rank.get(item.path, len(LANES)))
     items.sort(key=lambda item: rank[item.path])
 

@@ -126,6 +126,7 @@ def test_the_mean_of_rings_is_weighted_by_their_pixels():
     assert report_lines(rows)[-2] == "| dorm | 10.0 | – |"
 
 
+@pytest.mark.stage  # runs a command
 def test_a_capture_that_is_not_there_is_named(capsys):
     assert main(["cellar"]) == 2
     assert "cellar: no such folder" in capsys.readouterr().err

@@ -138,6 +138,7 @@ def test_captures_without_entities_are_refused(tmp_path, capsys):
     assert "scene.json" in capsys.readouterr().err
 
 
+@pytest.mark.stage  # runs a command
 def test_what_would_be_done_is_said_and_not_done(tmp_path, capsys):
     (tmp_path / "room" / "ground_truth").mkdir(parents=True)
     (tmp_path / "room" / "video.mp4").write_bytes(b"x")

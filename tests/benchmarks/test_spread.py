@@ -89,6 +89,7 @@ def test_least_and_greatest_are_kept_in_a_file(tmp_path):
     assert (cd["mean"], cd["min"], cd["max"], cd["runs"]) == (3.0, 2.0, 4.0, 2)
 
 
+@pytest.mark.stage  # runs a command
 def test_what_would_be_run_is_said(tmp_path, capsys):
     (tmp_path / "captures" / "room").mkdir(parents=True)
     (tmp_path / "captures" / "room" / "video.mp4").write_bytes(b"a film")
