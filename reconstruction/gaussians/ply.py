@@ -7,11 +7,12 @@ smallest scale becomes the normal, and higher spherical harmonics are dropped.
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from reconstruction.gaussians.model import Gaussians, from_packed
 from registry.errors import BundleError
 from registry.geometry import matrix_from_quat, quat_from_matrix
+from registry.plyfiles import read_vertices
 
 _THICKNESS = 1e-3  # third scale relative to the smaller of the others
 _REQUIRED = (
@@ -54,12 +55,8 @@ def read_ply(path: Path) -> Gaussians:
     Raises:
         BundleError: it is not a PLY of Gaussians, or it is truncated.
     """
-    try:
-        columns = PlyData.read(path)["vertex"].data
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise BundleError(f"{path}: not a PLY of vertices, or damaged ({error})") from error
-    names = columns.dtype.names or ()
-    missing = [name for name in _REQUIRED if name not in names]
+    columns = read_vertices(path)
+    missing = [name for name in _REQUIRED if name not in columns]
     if missing:
         raise BundleError(f"{path}: not a 3DGS file: it has no property {', '.join(missing)}")
 
@@ -67,7 +64,7 @@ def read_ply(path: Path) -> Gaussians:
         return np.stack([np.asarray(columns[name], np.float64) for name in wanted], axis=1)
 
     quaternions, scales = take("rot_0", "rot_1", "rot_2", "rot_3"), take("scale_0", "scale_1")
-    if "scale_2" in names and len(columns):
+    if "scale_2" in columns and len(quaternions):
         quaternions, scales = _normal_last(quaternions, take("scale_0", "scale_1", "scale_2"))
     colors = take("f_dc_0", "f_dc_1", "f_dc_2")
     parts = [take("x", "y", "z"), quaternions, scales[:, :2], take("opacity"), colors]
