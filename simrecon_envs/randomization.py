@@ -113,6 +113,8 @@ class Randomizer:
             robot = env.robot_points if env.placement is None else env.placement.to_world(env.robot_points)
             # The hand moves by about the arm's length times the change of a joint.
             self._groups = group_things(env.facts, robot, config.joints_rad * _ARM_M)
+        self.layer: Any = None
+        """The `SplatLayer` of an environment that draws Gaussians: it takes the light and the tints of the scene."""
         self._home: dict[Hashable, Any] = {}  # nominal lights, colors and camera poses
         self._nominal: dict[
             tuple[int, int], tuple[float, np.ndarray, list[float]]
@@ -253,9 +255,17 @@ class Randomizer:
             one = rng.rngs[number]
             if self.config.lights:
                 _draw_lights(env.scene.sub_scenes[number], one, self.config.lights, self._home, number)
+                if self.layer is not None:
+                    now, nominal = env.scene.sub_scenes[number].ambient_light, self._home["lights", number][0]
+                    self.layer.gain = (np.array(now)[:3] / nominal).astype(np.float32) ** np.float32(1 / 2.2)
             if self.config.textures:
                 for placed in {id(p.actor): p for p in env.builder.objects.values()}.values():
-                    _draw_tint(placed.actor._objs[number], one, self.config.textures, self._home)
+                    entity = placed.actor._objs[number]
+                    if self.layer is not None:
+                        variant = int(one.randint(_TINTS))
+                        self.layer.tint(entity, _tint(entity, 0, 0, variant, self.config.textures))
+                    else:
+                        _draw_tint(entity, one, self.config.textures, self._home)
         if (self.config.camera_m or self.config.camera_rad) and not env.gpu_sim_enabled:
             for name, sensor in env._sensors.items():
                 if sensor.entity is None:
@@ -316,8 +326,7 @@ def _draw_tint(entity: Any, rng: np.random.RandomState, most: float, home: dict[
             if key not in home:
                 home[key] = (np.array(part.material.base_color), part.material.base_color_texture)
             color, texture = home[key]
-            seed = zlib.crc32(f"{entity.name} {place} {part_number} {variant}".encode())
-            tint = 1 + most * np.random.RandomState(seed).uniform(-1, 1, size=3)
+            tint = _tint(entity, place, part_number, variant, most)
             if texture is None:
                 part.material.base_color = [*np.clip(color[:3] * tint, 0, 1), color[3]]
                 continue
@@ -325,6 +334,12 @@ def _draw_tint(entity: Any, rng: np.random.RandomState, most: float, home: dict[
             if tinted not in home:
                 home[tinted] = _tinted(texture, tint)
             part.material.base_color_texture = home[tinted]
+
+
+def _tint(entity: Any, place: int, part_number: int, variant: int, most: float) -> np.ndarray:
+    """Return a variant's factor (3,) of the colors of a part of an entity."""
+    seed = zlib.crc32(f"{entity.name} {place} {part_number} {variant}".encode())
+    return 1 + most * np.random.RandomState(seed).uniform(-1, 1, size=3)
 
 
 def _tinted(texture: Any, tint: np.ndarray) -> Any:

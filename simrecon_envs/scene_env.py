@@ -17,6 +17,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
+from registry import EnvironmentMissing
 from simrecon_envs.arrays import Array, tensor, tensors
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
@@ -28,7 +29,7 @@ from simrecon_envs.planning import Plan, plan_task
 from simrecon_envs.randomization import Randomization, Randomizer
 from simrecon_envs.robots import rest_qpos, robot_shape, traits_of
 from simrecon_envs.scene_builder import SceneBuilder, scene_extent
-from simrecon_envs.scene_options import REWARD_MODES, check_options, load_bundle
+from simrecon_envs.scene_options import REWARD_MODES, check_options, check_renderer, load_bundle
 from simrecon_envs.stepping import DirectStep, check_action, flatten
 from simrecon_envs.tasks import PickTaskConfig, Task, kind_of
 from simrecon_envs.tasks.facts import scene_facts
@@ -95,13 +96,15 @@ class SceneEnv(BaseEnv):
         task_config: Thresholds of picking.
         obs_mode: As in ManiSkill; None for "state".
         render_mode: None, "rgb_array", "sensors", "all" or "human".
+        renderer: "mesh", or "splats" for pictures from the Gaussians of the video, with robot and added things before them
+            (`docs/splats.md`); one environment on the CPU.
         render_backend: "auto" renders only if a mode needs images; "gpu", "cpu" and "none" as in ManiSkill.
         **kwargs: Arguments of ManiSkill's `BaseEnv` (num_envs, control_mode, reward_mode, sim_backend,
             sensor_configs …).
 
     Raises:
         SceneNotFound: The registry has no such scene; lists the existing ones.
-        SceneAssetsMissing: The files of the scene are missing or damaged.
+        SceneAssetsMissing: The files of the scene are missing or damaged, or it has no Gaussians for `renderer="splats"`.
         UsageError: The robot, task, target or a mode is unknown; lists the known ones.
         EnvironmentMissing: Images are requested without a usable renderer, or several environments without CUDA.
     """
@@ -129,9 +132,11 @@ class SceneEnv(BaseEnv):
         obs_mode: str | None = None,
         render_mode: str | None = None,
         render_backend: str = "auto",
+        renderer: str = "mesh",
         **kwargs: Any,
     ) -> None:
         check_options(scene_id, robot_uids, obs_mode, kwargs)
+        check_renderer(renderer, obs_mode)
         self.bundle, self.revision_note = load_bundle(scene_id, revision, registry, strict_revision)
         self.scene_id = scene_id
         config = PickTaskConfig(**task_config) if isinstance(task_config, dict) else task_config
@@ -146,6 +151,12 @@ class SceneEnv(BaseEnv):
         self.observe_objects = observe_objects
         self.cameras = parse_cameras(cameras)
         self._set_task(plan_task(self.facts, task, target))
+        self.renderer = renderer
+        self._splats = None
+        if renderer == "splats":
+            from simrecon_envs.splats.scene import read_splats
+
+            self._splats = read_splats(self.bundle, self.builder.bodies)
         self._stepper: DirectStep | None = None
         self._info: dict[str, Array] = {}
         self.randomization = Randomization.parse(randomize)
@@ -209,6 +220,12 @@ class SceneEnv(BaseEnv):
             DirectDrive(self.agent)  # compile or load kernels here, not in the first step
 
     def _load_scene(self, options: dict) -> None:
+        if self._splats is not None and self.gpu_sim_enabled:
+            raise EnvironmentMissing(
+                f"scene {self.scene_id}: renderer='splats' draws one environment on the CPU, and {self.num_envs} are simulated "
+                f"on a GPU here; use simrecon_envs.make_vec({self.scene_id!r}, {self.num_envs}, renderer='splats'), or "
+                "renderer='mesh'"
+            )
         pedestal = None
         if self.placement is not None and self.placement.pedestal_m > 0.01:
             # 2 mm below the robot, so that the two do not touch.
@@ -227,6 +244,13 @@ class SceneEnv(BaseEnv):
         self.scene.set_ambient_light([0.6, 0.6, 0.6])
         self.scene.add_directional_light([0.4, 0.3, -1.0], [0.8, 0.8, 0.78], shadow=self.enable_shadow)
         self.scene.add_directional_light([-0.5, -0.6, -0.6], [0.3, 0.3, 0.33])
+
+    def _setup_sensors(self, options: dict) -> None:
+        super()._setup_sensors(options)
+        if self._splats is not None and self.scene.can_render():
+            from simrecon_envs.splats.cameras import attach  # Numba is imported, and kernels are compiled, only here
+
+            self._randomizer.layer = attach(self, self._splats)
 
     def _root_pose(self) -> sapien.Pose:
         assert self.placement is not None  # there is a robot

@@ -23,6 +23,7 @@ from simrecon_envs.robots import check_control_mode, check_robot
 OBS_MODES = (
     "state", "state_dict", "none", "rgb", "depth", "segmentation", "rgbd", "pointcloud", "sensor_data",
 )  # fmt: skip
+RENDERERS = ("mesh", "splats")
 REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
 
 
@@ -55,6 +56,19 @@ def check_options(scene_id: str, robot: Any, obs_mode: str | None, options: dict
             f"num_envs={count} is simulated on a GPU, and there is no CUDA here; "
             f"simrecon_envs.make_vec({scene_id!r}, {count}) starts one process per environment"
         )
+
+
+def check_renderer(renderer: str, obs_mode: str | None) -> None:
+    """Check `renderer` and whether it has the images of the observation mode.
+
+    Raises:
+        UsageError: The renderer is unknown, or has no raw images.
+    """
+    if renderer not in RENDERERS:
+        near = did_you_mean(str(renderer), RENDERERS)
+        raise UsageError(f"renderer {renderer!r}: expected one of {', '.join(RENDERERS)}.{near}")
+    if renderer == "splats" and obs_mode == "sensor_data":
+        raise UsageError("renderer='splats' has no raw images for obs_mode 'sensor_data'; use 'rgb+depth+segmentation'")
 
 
 def load_bundle(

@@ -47,7 +47,8 @@ def observing_cameras(env: Any, names: tuple[str, ...]) -> list[CameraConfig]:
         elif name == "wrist":
             out += _wrist(env)
         else:
-            out += _captured(env.bundle, int(name.partition(":")[2] or _DEFAULT_CAPTURES))
+            given = env._custom_sensor_configs or {}
+            out += _captured(env.bundle, int(name.partition(":")[2] or _DEFAULT_CAPTURES), given)
     return out
 
 
@@ -80,24 +81,26 @@ def _wrist(env: Any) -> list[CameraConfig]:
     ]  # fmt: skip
 
 
-def _captured(bundle: Any, count: int) -> list[CameraConfig]:
-    """Return cameras of evenly spread video frames, with their intrinsics scaled to a height of `SIZE_PX`."""
+def _captured(bundle: Any, count: int, given: dict[str, Any]) -> list[CameraConfig]:
+    """Return cameras of evenly spread video frames, with the whole frame in the height that `sensor_configs` gives."""
     cameras = bundle.cameras
     total = len(cameras.indices)
     if not total:
         raise UsageError(f"cameras: scene {bundle.scene['id']} has no capture cameras")
     rows = np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
-    scale = SIZE_PX / cameras.height
-    fx, fy, cx, cy = np.asarray(cameras.params, np.float64)[:4] * scale
-    lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
     out = []
     for row in rows:
         pose = np.asarray(cameras.world_from_camera[row])
         quat = quat_from_matrix(pose[:3, :3] @ SAPIEN_CAMERA_FROM_OPENCV[:3, :3].T)
+        uid = f"capture_{int(cameras.indices[row])}"
+        # ManiSkill sets width and height from `sensor_configs` and keeps the intrinsics.
+        height = {**given, **given.get(uid, {})}.get("height", SIZE_PX)
+        scale = height / cameras.height
+        fx, fy, cx, cy = np.asarray(cameras.params, np.float64)[:4] * scale
+        lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
         out.append(
             CameraConfig(
-                uid=f"capture_{int(cameras.indices[row])}", pose=_pose(pose[:3, 3], quat),
-                width=round(cameras.width * scale), height=SIZE_PX, intrinsic=lens, near=0.01, far=100,
+                uid=uid, pose=_pose(pose[:3, 3], quat), width=round(cameras.width * scale), height=height, intrinsic=lens, near=0.01, far=100,
             )
         )  # fmt: skip
     return out

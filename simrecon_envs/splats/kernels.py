@@ -1,6 +1,6 @@
 """Compiled kernels that draw 2D Gaussians (Huang et al., "2D Gaussian Splatting", 2024): forward only, float32, CPU.
 
-The geometry is that of the reconstruction's rasterizer (`reconstruction/gaussians/kernels.py`, which fits them): in camera
+The geometry is that of the rasterizer that fits them (`reconstruction/gaussians/kernels.py`): in camera
 space H = [s_u t_u, s_v t_v, p] maps splat coordinates (u, v, 1) to points, and the ray of a pixel at (dx, dy) from the
 projected center meets the splat at
 
@@ -42,7 +42,7 @@ _STEP, _E2, _E3, _E4 = np.float32(-1 / 32), np.float32(1 / 2), np.float32(1 / 6)
 _FLAT_LOW, _FLAT_HIGH = np.float32(1 / 1.1), np.float32(1 / 0.9)
 
 
-def _compiled(**options):
+def compiled(**options):
     def decorate(function):
         try:
             return numba.njit(cache=True, error_model="numpy", **options)(function)
@@ -52,7 +52,7 @@ def _compiled(**options):
     return decorate
 
 
-@_compiled(inline="always")
+@compiled(inline="always")
 def _bounds(center, size, middle, extent, around):
     """Return the first and last (exclusive) pixel of an interval about the projected center."""
     low = max(center + min(middle - extent, -around), -1.0)
@@ -60,7 +60,7 @@ def _bounds(center, size, middle, extent, around):
     return max(int(math.ceil(low - 0.5)), 0), min(int(math.floor(high - 0.5)) + 1, size)
 
 
-@_compiled(nogil=True)
+@compiled(nogil=True)
 def project(start, stop, rows, bodies, colors, camera_from_body, intrinsics, width, height, near, splats, boxes):
     """Project the Gaussians start..stop.
 
@@ -134,7 +134,7 @@ def project(start, stop, rows, bodies, colors, camera_from_body, intrinsics, wid
         q[RED], q[GREEN], q[BLUE] = colors[i, 0], colors[i, 1], colors[i, 2]
 
 
-@_compiled()
+@compiled()
 def sort_by_depth(splats, boxes):
     """Return the rows, int32 (k,), of the visible splats from near to far: a stable radix sort by 22 bits of depth."""
     n = 0
@@ -164,7 +164,7 @@ def sort_by_depth(splats, boxes):
     return rows
 
 
-@_compiled()
+@compiled()
 def bin_to_tiles(rows, boxes, tiles_x, tiles_y):
     """Return tile_start (t + 1,) and entries (e,): for each tile the visible splats, near to far."""
     tile_start = np.zeros(tiles_x * tiles_y + 1, np.int64)
@@ -187,7 +187,7 @@ def bin_to_tiles(rows, boxes, tiles_x, tiles_y):
     return tile_start, entries
 
 
-@_compiled(inline="always", fastmath=_FAST)
+@compiled(inline="always", fastmath=_FAST)
 def _falloff(rho):
     x = rho * _STEP
     e = _ONE + x * (_ONE + x * (_E2 + x * (_E3 + x * _E4)))
@@ -197,7 +197,7 @@ def _falloff(rho):
     return e * e
 
 
-@_compiled(inline="always", fastmath=_FAST)
+@compiled(inline="always", fastmath=_FAST)
 def _span(s, dy, x0, x1):
     """Return the first and last (exclusive) of the pixels x0..x1 that a row at dy from the center shares with a splat.
 
@@ -220,7 +220,7 @@ def _span(s, dy, x0, x1):
     return max(int(low), x0), min(int(high) + 2, x1)
 
 
-@_compiled(nogil=True)
+@compiled(nogil=True)
 def blend(start, step, splats, boxes, bodies, tiles_x, tile_start, entries, limits, owners, softness, image, front):
     """Blend the splats of the tiles start, start + step, ..., front to back.
 
@@ -243,7 +243,7 @@ def blend(start, step, splats, boxes, bodies, tiles_x, tile_start, entries, limi
         _blend_tile(tile, tiles_x, splats, boxes, bodies, tile_start, entries, limits, owners, softness, image, front)
 
 
-@_compiled(fastmath=_FAST, boundscheck=False, forceinline=True)
+@compiled(fastmath=_FAST, boundscheck=False, forceinline=True)
 def _blend_tile(tile, tiles_x, splats, boxes, bodies, tile_start, entries, limits, owners, softness, image, front):
     """Blend one tile; the inner loop runs over 16 pixels without branches, so that it compiles to vector instructions.
 
