@@ -156,7 +156,7 @@ class SceneEnv(BaseEnv):
         if renderer == "splats":
             from simrecon_envs.splats.scene import read_splats
 
-            self._splats = read_splats(self.bundle, self.builder.bodies)
+            self._splats = read_splats(self.bundle, self.builder.bodies, self.facts.solids)
         self._stepper: DirectStep | None = None
         self._info: dict[str, Array] = {}
         self.randomization = Randomization.parse(randomize)
