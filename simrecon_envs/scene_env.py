@@ -96,15 +96,16 @@ class SceneEnv(BaseEnv):
         task_config: Thresholds of picking.
         obs_mode: As in ManiSkill; None for "state".
         render_mode: None, "rgb_array", "sensors", "all" or "human".
-        renderer: "mesh", or "splats" for pictures from the Gaussians of the video, with robot and added things before them
-            (`docs/splats.md`); one environment on the CPU.
+        renderer: "mesh", or "splats" for pictures from the Gaussians of the video, with robot and added things before
+            them (`docs/splats.md`); one environment on the CPU.
         render_backend: "auto" renders only if a mode needs images; "gpu", "cpu" and "none" as in ManiSkill.
         **kwargs: Arguments of ManiSkill's `BaseEnv` (num_envs, control_mode, reward_mode, sim_backend,
             sensor_configs …).
 
     Raises:
         SceneNotFound: The registry has no such scene; lists the existing ones.
-        SceneAssetsMissing: The files of the scene are missing or damaged, or it has no Gaussians for `renderer="splats"`.
+        SceneAssetsMissing: The files of the scene are missing or damaged, or there are no Gaussians for
+            `renderer="splats"`.
         UsageError: The robot, task, target or a mode is unknown; lists the known ones.
         EnvironmentMissing: Images are requested without a usable renderer, or several environments without CUDA.
     """
@@ -222,9 +223,9 @@ class SceneEnv(BaseEnv):
     def _load_scene(self, options: dict) -> None:
         if self._splats is not None and self.gpu_sim_enabled:
             raise EnvironmentMissing(
-                f"scene {self.scene_id}: renderer='splats' draws one environment on the CPU, and {self.num_envs} are simulated "
-                f"on a GPU here; use simrecon_envs.make_vec({self.scene_id!r}, {self.num_envs}, renderer='splats'), or "
-                "renderer='mesh'"
+                f"scene {self.scene_id}: renderer='splats' draws one environment on the CPU, and {self.num_envs} are "
+                f"simulated on a GPU here; use simrecon_envs.make_vec({self.scene_id!r}, {self.num_envs}, "
+                "renderer='splats'), or renderer='mesh'"
             )
         pedestal = None
         if self.placement is not None and self.placement.pedestal_m > 0.01:
@@ -248,7 +249,9 @@ class SceneEnv(BaseEnv):
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
         if self._splats is not None and self.scene.can_render():
-            from simrecon_envs.splats.cameras import attach  # Numba is imported, and kernels are compiled, only here
+            from simrecon_envs.splats.cameras import (
+                attach,
+            )  # Numba is imported, and kernels are compiled, only here
 
             self._randomizer.layer = attach(self, self._splats)
 

@@ -68,7 +68,9 @@ def check_renderer(renderer: str, obs_mode: str | None) -> None:
         near = did_you_mean(str(renderer), RENDERERS)
         raise UsageError(f"renderer {renderer!r}: expected one of {', '.join(RENDERERS)}.{near}")
     if renderer == "splats" and obs_mode == "sensor_data":
-        raise UsageError("renderer='splats' has no raw images for obs_mode 'sensor_data'; use 'rgb+depth+segmentation'")
+        raise UsageError(
+            "renderer='splats' has no raw images for obs_mode 'sensor_data'; use 'rgb+depth+segmentation'"
+        )
 
 
 def load_bundle(

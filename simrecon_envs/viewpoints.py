@@ -100,7 +100,8 @@ def _captured(bundle: Any, count: int, given: dict[str, Any]) -> list[CameraConf
         lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32)
         out.append(
             CameraConfig(
-                uid=uid, pose=_pose(pose[:3, 3], quat), width=round(cameras.width * scale), height=height, intrinsic=lens, near=0.01, far=100,
+                uid=uid, pose=_pose(pose[:3, 3], quat), width=round(cameras.width * scale), height=height,
+                intrinsic=lens, near=0.01, far=100,
             )
         )  # fmt: skip
     return out

@@ -112,13 +112,19 @@ class SplatCamera(Camera):
     ) -> dict[str, torch.Tensor]:
         """Return the images as ManiSkill does; normals and albedo are those of the meshes."""
         if not apply_texture_transforms:
-            raise UsageError("obs_mode 'sensor_data' has SAPIEN's raw images; renderer='splats' draws 'rgb', 'rgb+depth' …")
+            raise UsageError(
+                "obs_mode 'sensor_data' has SAPIEN's raw images; renderer='splats' draws 'rgb', 'rgb+depth' …"
+            )
         found = super().get_obs(True, True, position, True, normal, albedo)
         picture = Picture(*(_numpy(found[name]) for name in ("rgb", "depth", "segmentation")))
         component = self.camera._render_cameras[0]
         extrinsic, lens = component.get_extrinsic_matrix(), component.get_intrinsic_matrix()
         shown = self._layer.show(picture, extrinsic, lens)
-        images = {"rgb": shown.rgb, "depth": shown.depth_mm[..., None], "segmentation": shown.segmentation[..., None]}
+        images = {
+            "rgb": shown.rgb,
+            "depth": shown.depth_mm[..., None],
+            "segmentation": shown.segmentation[..., None],
+        }
         if position:
             images["position"] = _positions(shown.depth_mm, lens)
         for name, image in images.items():
@@ -152,7 +158,8 @@ def attach(env: Any, scene: SplatScene) -> SplatLayer:
         for name, camera in cameras.items():
             if type(camera) is not Camera:
                 raise UsageError(
-                    f"camera {name}: renderer='splats' draws plain cameras, not {type(camera).__name__}; use renderer='mesh'"
+                    f"camera {name}: renderer='splats' draws plain cameras, not {type(camera).__name__}; "
+                    "use renderer='mesh'"
                 )
             cameras[name] = SplatCamera(camera, layer)
     return layer

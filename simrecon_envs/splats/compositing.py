@@ -14,12 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simrecon_envs.splats import kernels
 from simrecon_envs.splats.kernels import DEPTH_SUM, LIGHT, RED_SUM, WX, WY, XC, YC, ZC, compiled
 from simrecon_envs.splats.rasterizer import Drawn
 
 NOTHING = np.float32(1e6)  # a depth behind everything, metres
-_AGREE = 0.02  # of depth: the Gaussians' expected and median depth are of one surface; a mesh is at the same place
+_AGREE = (
+    0.02  # of depth: the Gaussians' expected and median depth are of one surface; a mesh is at the same place
+)
 _AGREE_M = 0.02
 _MAX_MM = 32767.0
 
@@ -29,7 +30,9 @@ class Actors:
     """For each segmentation id of SAPIEN: what it is. Unknown ids are robot and added things."""
 
     body: np.ndarray  # int32 (k,) row in `SplatScene.world_from_body`, -1 for robot and added things
-    margin_m: np.ndarray  # float32 (k,) depth behind the actor's mesh from where on other Gaussians do not count
+    margin_m: (
+        np.ndarray
+    )  # float32 (k,) depth behind the actor's mesh from where on other Gaussians do not count
     tint: np.ndarray  # float32 (k, 3) factor of the picture's color
     segmentation: np.ndarray  # int16 (b,) the reverse: segmentation id of each body, 0 for none
 
@@ -52,7 +55,9 @@ def limits_of(picture: Picture, actors: Actors) -> tuple[np.ndarray, np.ndarray]
     return limits, owners
 
 
-def composite(picture: Picture, actors: Actors, drawn: Drawn, bodies: np.ndarray, gain: np.ndarray) -> Picture:
+def composite(
+    picture: Picture, actors: Actors, drawn: Drawn, bodies: np.ndarray, gain: np.ndarray
+) -> Picture:
     """Return the picture with Gaussians before it.
 
     Args:
@@ -76,7 +81,20 @@ def composite(picture: Picture, actors: Actors, drawn: Drawn, bodies: np.ndarray
 
 @compiled(nogil=True)
 def _composite(
-    mesh_rgb, mesh_mm, mesh_ids, body_of, tint_of, id_of, planes, front, splats, bodies, gain, colors, depth, ids
+    mesh_rgb,
+    mesh_mm,
+    mesh_ids,
+    body_of,
+    tint_of,
+    id_of,
+    planes,
+    front,
+    splats,
+    bodies,
+    gain,
+    colors,
+    depth,
+    ids,
 ):
     height, width = mesh_mm.shape
     for y in range(height):
@@ -106,7 +124,7 @@ def _composite(
 
 @compiled(nogil=True)
 def _soften(colors, ids, body_of, rgb):
-    """Write colors as bytes; smooth the outlines of robot and added things, which SAPIEN draws without anti-aliasing."""
+    """Write colors as bytes; smooth the outlines of robot and added things, which SAPIEN does not anti-alias."""
     height, width = ids.shape
     for y in range(height):
         for x in range(width):
@@ -121,4 +139,6 @@ def _soften(colors, ids, body_of, rgb):
                     for dy, dx in ((0, 1), (1, 0), (0, -1), (-1, 0)):
                         v, u = min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)
                         value += np.float32(0.125) * colors[v, u, c]
-                rgb[y, x, c] = np.uint8(min(max(value, np.float32(0.0)), np.float32(1.0)) * np.float32(255.0) + 0.5)
+                rgb[y, x, c] = np.uint8(
+                    min(max(value, np.float32(0.0)), np.float32(1.0)) * np.float32(255.0) + 0.5
+                )

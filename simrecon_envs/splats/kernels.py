@@ -29,12 +29,19 @@ N_PROJECTED = 16
 # Planes of the image: sum of weight times color (3) and depth; transmittance.
 RED_SUM, GREEN_SUM, BLUE_SUM, DEPTH_SUM, LIGHT = range(5)
 N_PLANES = 5
-_LIMIT, _OWNER, _FRONT, _LANES = 5, 6, 7, 8  # and, inside a tile: limit, body, Gaussian (exact below 2^24), column
+_LIMIT, _OWNER, _FRONT, _LANES = (
+    5,
+    6,
+    7,
+    8,
+)  # and, inside a tile: limit, body, Gaussian (exact below 2^24), column
 _MIN_COSINE = 0.01  # between normal and ray; splats seen more edge-on are culled
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _HALF = np.float32(0.5)
 _ALPHA_MAX = np.float32(0.99)
-_STOP = np.float32(1.0 / 255.0)  # transmittance below which a pixel is finished: what is behind changes no color value
+_STOP = np.float32(
+    1.0 / 255.0
+)  # transmittance below which a pixel is finished: what is behind changes no color value
 _FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
 # exp(-rho / 2) = exp(x)^16 with x = -rho / 32, by the Taylor polynomial of exp(x): relative error 6e-5 for rho < 7.
 _STEP, _E2, _E3, _E4 = np.float32(-1 / 32), np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24)
@@ -43,6 +50,8 @@ _FLAT_LOW, _FLAT_HIGH = np.float32(1 / 1.1), np.float32(1 / 0.9)
 
 
 def compiled(**options):
+    """Return a decorator that compiles a kernel at its first call and caches it where a folder is writable."""
+
     def decorate(function):
         try:
             return numba.njit(cache=True, error_model="numpy", **options)(function)
@@ -61,7 +70,9 @@ def _bounds(center, size, middle, extent, around):
 
 
 @compiled(nogil=True)
-def project(start, stop, rows, bodies, colors, camera_from_body, intrinsics, width, height, near, splats, boxes):
+def project(
+    start, stop, rows, bodies, colors, camera_from_body, intrinsics, width, height, near, splats, boxes
+):
     """Project the Gaussians start..stop.
 
     Args:
@@ -120,7 +131,9 @@ def project(start, stop, rows, bodies, colors, camera_from_body, intrinsics, wid
                 continue
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         det = nx * px + ny * py + nz * pz
-        if det * det < _MIN_COSINE * _MIN_COSINE * (nx * nx + ny * ny + nz * nz) * (px * px + py * py + pz * pz):
+        if det * det < _MIN_COSINE * _MIN_COSINE * (nx * nx + ny * ny + nz * nz) * (
+            px * px + py * py + pz * pz
+        ):
             continue
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, y0, x1, y1
         f = pz / det
@@ -146,7 +159,9 @@ def sort_by_depth(splats, boxes):
         if boxes[i, 2] > 0:
             rows[k], depth[k] = i, splats[i, ZC]
             k += 1
-    keys = depth.view(np.uint32)  # positive floats order as their bits do; the last 9 bits are 0.006 % of depth
+    keys = depth.view(
+        np.uint32
+    )  # positive floats order as their bits do; the last 9 bits are 0.006 % of depth
     other_rows, other_keys = np.empty_like(rows), np.empty_like(keys)
     for shift in (9, 20):
         counts = np.zeros(2049, np.int64)
@@ -221,7 +236,9 @@ def _span(s, dy, x0, x1):
 
 
 @compiled(nogil=True)
-def blend(start, step, splats, boxes, bodies, tiles_x, tile_start, entries, limits, owners, softness, image, front):
+def blend(
+    start, step, splats, boxes, bodies, tiles_x, tile_start, entries, limits, owners, softness, image, front
+):
     """Blend the splats of the tiles start, start + step, ..., front to back.
 
     Args:
@@ -240,11 +257,15 @@ def blend(start, step, splats, boxes, bodies, tiles_x, tile_start, entries, limi
         front: Output, int32 (h, w): the Gaussian at which half of the light is stopped, -1 if none does.
     """
     for tile in range(start, len(tile_start) - 1, step):
-        _blend_tile(tile, tiles_x, splats, boxes, bodies, tile_start, entries, limits, owners, softness, image, front)
+        _blend_tile(
+            tile, tiles_x, splats, boxes, bodies, tile_start, entries, limits, owners, softness, image, front
+        )
 
 
 @compiled(fastmath=_FAST, boundscheck=False, forceinline=True)
-def _blend_tile(tile, tiles_x, splats, boxes, bodies, tile_start, entries, limits, owners, softness, image, front):
+def _blend_tile(
+    tile, tiles_x, splats, boxes, bodies, tile_start, entries, limits, owners, softness, image, front
+):
     """Blend one tile; the inner loop runs over 16 pixels without branches, so that it compiles to vector instructions.
 
     For the same reason all values of a pixel, body and Gaussian included, are planes of one float32 array, whose shape

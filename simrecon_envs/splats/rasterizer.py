@@ -4,6 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,7 @@ class Rasterizer:
         count = len(scene.rows)
         cuts = [count * k // threads for k in range(threads + 1)]
         _each(
-            threads, kernels.project, list(zip(cuts[:-1], cuts[1:], strict=True)),
+            threads, kernels.project, list(pairwise(cuts)),
             scene.rows, scene.bodies, self.colors, moves, lens, width, height, _NEAR_M, splats, boxes,
         )  # fmt: skip
         rows = kernels.sort_by_depth(splats, boxes)

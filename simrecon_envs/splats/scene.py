@@ -19,9 +19,9 @@ _COLUMNS = (
     "x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "opacity", "f_dc_0", "f_dc_1", "f_dc_2",
     "instance_id",
 )  # fmt: skip
-# Gaussians up to this far outside of a movable thing's collision shapes are its own (the fit blurs outlines by about the
-# size of a Gaussian, the shapes are within some millimetres of the surface), but not those at its foot: they show the top
-# that it stands on.
+# Gaussians up to this far outside of a movable thing's collision shapes are its own (the fit blurs outlines by about
+# the size of a Gaussian, the shapes are within some millimetres of the surface), but not those at its foot: they show
+# the top that it stands on.
 _CLAIM_M, _FOOT_M = 0.01, 0.005
 # Gaussians up to `_BELOW_M` below a movable thing's foot are covered by it where its shape is over them at one of these
 # heights above the foot: as far as things overhang without showing what is below them.
@@ -43,8 +43,8 @@ class SplatScene:
 def read_splats(bundle: SceneBundle, bodies: Sequence[Body], solids: Sequence[ConvexSolid]) -> SplatScene:
     """Read the Gaussians of a bundle and assign them to bodies by `instance_id`.
 
-    Gaussians of immovable or no things at the surface of a movable one show that one's color, and go with it. Those just
-    below a movable thing were seen in no frame; their colors are arbitrary, and they are left out.
+    Gaussians of immovable or no things at the surface of a movable one show that one's color, and go with it. Those
+    just below a movable thing were seen in no frame; their colors are arbitrary, and they are left out.
 
     Args:
         bundle: A scene.
@@ -56,10 +56,12 @@ def read_splats(bundle: SceneBundle, bodies: Sequence[Body], solids: Sequence[Co
     """
     scene_id = bundle.scene["id"]
     entry = bundle.scene.get("gaussians")
-    advice = f"make the scene again with `simrecon reconstruct VIDEO --scene {scene_id}`, or use renderer='mesh'"
+    advice = (
+        f"make the scene again with `simrecon reconstruct VIDEO --scene {scene_id}`, or use renderer='mesh'"
+    )
     if entry is None:
         raise SceneAssetsMissing(
-            f"scene {scene_id}: renderer='splats' needs the file gaussians.ply, which this bundle does not have; {advice}"
+            f"scene {scene_id}: renderer='splats' needs gaussians.ply, which this bundle does not have; {advice}"
         )
     try:
         found = read_vertices(bundle.resolve(entry["file"]))
@@ -118,10 +120,16 @@ def _claim(scene: SplatScene, shapes: list[tuple[int, ConvexSolid]]) -> None:
     centers = scene.rows[:, :3].astype(np.float64)
     free = ~np.isin(scene.bodies, list(bottoms))
     for row, solid in shapes:
-        near = free & (centers >= solid.lower - _CLAIM_M).all(axis=1) & (centers <= solid.upper + _CLAIM_M).all(axis=1)
+        near = (
+            free
+            & (centers >= solid.lower - _CLAIM_M).all(axis=1)
+            & (centers <= solid.upper + _CLAIM_M).all(axis=1)
+        )
         near &= centers[:, 2] > bottoms[row] + _FOOT_M
         index = np.flatnonzero(near)
-        apart = (centers[index] @ solid.half_spaces[:, :3].T + solid.half_spaces[:, 3]).max(axis=1, initial=-np.inf)
+        apart = (centers[index] @ solid.half_spaces[:, :3].T + solid.half_spaces[:, 3]).max(
+            axis=1, initial=-np.inf
+        )
         scene.bodies[index[apart < _CLAIM_M]] = row
 
 
@@ -133,11 +141,15 @@ def _covered(scene: SplatScene, shapes: list[tuple[int, ConvexSolid]]) -> np.nda
     for row, solid in shapes:
         below = bottoms[row] + _FOOT_M - centers[:, 2]
         near = (scene.bodies != row) & (below > 0) & (below < _BELOW_M)
-        near &= (centers[:, :2] >= solid.lower[:2]).all(axis=1) & (centers[:, :2] <= solid.upper[:2]).all(axis=1)
+        near &= (centers[:, :2] >= solid.lower[:2]).all(axis=1) & (centers[:, :2] <= solid.upper[:2]).all(
+            axis=1
+        )
         index = np.flatnonzero(near)
         for height in _COVER_M:
             raised = np.column_stack([centers[index, :2], np.full(len(index), bottoms[row] + height)])
-            inside = (raised @ solid.half_spaces[:, :3].T + solid.half_spaces[:, 3]).max(axis=1, initial=-np.inf) < 0
+            inside = (raised @ solid.half_spaces[:, :3].T + solid.half_spaces[:, 3]).max(
+                axis=1, initial=-np.inf
+            ) < 0
             covered[index[inside]] = True
     return covered
 

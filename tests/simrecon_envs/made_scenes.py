@@ -6,6 +6,9 @@ import numpy as np
 import trimesh
 from masses import mass_entry
 
+from reconstruction.gaussians import write_ply
+from reconstruction.gaussians.model import from_packed
+from reconstruction.instances.gaussian_ids import add_instances_to_ply
 from registry import SceneRegistry, seal_bundle
 from registry.geometry import GLTF_FROM_WORLD
 
@@ -51,6 +54,8 @@ class BundleWriter:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.base, self.objects, self.edges = [], [], []
+        self.surfaces: list[tuple[int, trimesh.Trimesh]] = []  # id and mesh, world space
+        self.gaussians: dict | None = None
 
     def add_base(
         self, key: int, label: str, mesh: trimesh.Trimesh, plane: list, *, collision: bool = True
@@ -64,6 +69,7 @@ class BundleWriter:
             _obj(mesh, self.folder / f"base/{key:03d}_collision.obj")
             entry["collision"] = [f"base/{key:03d}_collision.obj"]
         self.base.append(entry)
+        self.surfaces.append((key, mesh))
 
     def add_object(
         self,
@@ -82,6 +88,7 @@ class BundleWriter:
         """Add an object of convex parts in object space."""
         stem = f"objects/{key:03d}"
         whole = trimesh.util.concatenate(parts)
+        self.surfaces.append((key, whole.copy().apply_transform(world_from_object)))
         _glb(whole, self.folder / f"{stem}/visual.glb", color)
         names = []
         for number, part in enumerate(parts):
@@ -114,6 +121,33 @@ class BundleWriter:
         self.edges.append(
             {"child": key, "relation": relation, "parent": parent, "confidence": 1.0, "evidence": "made"}
         )
+
+    def cover_with_gaussians(self, color: tuple = (0.1, 0.2, 0.9)) -> None:
+        """Write gaussians.ply: opaque disks of one color on all surfaces, smaller ones on small things."""
+        points, normals, ids, sizes = [], [], [], []
+        for key, mesh in self.surfaces:
+            spacing_m = 0.005 if mesh.area < 0.1 else 0.02
+            count = int(mesh.area / spacing_m**2)
+            found, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+            points.append(found)
+            normals.append(mesh.face_normals[faces])
+            ids.append(np.full(count, key))
+            sizes.append(np.full((count, 2), np.log(0.75 * spacing_m)))
+        points, normals = np.concatenate(points), np.concatenate(normals)
+        # The rotation that takes z to the normal.
+        quats = np.column_stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))])
+        quats[normals[:, 2] < -0.999] = (0, 1, 0, 0)
+        sh = (np.array(color) - 0.5) / 0.2820948
+        columns = [
+            points,
+            quats,
+            np.concatenate(sizes),
+            np.full((len(points), 1), 4.0),
+            np.tile(sh, (len(points), 1)),
+        ]
+        write_ply(from_packed(np.concatenate(columns, axis=1)), self.folder / "gaussians.ply")
+        add_instances_to_ply(self.folder / "gaussians.ply", np.concatenate(ids))
+        self.gaussians = {"file": "gaussians.ply", "count": len(points)}
 
     def seal(self, scene_id: str) -> None:
         """Write scene.json and the manifest."""
@@ -150,6 +184,7 @@ class BundleWriter:
                 "base": self.base,
                 "objects": self.objects,
                 "graph": {"edges": self.edges},
+                **({} if self.gaussians is None else {"gaussians": self.gaussians}),
                 "report": {
                     "physics": {},
                     "timings_s": {},
@@ -254,5 +289,15 @@ def publish(registry: SceneRegistry, scene_id: str, folder: Path) -> None:
             relation="attached_to",
             dynamic=False,
         )
+    writer.seal(scene_id)
+    registry.publish(writer.folder, scene_id)
+
+
+def publish_with_gaussians(registry: SceneRegistry, scene_id: str, folder: Path) -> None:
+    """Write `room` with Gaussians on all surfaces and publish it."""
+    writer = BundleWriter(folder)
+    add_room(writer)
+    add_furniture(writer)
+    writer.cover_with_gaussians()
     writer.seal(scene_id)
     registry.publish(writer.folder, scene_id)
