@@ -27,7 +27,7 @@ class WorldConfig:
     """Model of the metric depth backend: its name on the Hugging Face hub, or a local folder."""
     camera_height_prior_m: float = 1.4
     """Prior of the camera height above the floor: between chest (1.2 m) and eyes (1.6 m)."""
-    camera_height_sigma: float = 0.15
+    camera_height_sigma: float = 0.2
     """Relative standard deviation of the camera height."""
     table_height_prior_m: float = 0.74
     """Prior of the height of a table, for videos that show a table top but no floor."""

@@ -1,6 +1,7 @@
 """Estimate metres per `sfm` unit from the first available source, in this order.
 
-Marker of known size, length given by the user, imported metric poses, metric depth backend, priors on how people film.
+Marker of known size, length given by the user, imported metric poses, metric depth backend, what is usual of cameras,
+furniture and rooms.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,10 @@ from reconstruction.world.config import WorldConfig
 from reconstruction.world.floor import Floor
 from reconstruction.world.markers import detect_markers, measure_markers
 from reconstruction.world.metric_depth import load_backend, metres_per_unit
+from reconstruction.world.posterior import infer_scale
 from reconstruction.world.request import ScaleRequest, parse_scale
 from reconstruction.world.samples import SurfaceSamples, choose_frames
+from reconstruction.world.supports import highest_point, measure_supports
 from registry.errors import InputError, UsageError
 from registry.geometry import invert_rigid
 
@@ -60,7 +63,7 @@ def find_scale(
             per_unit, sigma = metres_per_unit(backend, posed, depth)
             detail = f"median ratio of {backend.name} metric depth to the measured depth"
             found = Metres(per_unit, ScaleEstimate("metric-depth", sigma, detail))
-    return found or _by_prior(samples, eye_height, floor, config)
+    return found or _by_prior(samples, eye_height, floor, config, progress)
 
 
 def camera_heights(samples: SurfaceSamples) -> np.ndarray:
@@ -123,15 +126,12 @@ def _by_user(
     return None
 
 
-def _by_prior(samples: SurfaceSamples, eye_height: float, floor: Floor, config: WorldConfig) -> Metres:
-    """Return the scale from priors: camera height over floor or table, else distance of the surface."""
+def _by_prior(
+    samples: SurfaceSamples, eye_height: float, floor: Floor, config: WorldConfig, progress: Progress
+) -> Metres:
+    """Return the scale from usual sizes; without a floor in view, from a single height or distance."""
     if floor.observed:
-        detail = (
-            f"the camera is assumed {config.camera_height_prior_m:g} m above the floor; "
-            "a marker or --scale gives a certain scale"
-        )
-        estimate = ScaleEstimate("camera-height-prior", config.camera_height_sigma, detail)
-        return Metres(config.camera_height_prior_m / eye_height, estimate)
+        return _by_furniture(samples, eye_height, floor, config, progress)
     if floor.table:
         above_m = config.camera_height_prior_m - config.table_height_prior_m
         detail = f"no floor in view: the camera is assumed {above_m:.2f} m above a table top"
@@ -142,6 +142,39 @@ def _by_prior(samples: SurfaceSamples, eye_height: float, floor: Floor, config: 
     )
     estimate = ScaleEstimate("subject-distance-prior", _SUBJECT_SIGMA, detail)
     return Metres(config.subject_distance_prior_m / distance, estimate)
+
+
+def _by_furniture(
+    samples: SurfaceSamples, eye_height: float, floor: Floor, config: WorldConfig, progress: Progress
+) -> Metres:
+    """Return the scale from the posterior of `infer_scale`; notes the part of every surface in it."""
+    supports = measure_supports(samples, floor.height, eye_height)
+    found = infer_scale(
+        eye_height,
+        supports,
+        highest_point(samples, floor.height),
+        camera_height_m=config.camera_height_prior_m,
+        camera_sigma=config.camera_height_sigma,
+    )
+    seen = [
+        f"{found.per_unit * surface.height:.2f} m high: {name} ({100 * share:.0f} %)"
+        for surface, (name, share) in zip(supports, found.parts)
+    ]
+    progress.note(
+        f"world: the scale is a guess between {100 * (found.low / found.per_unit - 1):+.0f} and "
+        f"{100 * (found.high / found.per_unit - 1):+.0f} % (68 % interval), from the camera's height, "
+        f"{found.per_unit * eye_height:.2f} m"
+        + ("; level surfaces " + "; ".join(seen) if seen else "; no level surface above the floor")
+        + ("; the highest seen point, which should lie below a ceiling" if found.ceiling_counts else "")
+    )
+    if not seen and not found.ceiling_counts:
+        detail = f"the camera is assumed {found.per_unit * eye_height:.2f} m above the floor"
+        method = "camera-height-prior"
+    else:
+        detail = "the camera's height, furniture and room are assumed to be of usual sizes"
+        method = "usual-sizes"
+    detail += "; a marker or --scale gives a certain scale"
+    return Metres(found.per_unit, ScaleEstimate(method, found.sigma, detail))
 
 
 def distance_between_pixels(
