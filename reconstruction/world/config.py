@@ -25,9 +25,12 @@ class WorldConfig:
     """Learned metric depth as a source of metres; needs `pip install 'simrecon[depth-models]'`."""
     metric_depth_model: str = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
     """Model of the metric depth backend: its name on the Hugging Face hub, or a local folder."""
+    usual_sizes: bool = False
+    """Without a known length, join the camera's height with usual heights of furniture and ceilings. Right in rooms of
+    standard furniture, and sure of itself and wrong where tables are much lower; see docs/world_frame.md."""
     camera_height_prior_m: float = 1.4
     """Prior of the camera height above the floor: between chest (1.2 m) and eyes (1.6 m)."""
-    camera_height_sigma: float = 0.2
+    camera_height_sigma: float = 0.15
     """Relative standard deviation of the camera height."""
     table_height_prior_m: float = 0.74
     """Prior of the height of a table, for videos that show a table top but no floor."""

@@ -85,7 +85,7 @@ def infer_scale(
         total = total + _POWER * np.log(likelihood.sum(axis=0))
     mass = np.exp(total - total.max())
     mass /= mass.sum()
-    low, middle, high = np.exp(np.interp((0.16, 0.5, 0.84), np.cumsum(mass), log_scale))
+    low, middle, high = np.exp(np.interp((0.16, 0.5, 0.84), np.cumsum(mass) - 0.5 * mass, log_scale))
     names = [c.name for c in FURNITURE] + ["none of these"]
     parts = []
     for likelihood in likelihoods:

@@ -1,7 +1,7 @@
 """Estimate metres per `sfm` unit from the first available source, in this order.
 
-Marker of known size, length given by the user, imported metric poses, metric depth backend, what is usual of cameras,
-furniture and rooms.
+Marker of known size, length given by the user, imported metric poses, metric depth backend, priors on how people film
+(and, if asked for, on furniture and rooms).
 """
 
 from dataclasses import dataclass
@@ -24,6 +24,7 @@ from registry.geometry import invert_rigid
 # Relative standard deviations of the sources.
 _USER_HEIGHT_SIGMA = 0.04
 _USER_DISTANCE_SIGMA = 0.015
+CAMERA_SIGMA = 0.2  # of the camera height beside other evidence; chosen like the constants of `posterior`
 _TABLE_SIGMA = 0.30
 _SUBJECT_SIGMA = 0.5
 _MARKER_SIGMA = 0.003  # of the print, and of reading half a millimetre on a ruler
@@ -129,9 +130,16 @@ def _by_user(
 def _by_prior(
     samples: SurfaceSamples, eye_height: float, floor: Floor, config: WorldConfig, progress: Progress
 ) -> Metres:
-    """Return the scale from usual sizes; without a floor in view, from a single height or distance."""
-    if floor.observed:
+    """Return the scale from priors: usual sizes if asked for, or camera height over floor or table, or distance."""
+    if floor.observed and config.usual_sizes:
         return _by_furniture(samples, eye_height, floor, config, progress)
+    if floor.observed:
+        detail = (
+            f"the camera is assumed {config.camera_height_prior_m:g} m above the floor; "
+            "a marker or --scale gives a certain scale"
+        )
+        estimate = ScaleEstimate("camera-height-prior", config.camera_height_sigma, detail)
+        return Metres(config.camera_height_prior_m / eye_height, estimate)
     if floor.table:
         above_m = config.camera_height_prior_m - config.table_height_prior_m
         detail = f"no floor in view: the camera is assumed {above_m:.2f} m above a table top"
@@ -154,7 +162,7 @@ def _by_furniture(
         supports,
         highest_point(samples, floor.height),
         camera_height_m=config.camera_height_prior_m,
-        camera_sigma=config.camera_height_sigma,
+        camera_sigma=CAMERA_SIGMA,
     )
     seen = [
         f"{found.per_unit * surface.height:.2f} m high: {name} ({100 * share:.0f} %)"
@@ -167,14 +175,8 @@ def _by_furniture(
         + ("; level surfaces " + "; ".join(seen) if seen else "; no level surface above the floor")
         + ("; the highest seen point, which should lie below a ceiling" if found.ceiling_counts else "")
     )
-    if not seen and not found.ceiling_counts:
-        detail = f"the camera is assumed {found.per_unit * eye_height:.2f} m above the floor"
-        method = "camera-height-prior"
-    else:
-        detail = "the camera's height, furniture and room are assumed to be of usual sizes"
-        method = "usual-sizes"
-    detail += "; a marker or --scale gives a certain scale"
-    return Metres(found.per_unit, ScaleEstimate(method, found.sigma, detail))
+    detail = "camera, furniture and room are taken for usual; a marker or --scale gives a certain scale"
+    return Metres(found.per_unit, ScaleEstimate("usual-sizes", found.sigma, detail))
 
 
 def distance_between_pixels(

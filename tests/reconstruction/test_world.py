@@ -159,7 +159,7 @@ def test_a_spoiled_room_in_any_sfm_space_is_set_upright(room, seed):
     assert abs(found["floor_m"]) < 0.01
     assert world.floor_observed
     assert world.yaw_snapped
-    assert world.scale.method == "usual-sizes"
+    assert world.scale.method == "camera-height-prior"
     assert abs(np.log(found["scale"])) < 2 * world.scale.uncertainty
     assert found["gravity_deg"] < 2 * world.gravity_sigma_deg
 
@@ -341,7 +341,7 @@ def test_an_object_height_is_provisional_first_and_exact_then(room):
     posed, depth, true = disturb(*room, 13)
     notes = Notes()
     first = find_world(posed, depth, WorldConfig(scale="object:3.height=0.74"), progress=notes)
-    assert first.scale.method == "usual-sizes"
+    assert first.scale.method == "camera-height-prior"
     assert any("provisional" in note for note in notes.notes)
     measured = 0.74 * errors(first, true)["scale"]
     config = WorldConfig(scale="object:3.height=0.74", object_measured_height_m=measured)
