@@ -1,7 +1,6 @@
 """Sample a film: decode it once at low resolution, measure its motion, keep some frames spread along the motion."""
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from reconstruction.phone_exports.exports import find_export
 from registry.errors import InputError, UsageError
 
 MAX_FRAMES = 48  # sampled; more frames cost more time and change no verdict on the generated films
+_MIN_SAMPLED = 12
 _MAX_METERED = 240  # frames whose motion is measured
 _MIN_INTRA = 40  # intra-coded frames that a film needs for being sampled by them alone
 _MAX_DECODED_PX = 2.0e9  # of all frames; longer or larger films are decoded at intra-coded frames only
@@ -168,8 +168,8 @@ def _choose(grays: list[np.ndarray], times: list[float], *, folder: bool = False
         return stats, rows
     spacing = Spacing(step=0.03, fewest=min(MAX_FRAMES, 32), most=MAX_FRAMES, blurred_below=0.4, widest_gap=0.22)
     rows = choose_keyframes(stats, np.ones(len(grays), bool), spacing)
-    if len(rows) < 2 and len(grays) >= 2:  # a camera at rest
-        rows = np.unique(np.linspace(0, len(grays) - 1, 8).round().astype(int))
+    if len(rows) < _MIN_SAMPLED:  # a camera at rest, or one too fast to follow
+        rows = np.unique(np.linspace(0, len(grays) - 1, min(_MIN_SAMPLED, len(grays))).round().astype(int))
     return stats, rows
 
 
@@ -181,7 +181,3 @@ def distinct_views(film: Film) -> int:
             count, last = count + 1, position
     return count
 
-
-def evenly(items: np.ndarray, most: int) -> Iterator[int]:
-    """Yield at most `most` rows of an array, spread evenly."""
-    yield from np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)).tolist()

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from reconstruction.core.progress import NO_PROGRESS
-from reconstruction.poses.features import Features, extract_features, match
+from reconstruction.poses.features import Features, extract_features, match, overlap_scores
 from reconstruction.poses.parallel import ordered_map
 
 _MAX_FEATURES = 700
@@ -27,7 +27,7 @@ class Pair:
     second: np.ndarray  # float32 (k, 2) pixels in the second
 
 
-def match_frames(images: np.ndarray, *, ordered: bool) -> tuple[list[Features], list[Pair]]:
+def match_frames(images: np.ndarray, *, ordered: bool) -> list[Pair]:
     """Detect features in images uint8 (n, h, w, 3), match frames near in time, keep epipolar inliers.
 
     Args:
@@ -35,7 +35,7 @@ def match_frames(images: np.ndarray, *, ordered: bool) -> tuple[list[Features], 
         ordered: frames are in time order; else all pairs with some overlap are matched.
 
     Returns:
-        Features by frame, and the pairs with at least `MIN_INLIERS` inliers.
+        The pairs with at least `MIN_INLIERS` inliers.
     """
     features = extract_features(images, _MAX_FEATURES, _CONTRAST, NO_PROGRESS)
     n = len(images)
@@ -43,12 +43,10 @@ def match_frames(images: np.ndarray, *, ordered: bool) -> tuple[list[Features], 
     if not ordered:
         wanted |= _alike(features)
     found = ordered_map(lambda rows: _verified(rows, features), sorted(wanted))
-    return features, [pair for pair in found if pair is not None]
+    return [pair for pair in found if pair is not None]
 
 
 def _alike(features: list[Features]) -> set[tuple[int, int]]:
-    from reconstruction.poses.features import overlap_scores
-
     scores = overlap_scores(features, NO_PROGRESS, count=128)
     best = np.argsort(-scores, axis=1, kind="stable")[:, :_ORDERLESS_PARTNERS]
     return {(min(i, int(j)), max(i, int(j))) for i in range(len(features)) for j in best[i] if scores[i, j] > 3}
@@ -104,7 +102,6 @@ class Parallax:
 
     focal_px: float
     degrees: np.ndarray  # float (pairs,) upper quartile over a pair's inliers of the angle left by the best rotation
-    rotations: list[np.ndarray]  # second_from_first (3, 3) by pair
 
 
 def measure_parallax(pairs: list[Pair], size: tuple[int, int], focal_px: float = 0.0) -> Parallax:
@@ -120,7 +117,7 @@ def measure_parallax(pairs: list[Pair], size: tuple[int, int], focal_px: float =
     """
     center = np.array(size, np.float64) / 2
     if not pairs:
-        return Parallax(focal_px or float(max(size)), np.zeros(0), [])
+        return Parallax(focal_px or float(max(size)), np.zeros(0))
     tried = [focal_px] if focal_px else [share * max(size) for share in _FOCALS]
     best: tuple[float, float] | None = None
     some = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, min(40, len(pairs))).astype(int))]
@@ -130,5 +127,5 @@ def measure_parallax(pairs: list[Pair], size: tuple[int, int], focal_px: float =
         if best is None or np.median(left) < best[0]:
             best = float(np.median(left)), focal
     assert best is not None
-    fits = [rotation_between(p, best[1], center) for p in pairs]
-    return Parallax(best[1], np.array([np.quantile(left, 0.75) for _, left in fits]), [r for r, _ in fits])
+    left = [np.quantile(rotation_between(p, best[1], center)[1], 0.75) for p in pairs]
+    return Parallax(best[1], np.array(left))

@@ -28,9 +28,9 @@ class MarkerSide:
 
 
 def detect_markers(
-    posed: PosedFrames, dictionaries: tuple[str, ...], rows: np.ndarray
+    images: np.ndarray, dictionaries: tuple[str, ...], rows: np.ndarray
 ) -> dict[tuple[str, int], dict[int, np.ndarray]]:
-    """Detect markers in frames `rows`; return {(dictionary, id): {row: corners (4, 2) in pixels}}.
+    """Detect markers in the images `rows` of uint8 (n, h, w, 3); return {(dictionary, id): {row: corners (4, 2) in pixels}}.
 
     Raises:
         UsageError: OpenCV has no such dictionary.
@@ -45,7 +45,7 @@ def detect_markers(
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         for row in rows:
-            gray = cv2.cvtColor(np.asarray(posed.images[row]), cv2.COLOR_RGB2GRAY)
+            gray = cv2.cvtColor(np.asarray(images[row]), cv2.COLOR_RGB2GRAY)
             corners, ids, _ = detector.detectMarkers(gray)
             flat = [] if ids is None else ids.ravel().tolist()
             for marker_id, quad in zip(flat, corners):
@@ -61,7 +61,7 @@ def detect_markers(
 def measure_markers(posed: PosedFrames, dictionaries: tuple[str, ...]) -> list[MarkerSide]:
     """Measure every marker that two or more frames show; detections that are no squares in space are dropped."""
     sides = []
-    found = detect_markers(posed, dictionaries, np.arange(len(posed.images)))
+    found = detect_markers(posed.images, dictionaries, np.arange(len(posed.images)))
     for (name, marker_id), seen in sorted(found.items()):
         if len(seen) < 2:
             continue

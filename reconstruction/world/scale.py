@@ -77,7 +77,7 @@ def _by_marker(posed: PosedFrames, config: WorldConfig, progress: Progress) -> M
     """Return the scale from markers, None if there are none; notes a marker in view whose size is not given."""
     if config.marker_size_m <= 0:
         rows = choose_frames(len(posed.images), 8)
-        seen = detect_markers(posed, config.marker_dictionaries[:1], rows)
+        seen = detect_markers(posed.images, config.marker_dictionaries[:1], rows)
         sure = sorted(marker_id for (_, marker_id), views in seen.items() if len(views) >= 2)
         if sure:
             progress.note(
