@@ -10,12 +10,14 @@ from registry.errors import SimReconError
 
 _EPILOG = """exit codes:
   0  done
+  1  `check`: the film is unlikely to be reconstructed
   2  wrong use (unknown flag, unknown scene, malformed file)
   3  the input cannot be reconstructed (too short, no parallax, blank, corrupt)
   4  the machine lacks something (driver, disk space, permission); see `simrecon doctor`
 
 a first run:
   simrecon doctor                                  what works on this machine, what is missing, how to get it
+  simrecon check room.mp4                          whether the film is fine, in seconds
   simrecon reconstruct room.mp4 --scene my_room    5-10 minutes on a laptop; an interrupted run resumes
   simrecon show my_room
   python -c 'import gymnasium as gym, simrecon_envs; print(gym.make("SimRecon/my_room"))'
@@ -27,6 +29,7 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all verbs."""
     from reconstruction.commands import (
         benchmark,
+        check,
         doctor,
         evaluate,
         export,
@@ -45,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_version())
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for module in (reconstruct, scenes, evaluate, report, export, marker, benchmark, train, doctor):
+    for module in (check, reconstruct, scenes, evaluate, report, export, marker, benchmark, train, doctor):
         module.add_parser(verbs)
     return parser
 

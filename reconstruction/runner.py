@@ -50,6 +50,7 @@ class Run:
     input_digest: str = ""  # of the video; computed if not given
     computed: set[str] = field(default_factory=set)  # stages that this run computed; the others were loaded
     started: float = field(default_factory=time.perf_counter)
+    after_stage: "Callable[[Run, str], None] | None" = None  # called with the name of a stage that was computed
 
     def __post_init__(self) -> None:
         """Compute the digest of the input."""
@@ -126,6 +127,8 @@ class Run:
             for note in manifest["notes"]
         )
         self.listener.end_stage(stage.name, None if kept else self.usage[stage.name])
+        if self.after_stage is not None and not kept:
+            self.after_stage(self, stage.name)
 
     def key_of(self, stage: Stage, corrections: list) -> str:
         """Return the fingerprint of a stage with these corrections."""

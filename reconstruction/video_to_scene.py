@@ -20,6 +20,7 @@ from registry.errors import InputError, UsageError
 if TYPE_CHECKING:
     from reconstruction.measure.oracle import Oracle
 
+_FEW_REGISTERED = 0.9  # of the keyframes; as a good film has in benchmarks/check_films.py
 _OBJECT_SCALE_PASSES = 3
 _OBJECT_SCALE_TOLERANCE = 0.015  # relative; half of the 1-sigma that is reported for such a scale
 
@@ -92,12 +93,42 @@ def reconstruct(
             listener,
             input_digest=digest,
             started=started,
+            after_stage=_check_registered,
         )
-        run.execute()
+        try:
+            run.execute()
+        except InputError as error:
+            if run.results.keys() & {"poses"}:
+                raise
+            raise InputError("\n".join([str(error), *_check_lines(video)])) from error
         run = _with_object_scale(run)
         record = publish_scene(run, registry, scene_id, require_stable=require_stable)
         run.store.note_published(scene_id, record.revision, run.keys)
     return Reconstruction(record, run)
+
+
+def _check_registered(run: Run, stage: str) -> None:
+    """Note the lines of `simrecon check` if the poses stage left many keyframes without a pose."""
+    if stage != "poses":
+        return
+    posed = run.results["poses"]
+    if len(posed.images) < _FEW_REGISTERED * posed.chosen_frames:
+        for line in _check_lines(run.video):
+            run.listener.note(line)
+
+
+def _check_lines(video: Path) -> list[str]:
+    """Return the lines of `simrecon check` that are not "pass"; none if the film cannot be read."""
+    from reconstruction.precheck import judge_film
+
+    try:
+        report = judge_film(video)
+    except InputError:
+        return []
+    troubled = [line for line in report.lines if line.status != "pass"]
+    if not troubled:
+        return []
+    return ["`simrecon check` says:", *(text for line in troubled for text in line.as_text())]
 
 
 def _check_backends(config: PipelineConfig) -> None:

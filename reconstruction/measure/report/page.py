@@ -14,7 +14,7 @@ from reconstruction.measure.stage_results import StageResults
 from registry import SceneBundle
 from registry.errors import EnvironmentMissing, UsageError
 
-_SOURCES = ("template.html.j2", "style.css", "script.js")
+_SOURCES = ("template.html.j2", "plain.html.j2", "blocks.html.j2", "style.css", "script.js")
 
 
 def build_page(
@@ -83,6 +83,23 @@ def render(g: Gathered) -> str:
     Raises:
         EnvironmentMissing: jinja2 is not installed.
     """
+    return render_template(
+        "template.html.j2",
+        scene=g.scene,
+        revision=g.bundle.revision,
+        picture=pictures.preview(g),
+        tiles=sections.summary_tiles(g),
+        sections=sections.all_sections(g),
+        missing=by_reason(g.stages.missing),
+    )
+
+
+def render_template(name: str, **values: Any) -> str:
+    """Render a template of this folder: "template.html.j2" of a scene, or "plain.html.j2" (title, source, sections).
+
+    Raises:
+        EnvironmentMissing: jinja2 is not installed.
+    """
     try:
         from jinja2 import DictLoader, Environment, StrictUndefined
     except ImportError as error:
@@ -98,11 +115,4 @@ def render(g: Gathered) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template("template.html.j2").render(
-        scene=g.scene,
-        revision=g.bundle.revision,
-        picture=pictures.preview(g),
-        tiles=sections.summary_tiles(g),
-        sections=sections.all_sections(g),
-        missing=by_reason(g.stages.missing),
-    )
+    return environment.get_template(name).render(**values)
