@@ -66,7 +66,7 @@ def _defocus(frames: Frames, rng: np.random.Generator) -> Frames:
     return np.stack([cv2.GaussianBlur(f, (0, 0), sigma) for f in frames])
 
 
-def _gained(frames: Frames, gain: float, noise: float, rng: np.random.Generator) -> Frames:
+def gained(frames: Frames, gain: float, noise: float, rng: np.random.Generator) -> Frames:
     """Multiply linear light, then add noise."""
     linear = (frames.astype(np.float32) / 255) ** 2.2 * gain
     out = 255 * np.clip(linear, 0, 1) ** (1 / 2.2) + noise * rng.standard_normal(frames.shape, np.float32)
@@ -74,21 +74,21 @@ def _gained(frames: Frames, gain: float, noise: float, rng: np.random.Generator)
 
 
 def _dark(frames: Frames, rng: np.random.Generator) -> Frames:
-    return _gained(frames, float(np.exp(rng.uniform(np.log(5e-4), np.log(2e-2)))), 3.0, rng)
+    return gained(frames, float(np.exp(rng.uniform(np.log(5e-4), np.log(2e-2)))), 3.0, rng)
 
 
 def _overexposed(frames: Frames, rng: np.random.Generator) -> Frames:
-    return _gained(frames, float(np.exp(rng.uniform(np.log(4), np.log(60)))), 1.0, rng)
+    return gained(frames, float(np.exp(rng.uniform(np.log(4), np.log(60)))), 1.0, rng)
 
 
 def _noisy(frames: Frames, rng: np.random.Generator) -> Frames:
-    return _gained(frames, 1.0, float(rng.uniform(25, 110)), rng)
+    return gained(frames, 1.0, float(rng.uniform(25, 110)), rng)
 
 
 def _frozen(frames: Frames, rng: np.random.Generator) -> Frames:
     """One frame, again and again, with sensor noise."""
     one = frames[int(rng.integers(len(frames)))]
-    return _gained(np.repeat(one[None], 40, axis=0), 1.0, 2.0, rng)
+    return gained(np.repeat(one[None], 40, axis=0), 1.0, 2.0, rng)
 
 
 def _short(frames: Frames, rng: np.random.Generator) -> Frames:

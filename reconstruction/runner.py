@@ -50,7 +50,9 @@ class Run:
     input_digest: str = ""  # of the video; computed if not given
     computed: set[str] = field(default_factory=set)  # stages that this run computed; the others were loaded
     started: float = field(default_factory=time.perf_counter)
-    after_stage: "Callable[[Run, str], None] | None" = None  # called with the name of a stage that was computed
+    after_stage: "Callable[[Run, str], None] | None" = (
+        None  # called with the name of a stage that was computed
+    )
 
     def __post_init__(self) -> None:
         """Compute the digest of the input."""

@@ -25,9 +25,13 @@ examples:
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Add the verb."""
-    parser = add_verb(verbs, "check", "tell in seconds whether a film will reconstruct", _DESCRIPTION, _EPILOG)
+    parser = add_verb(
+        verbs, "check", "tell in seconds whether a film will reconstruct", _DESCRIPTION, _EPILOG
+    )
     parser.add_argument("video", metavar="VIDEO", type=Path, help="a video file or a folder of images")
-    parser.add_argument("--page", type=Path, metavar="FILE.html", help="write a page with the frames that show the trouble")
+    parser.add_argument(
+        "--page", type=Path, metavar="FILE.html", help="write a page with the frames that show the trouble"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
     parser.add_argument("--verbose", action="store_true", help="log the decisions")
     parser.set_defaults(run=run)

@@ -27,7 +27,9 @@ class Coverage:
     rows: np.ndarray  # int (m,) frames of the largest connected part
     rotations: np.ndarray  # float64 (m, 3, 3) first_from_camera
     up: np.ndarray | None  # (3,) unit, in the first camera; None: not found
-    seen: np.ndarray  # int (18, 36) frames that see each cell; rows: pitch from +90 down, columns: yaw from -180
+    seen: (
+        np.ndarray
+    )  # int (18, 36) frames that see each cell; rows: pitch from +90 down, columns: yaw from -180
     lower_edge_deg: float | None  # median pitch of the lower edge of the frames; negative: below the horizon
 
     @property
@@ -62,7 +64,9 @@ def measure_coverage(grays: list[np.ndarray], pairs: list[Pair], focal_px: float
     """
     rows = largest_part(len(grays), pairs)
     height, width = grays[0].shape
-    camera = Camera(width, height, *(2 * [focal_px or _USUAL_FOCAL * max(width, height)]), width / 2, height / 2)
+    camera = Camera(
+        width, height, *(2 * [focal_px or _USUAL_FOCAL * max(width, height)]), width / 2, height / 2
+    )
     chained = _chain(rows, pairs, camera)
     up = _vertical([grays[r] for r in rows], chained, camera)
     upright = _upright(up) if up is not None else np.eye(3)
@@ -165,5 +169,3 @@ def _angles(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return yaw and pitch (k,) in degrees of directions (k, 3), axes x right, y down, z ahead."""
     x, y, z = directions.T
     return np.degrees(np.arctan2(x, z)), np.degrees(np.arcsin(np.clip(-y, -1, 1)))
-
-

@@ -162,14 +162,20 @@ def _directions(m: Figures) -> Line:
 def _floor(m: Figures) -> Line:
     lower = m.coverage.lower_edge_deg
     if lower is None:
-        return Line("floor", "warn", "the vertical could not be found", "Keep some floor and upright edges in view.")
+        return Line(
+            "floor", "warn", "the vertical could not be found", "Keep some floor and upright edges in view."
+        )
     status: Status = "pass" if m.coverage.sees_floor else "warn"
-    text = f"the frames' lower edge is {abs(lower):.0f} degrees {'below' if lower < 0 else 'above'} the horizon"
+    text = (
+        f"the frames' lower edge is {abs(lower):.0f} degrees {'below' if lower < 0 else 'above'} the horizon"
+    )
     return Line("floor", status, text, _advice(status, "Tilt the camera down, so that the floor is in view."))
 
 
 def _marker(m: Figures) -> Line:
     if m.markers:
         ids = ", ".join(map(str, m.markers[:5]))
-        return Line("marker", "pass", f"AprilTag {ids}: give its side with --marker-size METRES for a certain scale")
+        return Line(
+            "marker", "pass", f"AprilTag {ids}: give its side with --marker-size METRES for a certain scale"
+        )
     return Line("marker", "pass", "no AprilTag: the scale is a guess, see `simrecon marker`")

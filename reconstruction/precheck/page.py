@@ -14,22 +14,30 @@ _CELL_PX = 18
 
 def check_page(report: FilmReport) -> str:
     """Return the report as one self-contained HTML page."""
-    rows = [[Cell(x.status, _GRADES[x.status]), Cell(x.name), Cell(x.text), Cell(x.advice)] for x in report.lines]
+    rows = [
+        [Cell(x.status, _GRADES[x.status]), Cell(x.name), Cell(x.text), Cell(x.advice)] for x in report.lines
+    ]
     title = "Unlikely to be reconstructed" if report.fails else "Fine to reconstruct"
     sections = [Section("verdict", title, [Table(["", "property", "measured", "advice"], rows)])]
     for line in report.lines:
         if line.status != "pass" and line.frames:
             sections.append(Section(line.name, line.name, [_frames(report, line.frames)], lead=line.text))
     lead = "Frames that show each direction; the center is the first frame's view, above is up."
-    sections.append(Section("directions", "Directions in view", [_map(report.measured.coverage.seen)], lead=lead))
+    sections.append(
+        Section("directions", "Directions in view", [_map(report.measured.coverage.seen)], lead=lead)
+    )
     every = np.unique(np.linspace(0, len(report.film.images) - 1, 12).round().astype(int))
     sections.append(Section("frames", "Frames", [_frames(report, tuple(every.tolist()))]))
-    return render_template("plain.html.j2", title="Check of a film", source=report.film.file, sections=sections)
+    return render_template(
+        "plain.html.j2", title="Check of a film", source=report.film.file, sections=sections
+    )
 
 
 def _frames(report: FilmReport, rows: tuple[int, ...]) -> Block:
     film = report.film
-    return Pictures([picture(film.images[r], f"frame at {film.names[r]}", film.names[r]) for r in rows], columns=4)
+    return Pictures(
+        [picture(film.images[r], f"frame at {film.names[r]}", film.names[r]) for r in rows], columns=4
+    )
 
 
 def _map(seen: np.ndarray) -> Block:

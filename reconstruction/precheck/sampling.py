@@ -157,7 +157,9 @@ def gray_of(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
 
 
-def _choose(grays: list[np.ndarray], times: list[float], *, folder: bool = False) -> tuple[FrameStats, np.ndarray]:
+def _choose(
+    grays: list[np.ndarray], times: list[float], *, folder: bool = False
+) -> tuple[FrameStats, np.ndarray]:
     """Measure the motion; choose at most `MAX_FRAMES` frames, the sharpest of each stretch."""
     meter = MotionMeter()
     for number, (gray, time_s) in enumerate(zip(grays, times)):
@@ -166,7 +168,9 @@ def _choose(grays: list[np.ndarray], times: list[float], *, folder: bool = False
     if folder:  # photographs need not be in order, and each is one that its owner chose
         rows = np.unique(np.linspace(0, len(grays) - 1, min(MAX_FRAMES, len(grays))).round().astype(int))
         return stats, rows
-    spacing = Spacing(step=0.03, fewest=min(MAX_FRAMES, 32), most=MAX_FRAMES, blurred_below=0.4, widest_gap=0.22)
+    spacing = Spacing(
+        step=0.03, fewest=min(MAX_FRAMES, 32), most=MAX_FRAMES, blurred_below=0.4, widest_gap=0.22
+    )
     rows = choose_keyframes(stats, np.ones(len(grays), bool), spacing)
     if len(rows) < _MIN_SAMPLED:  # a camera at rest, or one too fast to follow
         rows = np.unique(np.linspace(0, len(grays) - 1, min(_MIN_SAMPLED, len(grays))).round().astype(int))
@@ -180,4 +184,3 @@ def distinct_views(film: Film) -> int:
         if position - last >= _MIN_STEP:
             count, last = count + 1, position
     return count
-

@@ -29,7 +29,9 @@ def edge_blur_px(gray: np.ndarray) -> float:
     ratio = strength[edge] / np.maximum(weaker[edge], 1e-3)
     blur = _REBLUR_PX / np.sqrt(np.maximum(ratio**2 - 1, (_REBLUR_PX / _MAX_BLUR_PX) ** 2))
     direction = (np.arctan2(gy[edge], gx[edge]) % np.pi / np.pi * _DIRECTIONS).astype(int) % _DIRECTIONS
-    medians = [np.median(blur[direction == k]) for k in range(_DIRECTIONS) if (direction == k).sum() >= _MIN_EDGES]
+    medians = [
+        np.median(blur[direction == k]) for k in range(_DIRECTIONS) if (direction == k).sum() >= _MIN_EDGES
+    ]
     if not medians:
         medians = [np.median(blur)] if len(blur) >= _MIN_EDGES else [_MAX_BLUR_PX]
     return float(np.sqrt(max(max(medians) ** 2 - _SMOOTH_PX**2, 0.0)))

@@ -49,7 +49,9 @@ def match_frames(images: np.ndarray, *, ordered: bool) -> list[Pair]:
 def _alike(features: list[Features]) -> set[tuple[int, int]]:
     scores = overlap_scores(features, NO_PROGRESS, count=128)
     best = np.argsort(-scores, axis=1, kind="stable")[:, :_ORDERLESS_PARTNERS]
-    return {(min(i, int(j)), max(i, int(j))) for i in range(len(features)) for j in best[i] if scores[i, j] > 3}
+    return {
+        (min(i, int(j)), max(i, int(j))) for i in range(len(features)) for j in best[i] if scores[i, j] > 3
+    }
 
 
 def _verified(rows: tuple[int, int], features: list[Features]) -> Pair | None:
@@ -101,7 +103,9 @@ class Parallax:
     """What rotations alone leave unexplained, under the focal length that suits them best."""
 
     focal_px: float
-    degrees: np.ndarray  # float (pairs,) upper quartile over a pair's inliers of the angle left by the best rotation
+    degrees: (
+        np.ndarray
+    )  # float (pairs,) upper quartile over a pair's inliers of the angle left by the best rotation
 
 
 def measure_parallax(pairs: list[Pair], size: tuple[int, int], focal_px: float = 0.0) -> Parallax:

@@ -37,7 +37,8 @@ def test_blur_of_step_edges_is_measured(sigma):
 def test_a_turn_leaves_no_parallax_and_a_walk_does(good, turned):
     size = (320, 240)
     walked, panned = (
-        np.median(measure_parallax(match_frames(film[::2], ordered=True), size).degrees) for film in (good, turned)
+        np.median(measure_parallax(match_frames(film[::2], ordered=True), size).degrees)
+        for film in (good, turned)
     )
     assert panned < FAIL_LIMITS["parallax_deg"] < walked
 
@@ -55,7 +56,9 @@ def test_directions_follow_a_turn_on_the_spot(turned):
 
 
 def test_verdicts_name_what_is_wrong(tmp_path, good, turned):
-    files = {name: tmp_path / f"{name}.mp4" for name in ("good", "turned", "defocused", "black", "still", "short")}
+    files = {
+        name: tmp_path / f"{name}.mp4" for name in ("good", "turned", "defocused", "black", "still", "short")
+    }
     write_video(files["good"], good)
     write_video(files["turned"], turned)
     write_video(files["defocused"], [cv2.GaussianBlur(f, (0, 0), 9.0) for f in good])
@@ -63,7 +66,8 @@ def test_verdicts_name_what_is_wrong(tmp_path, good, turned):
     write_still_camera(files["still"])
     write_video(files["short"], good[:5])
     failed = {
-        name: {line.name for line in judge_film(file).lines if line.status == "fail"} for name, file in files.items()
+        name: {line.name for line in judge_film(file).lines if line.status == "fail"}
+        for name, file in files.items()
     }
     assert failed["good"] == set()
     assert failed["turned"] == {"parallax"}
@@ -88,7 +92,14 @@ def test_command_prints_lines_json_and_a_page(tmp_path, capsys, good):
     assert main(["check", str(tmp_path / "still.mp4"), "--json"]) == 1
     said = json.loads(capsys.readouterr().out)
     assert said["fine"] is False
-    assert {line["name"] for line in said["lines"]} >= {"sharp", "parallax", "coverage", "exposure", "floor", "marker"}
+    assert {line["name"] for line in said["lines"]} >= {
+        "sharp",
+        "parallax",
+        "coverage",
+        "exposure",
+        "floor",
+        "marker",
+    }
 
 
 @pytest.mark.parametrize(
@@ -106,7 +117,15 @@ def test_broken_input_is_one_clear_error(tmp_path, capsys, content, code):
 def test_reconstruct_shows_the_lines_of_a_refused_film(tmp_path, capsys, turned):
     file = tmp_path / "turned.mp4"
     write_video(file, turned)
-    command = ["reconstruct", str(file), "--registry", str(tmp_path / "registry"), "--preset", "fast", "--quiet"]
+    command = [
+        "reconstruct",
+        str(file),
+        "--registry",
+        str(tmp_path / "registry"),
+        "--preset",
+        "fast",
+        "--quiet",
+    ]
     assert main(command) == 3
     error = capsys.readouterr().err
     assert "fail  parallax" in error
