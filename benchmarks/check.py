@@ -1,4 +1,4 @@
-"""How well `simrecon check` tells good films from bad ones, on generated rooms and on films spoiled by image operations.
+"""How well `simrecon check` tells good films of generated rooms from bad ones.
 
     python -m benchmarks.check make FOLDER       films rooms, well and badly; labels by the poses stage (25 minutes)
     python -m benchmarks.check measure FOLDER [FILM...]   figures of all generated films, and of films of your own
@@ -6,8 +6,8 @@
     python -m benchmarks.check report FOLDER     confusion on each split; which films are wrong
 
 A limit of a figure is the geometric middle between the worst good film and the nearest bad film beyond it, both of the
-split "fit": no good film of it fails. Figures whose limit fails a good film of the split "choose" are left out. The split "report" takes
-part in neither.
+split "fit": no good film of it fails. Figures whose limit fails a good film of
+the split "choose" are left out. The split "report" takes part in neither.
 """
 
 import argparse

@@ -192,7 +192,7 @@ def _blank_wall(scene: Scene, rng: np.random.Generator) -> Scene:
     middle, length = plan.shape.wall("wall_north")
     x = middle[0] + np.linspace(-0.25, 0.25, 40) * length
     eyes = np.column_stack([x, np.full(40, middle[1] - 0.7), np.full(40, rng.uniform(1.4, 1.7))])
-    path = np.stack([look_at(eye, eye + [0.1, 1.0, 0.1]) for eye in eyes])
+    path = np.stack([look_at(eye, [*eye, 0.1, 1.0, 0.1]) for eye in eyes])
     return replace(scene, film_set=prepare(furnish(plan)), world_from_camera=path)
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from reconstruction.commands.options import add_verb
 
-_DESCRIPTION = """Check VIDEO before anything else: sharpness, texture, overlap, parallax, exposure, directions in view, floor,
-marker, length. One line of verdict for each, and one of advice where something is wrong."""
+_DESCRIPTION = """Check VIDEO before anything else: sharpness, texture, overlap, parallax, exposure,
+directions in view, floor, marker, length. One line of verdict for each, and one of advice where something is wrong."""
 
 _EPILOG = """verdicts:
   pass   as in films that reconstruct

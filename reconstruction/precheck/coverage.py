@@ -64,9 +64,8 @@ def measure_coverage(grays: list[np.ndarray], pairs: list[Pair], focal_px: float
     """
     rows = largest_part(len(grays), pairs)
     height, width = grays[0].shape
-    camera = Camera(
-        width, height, *(2 * [focal_px or _USUAL_FOCAL * max(width, height)]), width / 2, height / 2
-    )
+    focal = focal_px or _USUAL_FOCAL * max(width, height)
+    camera = Camera(width, height, focal, focal, width / 2, height / 2)
     chained = _chain(rows, pairs, camera)
     up = _vertical([grays[r] for r in rows], chained, camera)
     upright = _upright(up) if up is not None else np.eye(3)

@@ -1,4 +1,4 @@
-"""Limits of the figures, fitted on generated films by `python -m benchmarks.check fit` (seeds in `check_films.SPLITS`)."""
+"""Limits of the figures, fitted on generated films by `python -m benchmarks.check fit`."""
 
 MIN_VIEWS = 8  # fewer are refused by the frames stage (`FramesConfig.min_usable_frames`)
 HIGH = ("blur_px", "clipped")  # figures of which more is worse; of all others less is worse

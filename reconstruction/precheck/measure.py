@@ -10,7 +10,7 @@ from reconstruction.precheck.coverage import Coverage, measure_coverage
 from reconstruction.precheck.exposure import Exposure, measure_exposure
 from reconstruction.precheck.sampling import Film, distinct_views, gray_of
 from reconstruction.precheck.sharpness import edge_blur_px
-from reconstruction.precheck.two_view import Pair, match_frames, measure_parallax
+from reconstruction.precheck.two_view import match_frames, measure_parallax
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.markers import detect_markers
 

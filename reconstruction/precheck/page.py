@@ -19,9 +19,11 @@ def check_page(report: FilmReport) -> str:
     ]
     title = "Unlikely to be reconstructed" if report.fails else "Fine to reconstruct"
     sections = [Section("verdict", title, [Table(["", "property", "measured", "advice"], rows)])]
-    for line in report.lines:
-        if line.status != "pass" and line.frames:
-            sections.append(Section(line.name, line.name, [_frames(report, line.frames)], lead=line.text))
+    sections += [
+        Section(line.name, line.name, [_frames(report, line.frames)], lead=line.text)
+        for line in report.lines
+        if line.status != "pass" and line.frames
+    ]
     lead = "Frames that show each direction; the center is the first frame's view, above is up."
     sections.append(
         Section("directions", "Directions in view", [_map(report.measured.coverage.seen)], lead=lead)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from reconstruction.core.progress import NO_PROGRESS, Progress
-from reconstruction.frames.decoding import ImageFolder, VideoReader, working_size
+from reconstruction.frames.decoding import ImageFolder, VideoReader
 from reconstruction.frames.keyframes import (
     ANALYSIS_SIDE_PX,
     FrameStats,

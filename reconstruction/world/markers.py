@@ -30,7 +30,7 @@ class MarkerSide:
 def detect_markers(
     images: np.ndarray, dictionaries: tuple[str, ...], rows: np.ndarray
 ) -> dict[tuple[str, int], dict[int, np.ndarray]]:
-    """Detect markers in the images `rows` of uint8 (n, h, w, 3); return {(dictionary, id): {row: corners (4, 2) in pixels}}.
+    """Detect markers in rows of images uint8 (n, h, w, 3); return {(dictionary, id): {row: corners (4, 2) in pixels}}.
 
     Raises:
         UsageError: OpenCV has no such dictionary.
