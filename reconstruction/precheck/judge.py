@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from reconstruction.core.progress import NO_PROGRESS, Progress
-from reconstruction.precheck.limits import FAIL_LIMITS, HIGH, MIN_VIEWS
+from reconstruction.precheck.limits import FAIL_LIMITS, HIGH, MIN_VIEWS, WARN_LIMITS
 from reconstruction.precheck.measure import Figures, measure_film
 from reconstruction.precheck.sampling import Film, sample_film
 
@@ -81,6 +81,9 @@ def judge_film(video: Path, progress: Progress = NO_PROGRESS) -> FilmReport:
 
 
 def _status(name: str, value: float) -> Status:
+    if name in WARN_LIMITS:
+        limit = WARN_LIMITS[name]
+        return "warn" if (value > limit if name in HIGH else value < limit) else "pass"
     limit = FAIL_LIMITS[name]
     low, high = (value, limit) if name not in HIGH else (limit, value)
     return "fail" if low < high else "warn" if low < high * _NEAR else "pass"
@@ -111,7 +114,7 @@ def _length(film: Film, m: Figures) -> Line:
 
 def _sharp(m: Figures, v: dict[str, float]) -> Line:
     status = _status("blur_px", v["blur_px"])
-    text = f"edges are blurred by {v['blur_px']:.1f} px (limit {FAIL_LIMITS['blur_px']:.1f}, in frames of 480 px)"
+    text = f"edges are blurred by {v['blur_px']:.1f} px (limit {WARN_LIMITS['blur_px']:.1f}, in frames of 480 px)"
     advice = "Move slowly, use more light, tap to focus."
     return Line("sharp", status, text, _advice(status, advice), _rows(-m.blur_px))
 
@@ -146,7 +149,7 @@ def _exposure(m: Figures, v: dict[str, float]) -> Line:
         status = _worst(status, "warn")
     text = f"bright parts at {v['bright']:.0f} of 255, {100 * v['clipped']:.0f} % clipped, "
     text += f"exposure drifts by {v['drift_stops']:.1f} stops"
-    dark = v["bright"] < _NEAR * FAIL_LIMITS["bright"]
+    dark = v["bright"] < WARN_LIMITS["bright"]
     advice = "Turn on the light." if dark else "Lock the exposure; avoid windows in view."
     rows = _rows(m.exposure.bright if dark else -m.exposure.clipped)
     return Line("exposure", status, text, _advice(status, advice), rows)
