@@ -3,7 +3,8 @@
     python -m benchmarks.check_real FILM...
 
 Of each film three spoiled ones are made, by turns, from its sampled frames: defocused, dark, one frame again
-and again, a turn on the spot (one frame warped by homographies K R K^-1), a blank crop, a few frames. They are bad by construction. Exit code 1 where
+and again, a turn on the spot (one frame warped by homographies K R K^-1), a blank crop, a few
+frames. They are bad by construction. Exit code 1 where
 one is told wrongly.
 """
 
