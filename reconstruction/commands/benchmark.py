@@ -188,6 +188,12 @@ def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None
         metavar="MODE",
         help="observations: state_dict, or rgb and others if this machine can render (default: state_dict)",
     )
+    parser.add_argument(
+        "--demo-renderer",
+        default="mesh",
+        choices=("mesh", "splats"),
+        help="images from the scene's meshes or from its Gaussians (default: mesh)",
+    )
 
 
 def _add_work(parser: argparse.ArgumentParser, jobs: bool = True) -> None:

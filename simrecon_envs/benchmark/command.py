@@ -147,6 +147,7 @@ def _record_demos(
         maniskill=arguments.maniskill,
         lerobot=arguments.lerobot,
         obs_mode=arguments.demo_obs,
+        renderer=arguments.demo_renderer,
         episodes=episodes,
         registry=arguments.registry,
         any_revision=any_revision,

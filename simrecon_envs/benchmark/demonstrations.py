@@ -27,6 +27,7 @@ def record_demonstrations(
     maniskill: Path | None = None,
     lerobot: Path | None = None,
     obs_mode: str = "state_dict",
+    renderer: str = "mesh",
     episodes: int | None = None,
     registry: Path | None = None,
     any_revision: bool = False,
@@ -40,6 +41,7 @@ def record_demonstrations(
         maniskill: Folder for ManiSkill trajectories; one subfolder per task.
         lerobot: Folder for LeRobot datasets; one per robot, since action spaces differ.
         obs_mode: "state_dict", or a mode with images.
+        renderer: "mesh" or "splats", see `SceneEnv`.
         episodes: Greatest number per task; all where None.
         registry: The registry's folder; the default registry where None.
         any_revision: Accept scenes with another revision than the suite's.
@@ -64,7 +66,7 @@ def record_demonstrations(
     count = steps = 0
     written: list[str] = []
     for task in tasks:
-        env = suite.make(task, registry=root, control_mode=CONTROL_MODE, obs_mode=obs_mode)
+        env = suite.make(task, registry=root, control_mode=CONTROL_MODE, obs_mode=obs_mode, renderer=renderer)
         file, seeds = None, task.seeds[:episodes]
         try:
             file = TrajectoryFile(env, maniskill / task.name) if maniskill is not None else None
