@@ -141,7 +141,7 @@ class _Watch:
         shown = self._show(picture, extrinsic, intrinsics)
         planes, _ = self._layer._rasterizer._images[picture.depth_mm.shape]
         mesh, light = picture.segmentation != 0, planes[4]
-        room = ndimage.binary_fill_holes(mesh | (light < 0.5))
+        room = np.asarray(ndimage.binary_fill_holes(mesh | (light < 0.5)))
         self.pictures += 1
         self.pixels += int(room.sum())
         self.holes += int((room & ~mesh & (light > 0.1)).sum())

@@ -167,7 +167,7 @@ def attach(env: Any, scene: SplatScene) -> SplatLayer:
 
 def _unlit(entity: sapien.Entity) -> None:
     """Let an actor show its texture unchanged: textures from a video have the room's light in them."""
-    body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+    body: Any = entity.find_component_by_type(sapien.render.RenderBodyComponent)
     for shape in body.render_shapes if body is not None else ():
         for part in shape.parts:
             material = part.material
