@@ -35,7 +35,8 @@ _SIZE = (240, 180)
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.metres", description=__doc__.split("\n\n")[0])
+    about = (__doc__ or "").split("\n\n")[0]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.metres", description=about)
     parser.add_argument("--rooms", type=int, default=60, help="how many (default: %(default)s)")
     parser.add_argument(
         "--seed", type=int, default=1000, help="number of the first room (default: %(default)s)"

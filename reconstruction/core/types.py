@@ -205,8 +205,9 @@ class DepthMaps:
 class ScaleEstimate:
     """Source and accuracy of the metric scale."""
 
-    # "marker" | "user-camera-height" | "user-distance" | "user-object" | "user-factor" |
-    # "imported-poses" | "metric-depth" | "usual-sizes" | "camera-height-prior" | "table-height-prior" | "subject-distance-prior" | "unknown"
+    # "marker" | "user-camera-height" | "user-distance" | "user-object" | "user-factor" | "imported-poses" |
+    # "metric-depth" | "usual-sizes" | "camera-height-prior" | "table-height-prior" | "subject-distance-prior" |
+    # "unknown"
     method: str
     uncertainty: float  # relative standard deviation of the scale
     detail: str  # one sentence for users

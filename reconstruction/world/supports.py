@@ -89,10 +89,10 @@ def _connected(heights: np.ndarray, cells: np.ndarray, cell: float) -> list[Supp
     grid = np.zeros(cells.max(axis=0) - corner + 1, bool)
     grid[tuple((cells - corner).T)] = True
     closed = ndimage.binary_closing(np.pad(grid, 2), np.ones((3, 3)))[2:-2, 2:-2] | grid
-    labels, count = ndimage.label(closed, np.ones((3, 3)))
+    count, labels = cv2.connectedComponents(closed.astype(np.uint8), connectivity=8)
     of_point = labels[tuple((cells - corner).T)]
     found = []
-    for number in range(1, count + 1):
+    for number in range(1, count):
         own = np.argwhere(labels == number)
         if len(own) < _MIN_CELLS:
             continue
