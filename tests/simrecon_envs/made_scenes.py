@@ -8,7 +8,6 @@ from masses import mass_entry
 
 from reconstruction.gaussians import write_ply
 from reconstruction.gaussians.model import from_packed
-from reconstruction.instances.gaussian_ids import add_instances_to_ply
 from registry import SceneRegistry, seal_bundle
 from registry.geometry import GLTF_FROM_WORLD
 
@@ -145,8 +144,9 @@ class BundleWriter:
             np.full((len(points), 1), 4.0),
             np.tile(sh, (len(points), 1)),
         ]
-        write_ply(from_packed(np.concatenate(columns, axis=1)), self.folder / "gaussians.ply")
-        add_instances_to_ply(self.folder / "gaussians.ply", np.concatenate(ids))
+        write_ply(
+            from_packed(np.concatenate(columns, axis=1)), self.folder / "gaussians.ply", np.concatenate(ids)
+        )
         self.gaussians = {"file": "gaussians.ply", "count": len(points)}
 
     def seal(self, scene_id: str) -> None:
