@@ -100,7 +100,7 @@ def reconstruct(
         except InputError as error:
             if run.results.keys() & {"poses"}:
                 raise
-            raise InputError("\n".join([str(error), *_check_lines(video)])) from error
+            raise InputError("\n".join([str(error), *_check_summary(video)])) from error
         run = _with_object_scale(run)
         record = publish_scene(run, registry, scene_id, require_stable=require_stable)
         run.store.note_published(scene_id, record.revision, run.keys)
@@ -108,27 +108,31 @@ def reconstruct(
 
 
 def _check_registered(run: Run, stage: str) -> None:
-    """Note the lines of `simrecon check` if the poses stage left many keyframes without a pose."""
+    """Note what `simrecon check` finds if the poses stage left many keyframes without a pose."""
     if stage != "poses":
         return
     posed = run.results["poses"]
     if len(posed.images) < _FEW_REGISTERED * posed.chosen_frames:
-        for line in _check_lines(run.video):
+        for line in _check_summary(run.video):
             run.listener.note(line)
 
 
-def _check_lines(video: Path) -> list[str]:
-    """Return the lines of `simrecon check` that are not "pass"; none if the film cannot be read."""
+def _check_summary(video: Path) -> list[str]:
+    """Return one line with the properties that fail in `simrecon check`, and advice on the first of them.
+
+    The list is empty if none fails, or if the film cannot be read.
+    """
     from reconstruction.precheck import judge_film
 
     try:
         report = judge_film(video)
     except InputError:
         return []
-    troubled = [line for line in report.lines if line.status != "pass"]
-    if not troubled:
+    failed = [line for line in report.lines if line.status == "fail"]
+    if not failed:
         return []
-    return ["`simrecon check` says:", *(text for line in troubled for text in line.as_text())]
+    names = ", ".join(line.name for line in failed)
+    return [f"`simrecon check {video.name}` fails it for: {names}. {failed[0].advice}"]
 
 
 def _check_backends(config: PipelineConfig) -> None:
