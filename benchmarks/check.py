@@ -1,7 +1,7 @@
 """How well `simrecon check` tells good films of generated rooms from bad ones.
 
     python -m benchmarks.check make FOLDER       films rooms, well and badly; labels by the poses stage (25 minutes)
-    python -m benchmarks.check measure FOLDER [FILM...]   figures of all generated films, and of films of your own
+    python -m benchmarks.check measure FOLDER    figures of all generated films
     python -m benchmarks.check fit FOLDER        limits of `reconstruction/precheck/limits.py` from the splits
     python -m benchmarks.check report FOLDER     confusion on each split; which films are wrong
 
@@ -20,14 +20,12 @@ import numpy as np
 
 from benchmarks.check_films import SPLITS, make_films
 from benchmarks.command import guarded
-from reconstruction.precheck import judge_film, measure_film, sample_film
-from reconstruction.precheck.limits import FAIL_LIMITS, fails
+from reconstruction.precheck import measure_film, sample_film
+from reconstruction.precheck.limits import FAIL_LIMITS, HIGH, fails
 from registry.errors import UsageError
 
 LOW = ("matches", "spread", "parallax_deg", "connected", "bright")
 """Figures of which less is worse."""
-HIGH = ("blur_px", "clipped")
-"""Figures of which more is worse."""
 
 
 def measured(folder: Path, split: str) -> list[tuple[dict, dict[str, float]]]:
@@ -74,7 +72,6 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("step", choices=("make", "measure", "fit", "report"))
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    parser.add_argument("films", type=Path, nargs="*", metavar="FILM", help="measure these instead")
     return parser
 
 
@@ -91,10 +88,6 @@ def _run(arguments: argparse.Namespace) -> int:
             for seed in seeds:
                 made = make_films(split, seed, folder / split)
                 print(split, *(film.name for film in made), flush=True)
-    elif arguments.step == "measure" and arguments.films:
-        for film in arguments.films:
-            report = judge_film(film)
-            print(film, "fails" if report.fails else "passes", json.dumps(report.figures), flush=True)
     elif arguments.step == "measure":
         for label in sorted(folder.glob("*/*/label.json")):
             if not label.with_name("figures.json").exists():

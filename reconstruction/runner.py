@@ -50,9 +50,7 @@ class Run:
     input_digest: str = ""  # of the video; computed if not given
     computed: set[str] = field(default_factory=set)  # stages that this run computed; the others were loaded
     started: float = field(default_factory=time.perf_counter)
-    after_stage: "Callable[[Run, str], None] | None" = (
-        None  # called with the name of a stage that was computed
-    )
+    after_stage: "Callable[[Run, str], None] | None" = None  # called with the name of each computed stage
 
     def __post_init__(self) -> None:
         """Compute the digest of the input."""

@@ -249,9 +249,7 @@ class SceneEnv(BaseEnv):
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
         if self._splats is not None and self.scene.can_render():
-            from simrecon_envs.splats.cameras import (
-                attach,
-            )  # Numba is imported, and kernels are compiled, only here
+            from simrecon_envs.splats.cameras import attach  # imports Numba and compiles kernels
 
             self._randomizer.layer = attach(self, self._splats)
 

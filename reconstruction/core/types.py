@@ -171,9 +171,7 @@ class PosedFrames:
     ordered: bool  # rows are in time order
     reprojection_error_px: float  # mean
     metric: bool = False  # `sfm` is in metres: poses were imported from a metric tracker (ARKit)
-    distorted: DistortedCamera | None = (
-        None  # of the frames as recorded, at this size; None: `camera` is theirs
-    )
+    distorted: DistortedCamera | None = None  # of the recorded frames, at this size; None: `camera` is theirs
 
     def __post_init__(self) -> None:
         """Check dtypes and shapes."""

@@ -113,8 +113,8 @@ def _textures_shifted(material: dict, shift: int) -> dict:
 
 def _read(path: Path) -> tuple[dict, bytes]:
     """Read the JSON and binary chunks of a `.glb`; reject what cannot be merged by shifting indices."""
-    document, start = read_glb_json(path, str(path))
     try:
+        document, start = read_glb_json(path, str(path))
         if document.get("extensionsUsed") or any("sparse" in a for a in document.get("accessors", [])):
             raise ValueError("it uses glTF extensions or sparse accessors")
         if not document["meshes"] or not document["scenes"][document.get("scene", 0)]["nodes"]:
@@ -123,6 +123,6 @@ def _read(path: Path) -> tuple[dict, bytes]:
         data = path.read_bytes()[start : start + size]
         if len(document["buffers"]) != 1 or len(data) != size:
             raise ValueError("its buffer is external or truncated")
-    except (ValueError, KeyError, IndexError) as error:
+    except (OSError, ValueError, KeyError, IndexError) as error:
         raise BundleError(f"{path}: cannot be merged into scene.glb ({error})") from error
     return document, data

@@ -27,9 +27,7 @@ class Coverage:
     rows: np.ndarray  # int (m,) frames of the largest connected part
     rotations: np.ndarray  # float64 (m, 3, 3) first_from_camera
     up: np.ndarray | None  # (3,) unit, in the first camera; None: not found
-    seen: (
-        np.ndarray
-    )  # int (18, 36) frames that see each cell; rows: pitch from +90 down, columns: yaw from -180
+    seen: np.ndarray  # int (18, 36) frames that see a cell; rows: pitch from +90 down, columns: yaw from -180
     lower_edge_deg: float | None  # median pitch of the lower edge of the frames; negative: below the horizon
 
     @property

@@ -13,6 +13,7 @@ from reconstruction.precheck.sharpness import edge_blur_px
 from reconstruction.precheck.two_view import match_frames, measure_parallax
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.markers import detect_markers
+from reconstruction.world.samples import choose_frames
 
 _GRID = 8  # cells along each side of a frame
 _MARKER_FRAMES = 12
@@ -83,6 +84,6 @@ def _spread(points: np.ndarray, size: tuple[int, int]) -> float:
 
 
 def _markers(film: Film) -> tuple[int, ...]:
-    rows = np.unique(np.linspace(0, len(film.images) - 1, _MARKER_FRAMES).round().astype(int))
+    rows = choose_frames(len(film.images), _MARKER_FRAMES)
     seen = detect_markers(film.images, WorldConfig().marker_dictionaries[:1], rows)
     return tuple(sorted(marker for (_, marker), views in seen.items() if len(views) >= 2))

@@ -7,6 +7,7 @@ from reconstruction.measure.report.blocks import Block, Cell, Pictures, Section,
 from reconstruction.measure.report.page import render_template
 from reconstruction.measure.report.pictures import picture
 from reconstruction.precheck.judge import FilmReport
+from reconstruction.world.samples import choose_frames
 
 _GRADES = {"pass": "good", "warn": "warn", "fail": "bad"}
 _CELL_PX = 18
@@ -28,7 +29,7 @@ def check_page(report: FilmReport) -> str:
     sections.append(
         Section("directions", "Directions in view", [_map(report.measured.coverage.seen)], lead=lead)
     )
-    every = np.unique(np.linspace(0, len(report.film.images) - 1, 12).round().astype(int))
+    every = choose_frames(len(report.film.images), 12)
     sections.append(Section("frames", "Frames", [_frames(report, tuple(every.tolist()))]))
     return render_template(
         "plain.html.j2", title="Check of a film", source=report.film.file, sections=sections

@@ -17,6 +17,7 @@ from reconstruction.frames.keyframes import (
     choose_keyframes,
 )
 from reconstruction.phone_exports.exports import find_export
+from reconstruction.world.samples import choose_frames
 from registry.errors import InputError, UsageError
 
 MAX_FRAMES = 48  # sampled; more frames cost more time and change no verdict on the generated films
@@ -35,19 +36,13 @@ class Film:
     width: int
     height: int
     fps: float  # 0 for a folder of images
-    frame_count: int  # decoded; of intra-coded frames only, if `intra_only`
+    frame_count: int  # decoded; of a large film: intra-coded frames
     duration_s: float  # 0 for a folder of images
     images: np.ndarray  # uint8 (n, h, w, 3) RGB, longer side at most `ANALYSIS_SIDE_PX`
     names: tuple[str, ...]  # (n,) time, or file name, of each sampled frame
     stats: FrameStats  # of the metered frames
     focal_prior_px: float  # at the sampled size, 0 where unknown
-    intra_only: bool = False
     damage: str = ""  # of the file, in words
-
-    @property
-    def travel(self) -> float:
-        """Total displacement of the view, in shares of the longer image side."""
-        return self.stats.position[-1] - self.stats.position[0] if self.stats.position else 0.0
 
 
 class _IntraReader(VideoReader):
@@ -107,7 +102,7 @@ def _sample_video(path: Path, progress: Progress) -> Film:
     rate = reader.nominal_fps if intra_only or span <= 0 else (decoded - 1) / max(span, 1e-6)
     return Film(
         str(path), reader.width, reader.height, rate, decoded, span, np.stack([kept[r][0] for r in rows]),
-        tuple(f"{times[r]:.1f} s" for r in rows), stats, reader.focal_prior_px(ANALYSIS_SIDE_PX), intra_only, damage,
+        tuple(f"{times[r]:.1f} s" for r in rows), stats, reader.focal_prior_px(ANALYSIS_SIDE_PX), damage,
     )  # fmt: skip
 
 
@@ -166,14 +161,13 @@ def _choose(
         meter.add(number, time_s, gray)
     stats = meter.stats
     if folder:  # photographs need not be in order, and each is one that its owner chose
-        rows = np.unique(np.linspace(0, len(grays) - 1, min(MAX_FRAMES, len(grays))).round().astype(int))
-        return stats, rows
+        return stats, choose_frames(len(grays), MAX_FRAMES)
     spacing = Spacing(
         step=0.03, fewest=min(MAX_FRAMES, 32), most=MAX_FRAMES, blurred_below=0.4, widest_gap=0.22
     )
     rows = choose_keyframes(stats, np.ones(len(grays), bool), spacing)
     if len(rows) < _MIN_SAMPLED:  # a camera at rest, or one too fast to follow
-        rows = np.unique(np.linspace(0, len(grays) - 1, min(_MIN_SAMPLED, len(grays))).round().astype(int))
+        rows = choose_frames(len(grays), _MIN_SAMPLED)
     return stats, rows
 
 

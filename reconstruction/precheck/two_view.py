@@ -100,12 +100,10 @@ def rays(points: np.ndarray, focal_px: float, center: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Parallax:
-    """What rotations alone leave unexplained, under the focal length that suits them best."""
+    """Parallax of pairs of frames: angles between matched rays after the best rotation."""
 
-    focal_px: float
-    degrees: (
-        np.ndarray
-    )  # float (pairs,) upper quartile over a pair's inliers of the angle left by the best rotation
+    focal_px: float  # given, or the one with the smallest angles
+    degrees: np.ndarray  # float (pairs,) upper quartile of the angles of a pair's inliers
 
 
 def measure_parallax(pairs: list[Pair], size: tuple[int, int], focal_px: float = 0.0) -> Parallax:

@@ -13,9 +13,7 @@ _BAND_SHARE = 0.012  # thickness of a height layer, as a share of the median dep
 _CELL_SHARE = 0.025  # side of the grid cells, as a share of the median depth
 _MIN_CELLS = 12  # smaller patches are the tops of things
 _MIN_AREA_SHARE = 0.03  # smallest area of the surfaces at one height, as a share of the squared camera height
-_SAME_HEIGHT = (
-    0.03  # surfaces whose heights differ by less (relative) count once: a set of chairs, a split table top
-)
+_SAME_HEIGHT = 0.03  # relative: surfaces of one height count once (a set of chairs, a split table top)
 _TOP_QUANTILE = 0.995  # the remaining points may be outliers
 
 

@@ -18,10 +18,8 @@ from simrecon_envs.splats.kernels import DEPTH_SUM, LIGHT, RED_SUM, WX, WY, XC, 
 from simrecon_envs.splats.rasterizer import Drawn
 
 NOTHING = np.float32(1e6)  # a depth behind everything, metres
-_AGREE = (
-    0.02  # of depth: the Gaussians' expected and median depth are of one surface; a mesh is at the same place
-)
-_AGREE_M = 0.02
+# Depths that differ by less (relative, or in metres) are of one surface.
+_AGREE, _AGREE_M = 0.02, 0.02
 _MAX_MM = 32767.0
 
 
@@ -30,16 +28,14 @@ class Actors:
     """For each segmentation id of SAPIEN: what it is. Unknown ids are robot and added things."""
 
     body: np.ndarray  # int32 (k,) row in `SplatScene.world_from_body`, -1 for robot and added things
-    margin_m: (
-        np.ndarray
-    )  # float32 (k,) depth behind the actor's mesh from where on other Gaussians do not count
+    margin_m: np.ndarray  # float32 (k,) depth behind the actor's mesh at which other Gaussians end
     tint: np.ndarray  # float32 (k, 3) factor of the picture's color
     segmentation: np.ndarray  # int16 (b,) the reverse: segmentation id of each body, 0 for none
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What a camera shows."""
+    """Color, depth and segmentation images of one camera."""
 
     rgb: np.ndarray  # uint8 (h, w, 3)
     depth_mm: np.ndarray  # int16 (h, w), 0 is nothing

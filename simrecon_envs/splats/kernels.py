@@ -29,19 +29,13 @@ N_PROJECTED = 16
 # Planes of the image: sum of weight times color (3) and depth; transmittance.
 RED_SUM, GREEN_SUM, BLUE_SUM, DEPTH_SUM, LIGHT = range(5)
 N_PLANES = 5
-_LIMIT, _OWNER, _FRONT, _LANES = (
-    5,
-    6,
-    7,
-    8,
-)  # and, inside a tile: limit, body, Gaussian (exact below 2^24), column
+# Further planes of a tile: depth limit, body, Gaussian (exact below 2^24), column.
+_LIMIT, _OWNER, _FRONT, _LANES = 5, 6, 7, 8
 _MIN_COSINE = 0.01  # between normal and ray; splats seen more edge-on are culled
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _HALF = np.float32(0.5)
 _ALPHA_MAX = np.float32(0.99)
-_STOP = np.float32(
-    1.0 / 255.0
-)  # transmittance below which a pixel is finished: what is behind changes no color value
+_STOP = np.float32(1 / 255)  # transmittance below which a pixel is finished: no 8-bit color changes any more
 _FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
 # exp(-rho / 2) = exp(x)^16 with x = -rho / 32, by the Taylor polynomial of exp(x): relative error 6e-5 for rho < 7.
 _STEP, _E2, _E3, _E4 = np.float32(-1 / 32), np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24)
@@ -62,8 +56,16 @@ def compiled(**options):
 
 
 @compiled(inline="always")
-def _bounds(center, size, middle, extent, around):
-    """Return the first and last (exclusive) pixel of an interval about the projected center."""
+def _bounds(focal, along, principal, u, v, uz, vz, k, around, size):
+    """Return the first and last (exclusive) pixel of a splat along one image axis.
+
+    Exact bounds of the projected ellipse u^2 + v^2 = reach^2, united with those of the screen-space filter.
+    `along` is the center's offset from the principal point, u and v are the tangents' components along the axis.
+    """
+    tu, tv = focal * u - along * uz, focal * v - along * vz
+    middle = k * (tu * uz + tv * vz)
+    extent = math.sqrt(max(middle * middle - k * (tu * tu + tv * tv), 0.0))
+    center = along + principal
     low = max(center + min(middle - extent, -around), -1.0)
     high = min(center + max(middle + extent, around), size + 1.0)
     return max(int(math.ceil(low - 0.5)), 0), min(int(math.floor(high - 0.5)) + 1, size)
@@ -111,22 +113,15 @@ def project(
         around = math.sqrt(reach2 * 0.5)
         inverse_z = 1.0 / pz
         along_x, along_y = fx * px * inverse_z, fy * py * inverse_z
-        # Exact bounds of the projected ellipse u^2 + v^2 = reach^2, united with those of the screen-space filter.
         s = reach2 * (uz * uz + vz * vz) - pz * pz
         if s >= 0.0:  # it reaches behind the camera: no bounds
             x0, y0, x1, y1 = 0, 0, width, height
         else:
             k = reach2 / s
-            tu, tv = fx * ux - along_x * uz, fx * vx - along_x * vz
-            middle = k * (tu * uz + tv * vz)
-            extent = math.sqrt(max(middle * middle - k * (tu * tu + tv * tv), 0.0))
-            x0, x1 = _bounds(along_x + cx, width, middle, extent, around)
+            x0, x1 = _bounds(fx, along_x, cx, ux, vx, uz, vz, k, around, width)
             if x0 >= x1:
                 continue
-            tu, tv = fy * uy - along_y * uz, fy * vy - along_y * vz
-            middle = k * (tu * uz + tv * vz)
-            extent = math.sqrt(max(middle * middle - k * (tu * tu + tv * tv), 0.0))
-            y0, y1 = _bounds(along_y + cy, height, middle, extent, around)
+            y0, y1 = _bounds(fy, along_y, cy, uy, vy, uz, vz, k, around, height)
             if y0 >= y1:
                 continue
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
