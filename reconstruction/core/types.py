@@ -3,44 +3,17 @@
 Conventions (docs/conventions.md): transforms are `b_from_a`, float64 4x4. Camera frames are OpenCV: +x right, +y down,
 +z forward. `sfm` space has arbitrary scale and orientation. `world` is in metres, +z up, floor at z = 0. Images are
 sRGB. Depth is z-depth, 0 = unknown. The centre of the first pixel is (0.5, 0.5). Instance ids are integers >= 1 with
-one meaning in all artifacts; 0 = none. Quaternions are wxyz. `reconstruction.core.artifacts` saves and loads them.
+one meaning in all artifacts; 0 = none. Quaternions are wxyz. Annotations give dtype and axes of arrays, as in
+`CheckedArrays`. `reconstruction.core.artifacts` saves and loads artifacts.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
+from reconstruction.core.checked_arrays import CheckedArrays
 from registry.geometry import split_similarity
-
-
-def check_arrays(owner: Any, **expected: str) -> None:
-    """Check dtype and shape of the array fields of `owner`, e.g. `check_arrays(self, points="float64 p 3")`.
-
-    Args:
-        owner: instance of a dataclass.
-        **expected: for a field, its dtype and its axes. Axes of the same name have the same length in all fields of
-            the call. A field that is None passes.
-
-    Raises:
-        ValueError: a field has another dtype, rank or length; names the class and the field.
-    """
-    lengths: dict[str, int] = {}
-    for name, text in expected.items():
-        array, (dtype, *axes) = getattr(owner, name), text.split()
-        if array is None:
-            continue
-        shape = np.shape(array)
-        fits = len(shape) == len(axes) and all(
-            size == (int(axis) if axis.isdigit() else lengths.setdefault(axis, size))
-            for axis, size in zip(axes, shape)
-        )
-        if not fits or getattr(array, "dtype", None) != dtype:
-            known = "".join(f", {axis} = {lengths[axis]}" for axis in axes if axis in lengths)
-            raise ValueError(
-                f"{type(owner).__name__}.{name}: expected {dtype} ({', '.join(axes)}){known}; "
-                f"got {getattr(array, 'dtype', type(array).__name__)} {shape}"
-            )
 
 
 @dataclass(frozen=True)
@@ -57,26 +30,19 @@ class VideoSource:
 
 
 @dataclass(frozen=True)
-class FrameSet:
+class FrameSet(CheckedArrays):
     """Stage 1: n keyframes and m held-out frames, upright, at working resolution."""
 
     source: VideoSource
-    images: np.ndarray  # uint8 (n, h, w, 3) RGB keyframes in time order
-    indices: np.ndarray  # int32 (n,) decoded video frame numbers
-    times_s: np.ndarray  # float64 (n,)
-    sharpness: np.ndarray  # float32 (n,) larger is sharper; comparable within one video only
-    held_out_images: np.ndarray  # uint8 (m, h, w, 3) frames with index % 10 == 0, for evaluation only
-    held_out_indices: np.ndarray  # int32 (m,) decoded video frame numbers; disjoint from `indices`
-    held_out_times_s: np.ndarray  # float64 (m,)
+    images: Annotated[np.ndarray, "uint8 n h w 3"]  # RGB keyframes in time order
+    indices: Annotated[np.ndarray, "int32 n"]  # decoded video frame numbers
+    times_s: Annotated[np.ndarray, "float64 n"]
+    sharpness: Annotated[np.ndarray, "float32 n"]  # larger is sharper; comparable within one video only
+    held_out_images: Annotated[np.ndarray, "uint8 m h w 3"]  # index % 10 == 0, for evaluation only
+    held_out_indices: Annotated[np.ndarray, "int32 m"]  # decoded video frame numbers; disjoint from `indices`
+    held_out_times_s: Annotated[np.ndarray, "float64 m"]
     focal_prior_px: float  # focal length from metadata, 0 = unknown
     ordered: bool  # True: video; False: image folder, where neighbours in name order may be far apart
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(
-            self, images="uint8 n h w 3", indices="int32 n", times_s="float64 n", sharpness="float32 n",
-            held_out_images="uint8 m h w 3", held_out_indices="int32 m", held_out_times_s="float64 m",
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,70 +99,49 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class DistortedCamera:
+class DistortedCamera(CheckedArrays):
     """A camera with lens distortion, in COLMAP's terms; pixels as in `Camera`."""
 
     model: str  # COLMAP's name: "SIMPLE_RADIAL", "RADIAL", "OPENCV", …
     width: int
     height: int
-    params: np.ndarray  # float64 (k,) focal lengths, principal point and distortion, in the model's order
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, params="float64 k")
+    params: Annotated[np.ndarray, "float64 k"]  # focal lengths, principal point, distortion
 
 
 @dataclass(frozen=True)
-class PosedFrames:
+class PosedFrames(CheckedArrays):
     """Stage 2: undistorted frames with cameras and sparse points, in `sfm` space; `WorldFrame.apply_to` moves them."""
 
     source: VideoSource
     camera: Camera  # shared by all frames, at the resolution of `images`
-    images: np.ndarray  # uint8 (n, h, w, 3) RGB keyframes
-    indices: np.ndarray  # int32 (n,) decoded video frame numbers
-    times_s: np.ndarray  # float64 (n,)
-    world_from_camera: np.ndarray  # float64 (n, 4, 4) rigid
-    sharpness: np.ndarray  # float32 (n,) as in `FrameSet`
-    held_out_images: np.ndarray  # uint8 (m, h, w, 3) RGB; only frames that could be registered
-    held_out_indices: np.ndarray  # int32 (m,) decoded video frame numbers
-    held_out_times_s: np.ndarray  # float64 (m,)
-    held_out_world_from_camera: np.ndarray  # float64 (m, 4, 4) rigid
-    points: np.ndarray  # float64 (p, 3) sparse points
-    point_colors: np.ndarray  # uint8 (p, 3) RGB
-    point_errors_px: np.ndarray  # float32 (p,) mean reprojection error
-    observations: np.ndarray  # int32 (o, 2) pairs (frame row, point row): the frame sees the point
-    chosen_frames: (
-        int  # number of keyframes before registration; len(images) / chosen_frames is the registered share
-    )
+    images: Annotated[np.ndarray, "uint8 n h w 3"]  # RGB keyframes
+    indices: Annotated[np.ndarray, "int32 n"]  # decoded video frame numbers
+    times_s: Annotated[np.ndarray, "float64 n"]
+    world_from_camera: Annotated[np.ndarray, "float64 n 4 4"]  # rigid
+    sharpness: Annotated[np.ndarray, "float32 n"]  # as in `FrameSet`
+    held_out_images: Annotated[np.ndarray, "uint8 m h w 3"]  # RGB; only frames that could be registered
+    held_out_indices: Annotated[np.ndarray, "int32 m"]  # decoded video frame numbers
+    held_out_times_s: Annotated[np.ndarray, "float64 m"]
+    held_out_world_from_camera: Annotated[np.ndarray, "float64 m 4 4"]  # rigid
+    points: Annotated[np.ndarray, "float64 p 3"]  # sparse points
+    point_colors: Annotated[np.ndarray, "uint8 p 3"]  # RGB
+    point_errors_px: Annotated[np.ndarray, "float32 p"]  # mean reprojection error
+    observations: Annotated[np.ndarray, "int32 o 2"]  # pairs (frame row, point row): the frame sees the point
+    chosen_frames: int  # keyframes before registration; len(images) / chosen_frames is the registered share
     ordered: bool  # rows are in time order
     reprojection_error_px: float  # mean
     metric: bool = False  # `sfm` is in metres: poses were imported from a metric tracker (ARKit)
     distorted: DistortedCamera | None = None  # of the recorded frames, at this size; None: `camera` is theirs
 
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(
-            self, images="uint8 n h w 3", indices="int32 n", times_s="float64 n", world_from_camera="float64 n 4 4",
-            sharpness="float32 n", held_out_images="uint8 m h w 3", held_out_indices="int32 m",
-            held_out_times_s="float64 m", held_out_world_from_camera="float64 m 4 4", points="float64 p 3",
-            point_colors="uint8 p 3", point_errors_px="float32 p", observations="int32 o 2",
-        )  # fmt: skip
-
 
 @dataclass(frozen=True)
-class DepthMaps:
+class DepthMaps(CheckedArrays):
     """Stage 3: one depth map per keyframe of `PosedFrames`, in the units of its poses."""
 
     camera: Camera  # of the keyframes, at depth resolution
-    depth: np.ndarray  # float32 (n, h, w) z-depth, 0 = unknown
-    confidence: np.ndarray  # uint8 (n, h, w) 0 unknown, 1 completed by a plane around it, 2 measured
-    affinity: np.ndarray | None = (
-        None  # uint8 (n, 6, ceil(h / 2), ceil(w / 2)), see `depth.mending.pack_affinities`
-    )
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, depth="float32 n h w", confidence="uint8 n h w", affinity="uint8 n 6 h2 w2")
+    depth: Annotated[np.ndarray, "float32 n h w"]  # z-depth, 0 = unknown
+    confidence: Annotated[np.ndarray, "uint8 n h w"]  # 0 unknown, 1 completed by a plane, 2 measured
+    affinity: Annotated[np.ndarray | None, "uint8 n 6 h2 w2"] = None  # see `depth.mending.pack_affinities`
 
 
 @dataclass(frozen=True)
@@ -212,37 +157,15 @@ class ScaleEstimate:
 
 
 @dataclass(frozen=True)
-class WorldFrame:
+class WorldFrame(CheckedArrays):
     """Stage 4: the similarity transform from `sfm` to `world`, and how it was estimated."""
 
-    world_from_sfm: np.ndarray  # float64 (4, 4), scale in the 3x3 block
+    world_from_sfm: Annotated[np.ndarray, "float64 4 4"]  # scale in the 3x3 block
     scale: ScaleEstimate
     gravity_method: str  # e.g. "planes+cameras" | "cameras"
     gravity_sigma_deg: float  # standard deviation of the up direction
     floor_observed: bool  # False: the floor is assumed below all seen surface
     yaw_snapped: bool  # walls (or furniture faces) are parallel to x and y
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, world_from_sfm="float64 4 4")
-
-    def apply_to(self, posed: PosedFrames) -> PosedFrames:
-        """Return the frames with cameras and points in world space, in metres."""
-        m = self.world_from_sfm
-        _, rotation, _ = split_similarity(m)
-
-        def move(poses: np.ndarray) -> np.ndarray:
-            out = poses.copy()
-            out[:, :3, :3] = rotation @ poses[:, :3, :3]
-            out[:, :3, 3] = poses[:, :3, 3] @ m[:3, :3].T + m[:3, 3]
-            return out
-
-        return replace(
-            posed,
-            world_from_camera=move(posed.world_from_camera),
-            held_out_world_from_camera=move(posed.held_out_world_from_camera),
-            points=posed.points @ m[:3, :3].T + m[:3, 3],
-        )
 
     def scale_depth(self, depth: DepthMaps) -> DepthMaps:
         """Return the depth maps in metres."""
@@ -250,16 +173,12 @@ class WorldFrame:
 
 
 @dataclass(frozen=True)
-class SpaceGrid:
+class SpaceGrid(CheckedArrays):
     """Occupancy of a regular voxel grid, axis-aligned in world space."""
 
-    origin: np.ndarray  # float64 (3,) corner of voxel (0, 0, 0), metres
+    origin: Annotated[np.ndarray, "float64 3"]  # corner of voxel (0, 0, 0), metres
     voxel_size_m: float
-    state: np.ndarray  # uint8 (nx, ny, nz) 0 unknown, 1 free (a ray passed through), 2 surface
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, origin="float64 3", state="uint8 nx ny nz")
+    state: Annotated[np.ndarray, "uint8 nx ny nz"]  # 0 unknown, 1 free (a ray passed through), 2 surface
 
     def lookup(self, points: np.ndarray) -> np.ndarray:
         """Return the state, uint8 (n,), at world points (n, 3); 0 outside of the grid."""
@@ -272,51 +191,36 @@ class SpaceGrid:
 
 
 @dataclass(frozen=True)
-class Plane:
+class Plane(CheckedArrays):
     """A bounded plane n . x + d = 0 in world space; n is unit and points towards free space."""
 
-    plane: np.ndarray  # float64 (4,) nx, ny, nz, d in metres
-    polygon: np.ndarray  # float64 (k, 3) outline, metres, k >= 3
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, plane="float64 4", polygon="float64 k 3")
+    plane: Annotated[np.ndarray, "float64 4"]  # nx, ny, nz, d in metres
+    polygon: Annotated[np.ndarray, "float64 k 3"]  # outline, metres, k >= 3
 
 
 @dataclass(frozen=True)
-class SurfacePlane:
+class SurfacePlane(CheckedArrays):
     """A partly seen plane of the room: floor, wall, ceiling, or a support plane (level, can carry things)."""
 
     label: str  # "floor" | "wall" | "ceiling" | "support"
     surface: Plane  # outline of the seen part: convex, except that of a support, which may be concave
     area_m2: float  # seen surface on the plane
     band_m: float  # largest distance to the plane of surface that belongs to it
-    vertices: np.ndarray  # int32 (k,) rows of `Surface.vertices`, ascending; no vertex is on two planes
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, vertices="int32 k")
+    vertices: Annotated[np.ndarray, "int32 k"]  # rows of `Surface.vertices`, ascending; on one plane each
 
 
 @dataclass(frozen=True)
-class Surface:
+class Surface(CheckedArrays):
     """Stage 5: the fused visible surface as one triangle mesh in world space, and the occupancy grid."""
 
-    vertices: np.ndarray  # float32 (v, 3) metres
-    faces: np.ndarray  # int32 (f, 3) rows of `vertices`, counter-clockwise seen from free space
-    normals: np.ndarray  # float32 (v, 3) unit, towards free space
-    colors: np.ndarray  # uint8 (v, 3) RGB
-    weights: np.ndarray  # float32 (v,) number of views that support the vertex
+    vertices: Annotated[np.ndarray, "float32 v 3"]  # metres
+    faces: Annotated[np.ndarray, "int32 f 3"]  # rows of `vertices`, counter-clockwise seen from free space
+    normals: Annotated[np.ndarray, "float32 v 3"]  # unit, towards free space
+    colors: Annotated[np.ndarray, "uint8 v 3"]  # RGB
+    weights: Annotated[np.ndarray, "float32 v"]  # number of views that support the vertex
     voxel_size_m: float  # of the fusion
     space: SpaceGrid
     planes: tuple[SurfacePlane, ...] = ()  # floor, walls, ceiling, then supports by ascending height
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(
-            self, vertices="float32 v 3", faces="int32 f 3", normals="float32 v 3", colors="uint8 v 3",
-            weights="float32 v",
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -330,63 +234,45 @@ class BaseEntity:
 
 
 @dataclass(frozen=True)
-class Instance:
+class Instance(CheckedArrays):
     """One object, as segmented from the seen surface."""
 
     id: int
     label: str  # coarse class: "table", "shelf", "box", … "unknown"
     label_confidence: float
-    center: np.ndarray  # float64 (3,) of its upright box, world space, metres
+    center: Annotated[np.ndarray, "float64 3"]  # of its upright box, world space, metres
     yaw_rad: float  # of its upright box, about +z
-    extents_m: np.ndarray  # float64 (3,) of its upright box
+    extents_m: Annotated[np.ndarray, "float64 3"]  # of its upright box
     support_hint: int  # id of what it probably rests on or hangs from, 0 = not known
     attached_hint: bool  # True: hangs on a wall; False: stands
 
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, center="float64 3", extents_m="float64 3")
-
 
 @dataclass(frozen=True)
-class InstanceSet:
+class InstanceSet(CheckedArrays):
     """Stage 6: instance segmentation of the surface and of the keyframes."""
 
-    vertex_instance: np.ndarray  # int32 (v,) id per vertex of `Surface`, base entities included, 0 = none
+    vertex_instance: Annotated[np.ndarray, "int32 v"]  # id per vertex of `Surface`, also base; 0 = none
     base: tuple[BaseEntity, ...]
     objects: tuple[Instance, ...]
-    id_maps: np.ndarray  # uint16 (n, h, w) id seen at each pixel, per keyframe at depth resolution
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, vertex_instance="int32 v", id_maps="uint16 n h w")
+    id_maps: Annotated[np.ndarray, "uint16 n h w"]  # id seen at each pixel, per keyframe at depth resolution
 
 
 @dataclass(frozen=True)
-class TexturedMesh:
+class TexturedMesh(CheckedArrays):
     """A textured triangle mesh; vertices are duplicated at texture seams."""
 
-    vertices: np.ndarray  # float32 (v, 3) metres, +z up, in the space that its owner names
-    faces: np.ndarray  # int32 (f, 3) rows of `vertices`
-    uvs: np.ndarray  # float32 (v, 2) in [0, 1], origin at the lower left
-    texture: np.ndarray  # uint8 (h, w, 3) sRGB, row 0 at v = 1
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(
-            self, vertices="float32 v 3", faces="int32 f 3", uvs="float32 v 2", texture="uint8 h w 3"
-        )
+    vertices: Annotated[np.ndarray, "float32 v 3"]  # metres, +z up, in the space that its owner names
+    faces: Annotated[np.ndarray, "int32 f 3"]  # rows of `vertices`
+    uvs: Annotated[np.ndarray, "float32 v 2"]  # in [0, 1], origin at the lower left
+    texture: Annotated[np.ndarray, "uint8 h w 3"]  # sRGB, row 0 at v = 1
 
 
 @dataclass(frozen=True)
-class ConvexPart:
+class ConvexPart(CheckedArrays):
     """One convex part of a collision shape, in object space."""
 
-    vertices: np.ndarray  # float32 (v, 3) metres
-    faces: np.ndarray  # int32 (f, 3) rows of `vertices`
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, vertices="float32 v 3", faces="int32 f 3")
+    vertices: Annotated[np.ndarray, "float32 v 3"]  # metres
+    faces: Annotated[np.ndarray, "int32 f 3"]  # rows of `vertices`
 
 
 @dataclass(frozen=True)
@@ -399,21 +285,17 @@ class PhysicalRanges:
 
 
 @dataclass(frozen=True)
-class PhysicalAttributes:
+class PhysicalAttributes(CheckedArrays):
     """Physical properties of an object; `AssetProvenance.physics` says where they come from."""
 
     material: str
     density_kg_m3: float  # of the solid material, before hollowness
     mass_kg: float
-    center_of_mass: np.ndarray  # float64 (3,) object space, metres
-    inertia: np.ndarray  # float64 (3, 3) about the centre of mass, object axes, kg m^2
+    center_of_mass: Annotated[np.ndarray, "float64 3"]  # object space, metres
+    inertia: Annotated[np.ndarray, "float64 3 3"]  # about the centre of mass, object axes, kg m^2
     friction: float
     restitution: float
     ranges: PhysicalRanges
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, center_of_mass="float64 3", inertia="float64 3 3")
 
 
 @dataclass(frozen=True)
@@ -427,39 +309,31 @@ class AssetProvenance:
 
 
 @dataclass(frozen=True)
-class ObjectAsset:
+class ObjectAsset(CheckedArrays):
     """Stage 7: one complete object. Object space: metres, +z up, origin at the bottom centre of its box."""
 
     id: int
     label: str
     label_confidence: float
-    world_from_object: np.ndarray  # float64 (4, 4) rigid, as reconstructed, before assembly
+    world_from_object: Annotated[np.ndarray, "float64 4 4"]  # rigid, as reconstructed, before assembly
     visual: TexturedMesh  # closed surface, object space
     collision: tuple[ConvexPart, ...]
     physics: PhysicalAttributes
     provenance: AssetProvenance
-    views: np.ndarray  # int32 (k,) video frame numbers that textured it, best first
+    views: Annotated[np.ndarray, "int32 k"]  # video frame numbers that textured it, best first
     support_hint: int  # as in `Instance`
     attached_hint: bool  # as in `Instance`
 
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, world_from_object="float64 4 4", views="int32 k")
-
 
 @dataclass(frozen=True)
-class BaseAsset:
+class BaseAsset(CheckedArrays):
     """Stage 7: a floor, wall or ceiling with its textured mesh in world space."""
 
     id: int
     label: str  # "floor" | "wall" | "ceiling"
-    plane: np.ndarray  # float64 (4,) n . x + d = 0 in metres, n unit and into the room
+    plane: Annotated[np.ndarray, "float64 4"]  # n . x + d = 0 in metres, n unit and into the room
     visual: TexturedMesh
     observed: bool
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, plane="float64 4")
 
 
 @dataclass(frozen=True)
@@ -489,21 +363,17 @@ class SceneGraph:
 
 
 @dataclass(frozen=True)
-class PlacedObject:
+class PlacedObject(CheckedArrays):
     """Stage 9: the final pose of an object and how it was reached."""
 
     id: int
-    world_from_object: np.ndarray  # float64 (4, 4) rigid
+    world_from_object: Annotated[np.ndarray, "float64 4 4"]  # rigid
     dynamic: bool
     moved_m: float  # distance from the reconstructed pose
     turned_deg: float  # rotation from the reconstructed pose
     repair: str  # what made it stand, "" = nothing was needed
     stable: bool
     collision: tuple[ConvexPart, ...] | None = None  # object space; replaces the asset's own after a repair
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(self, world_from_object="float64 4 4")
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """Gaussians as an artifact, and their packed form (n, 13) for kernels."""
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
-from reconstruction.core.types import check_arrays
+from reconstruction.core.checked_arrays import CheckedArrays
 from registry.geometry import matrix_from_quat, quat_from_matrix, split_similarity
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 * coefficient
@@ -12,29 +13,21 @@ N_PARAMETERS = 13  # mean 3, quaternion 4, log scales 2, opacity logit 1, color 
 
 
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(CheckedArrays):
     """2D Gaussians (oriented disks) in the space of the posed frames that they were fitted to.
 
     Colors are view-independent (spherical harmonics of degree 0), in sRGB values, not linear light. Keyframe k is
     modeled as `exposure_gain[k] * rendered + exposure_bias[k]`, seen by `world_from_camera[k]`.
     """
 
-    means: np.ndarray  # float32 (n, 3)
-    quaternions: np.ndarray  # float32 (n, 4) wxyz, unit; the columns of its matrix are t_u, t_v, normal
-    log_scales: np.ndarray  # float32 (n, 2) natural logarithms of the standard deviations along t_u and t_v
-    opacity_logits: np.ndarray  # float32 (n,)
-    colors: np.ndarray  # float32 (n, 3) SH coefficients c of degree 0: rgb = 0.5 + 0.2821 c
-    exposure_gain: np.ndarray  # float32 (k, 3) per keyframe and color channel
-    exposure_bias: np.ndarray  # float32 (k, 3)
-    world_from_camera: np.ndarray  # float64 (k, 4, 4) rigid; as optimized, if `optimize_poses`
-
-    def __post_init__(self) -> None:
-        """Check dtypes and shapes."""
-        check_arrays(
-            self, means="float32 n 3", quaternions="float32 n 4", log_scales="float32 n 2", opacity_logits="float32 n",
-            colors="float32 n 3", exposure_gain="float32 k 3", exposure_bias="float32 k 3",
-            world_from_camera="float64 k 4 4",
-        )  # fmt: skip
+    means: Annotated[np.ndarray, "float32 n 3"]
+    quaternions: Annotated[np.ndarray, "float32 n 4"]  # wxyz, unit; matrix columns are t_u, t_v, normal
+    log_scales: Annotated[np.ndarray, "float32 n 2"]  # ln of standard deviations along t_u, t_v
+    opacity_logits: Annotated[np.ndarray, "float32 n"]
+    colors: Annotated[np.ndarray, "float32 n 3"]  # SH coefficients c of degree 0: rgb = 0.5 + 0.2821 c
+    exposure_gain: Annotated[np.ndarray, "float32 k 3"]  # per keyframe and color channel
+    exposure_bias: Annotated[np.ndarray, "float32 k 3"]
+    world_from_camera: Annotated[np.ndarray, "float64 k 4 4"]  # rigid; as optimized, if `optimize_poses`
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
