@@ -119,7 +119,9 @@ def robot_shape(uid: str) -> RobotShape:
         body = link._objs[0]
         for shape in body.collision_shapes:
             pose = body.entity.pose * shape.local_pose
-            clouds.append(_surface_points(shape) @ pose.to_transformation_matrix()[:3, :3].T + pose.p)
+            clouds.append(
+                surface_points(shape, _SAMPLE_SPACING_M) @ pose.to_transformation_matrix()[:3, :3].T + pose.p
+            )
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
     # Keep one point per cell.
     _, kept = np.unique(np.floor(points / _SAMPLE_SPACING_M), axis=0, return_index=True)
@@ -150,8 +152,8 @@ def rest_qpos(agent: Any) -> np.ndarray:
     return np.asarray(frame.qpos, dtype=np.float64)
 
 
-def _surface_points(shape: Any) -> np.ndarray:
-    """Sample points (n, 3) on a PhysX shape, in its own space, at most `_SAMPLE_SPACING_M` apart."""
+def surface_points(shape: Any, spacing_m: float) -> np.ndarray:
+    """Sample points (n, 3) on a PhysX shape, in its own space, at most `spacing_m` apart; none on a plane."""
     import trimesh
     from sapien import physx
 
@@ -170,7 +172,7 @@ def _surface_points(shape: Any) -> np.ndarray:
         mesh = trimesh.Trimesh(
             np.asarray(shape.vertices) * np.asarray(shape.scale), shape.triangles, process=False
         )
-    found = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SAMPLE_SPACING_M, max_iter=12)
+    found = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, spacing_m, max_iter=12)
     return np.asarray(found[0])
 
 

@@ -12,6 +12,7 @@ from registry.geometry import invert_rigid
 from simrecon_envs.splats.compositing import Actors, Picture, composite, limits_of
 from simrecon_envs.splats.rasterizer import Rasterizer
 from simrecon_envs.splats.scene import SplatScene
+from simrecon_envs.splats.shadows import Caster, darken, shadow_map
 
 _STATIC_MARGIN_M = 0.10  # Gaussians this far behind the mesh of a thing that stands as captured still show
 _MOVED_MARGIN_M = 0.02  # and of a thing that was moved: less, because behind it is what it came to cover
@@ -40,6 +41,12 @@ class SplatLayer:
         for entity in (*self._entities, *grounds):
             _unlit(entity)
         self._actors = self._table(len(env.bundle.base), grounds)
+        self._moving = {row: Caster(self._entities[row - 1]) for row in np.flatnonzero(self._movable)}
+        self._added = [
+            Caster(entity)
+            for entity in env.scene.sub_scenes[0].entities
+            if self._actors.body[entity.per_scene_id] < 0
+        ]
 
     def _table(self, bases: int, grounds: list[sapien.Entity]) -> Actors:
         ids = [entity.per_scene_id for entity in self._entities]
@@ -84,12 +91,20 @@ class SplatLayer:
             margin = _STATIC_MARGIN_M if still[row] else _MOVED_MARGIN_M
             actors.margin_m[actors.segmentation[row]] = margin
         limits, owners = limits_of(picture, actors)
+        lens = np.array([intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]], np.float64)
         drawn = self._rasterizer.draw(
-            extrinsic.astype(np.float64) @ moves,
-            np.array([intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]),
-            limits, owners, threads=torch.get_num_threads(),
-        )  # fmt: skip
-        return composite(picture, actors, drawn, self._scene.bodies, self.gain)
+            extrinsic.astype(np.float64) @ moves, lens, limits, owners, threads=torch.get_num_threads()
+        )
+        casters = [*self._added, *(caster for row, caster in self._moving.items() if not still[row])]
+        shadows = shadow_map(np.concatenate([np.zeros((0, 3)), *(caster.in_world() for caster in casters)]))
+
+        def shade(colors: np.ndarray, depth_mm: np.ndarray) -> None:
+            if shadows is not None:
+                receives = (owners >= 0) & (still | ~self._movable)[owners]
+                pose = invert_rigid(np.vstack([extrinsic, [0, 0, 0, 1]]).astype(np.float64))
+                darken(colors, depth_mm, receives, pose, lens, shadows.origin, shadows.cover, shadows.lowest)
+
+        return composite(picture, actors, drawn, self._scene.bodies, self.gain, shade)
 
 
 class SplatCamera(Camera):

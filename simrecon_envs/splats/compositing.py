@@ -10,6 +10,7 @@ plus the light that they let through times the picture's color. Three kinds of p
 | the robot, or an added thing | those before it, fading out over 1 cm                         |
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +53,12 @@ def limits_of(picture: Picture, actors: Actors) -> tuple[np.ndarray, np.ndarray]
 
 
 def composite(
-    picture: Picture, actors: Actors, drawn: Drawn, bodies: np.ndarray, gain: np.ndarray
+    picture: Picture,
+    actors: Actors,
+    drawn: Drawn,
+    bodies: np.ndarray,
+    gain: np.ndarray,
+    shade: Callable[[np.ndarray, np.ndarray], None] | None = None,
 ) -> Picture:
     """Return the picture with Gaussians before it.
 
@@ -62,6 +68,7 @@ def composite(
         drawn: The Gaussians, drawn with `limits_of` of the picture.
         bodies: int32 (n,) row of each Gaussian's body.
         gain: float32 (3,) factor of the colors of the scene, without robot and added things.
+        shade: Darkens colors, float32 (h, w, 3), in place; called with them and the new depth, int16 (h, w) in mm.
     """
     height, width = picture.depth_mm.shape
     colors = np.empty((height, width, 3), np.float32)
@@ -71,6 +78,8 @@ def composite(
         picture.rgb, picture.depth_mm, picture.segmentation, actors.body, actors.tint, actors.segmentation,
         drawn.planes, drawn.front, drawn.splats, bodies, gain, colors, depth, ids,
     )  # fmt: skip
+    if shade is not None:
+        shade(colors, depth)
     _soften(colors, picture.segmentation, actors.body, rgb)
     return Picture(rgb, depth, ids)
 

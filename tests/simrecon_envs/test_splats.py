@@ -18,6 +18,7 @@ from simrecon_envs.splats.compositing import NOTHING
 from simrecon_envs.splats.kernels import DEPTH_SUM, LIGHT
 from simrecon_envs.splats.rasterizer import Drawn, Rasterizer
 from simrecon_envs.splats.scene import SplatScene, read_splats
+from simrecon_envs.splats.shadows import darken, shadow_map
 from simrecon_envs.tasks.facts import scene_facts
 
 SIZE = {"width": 96, "height": 72}
@@ -141,6 +142,46 @@ def test_gaussians_hidden_below_a_movable_thing_are_left_out(splats_root: Path) 
     assert len(top) > 100
     inside = (np.abs(top[:, :2] - box[:2]) < 0.02).all(axis=1)
     assert not inside.any()
+
+
+@pytest.mark.parametrize(("gap_m", "darkest"), [(0.0, 0.4), (0.06, 0.85), (0.3, 1.0)])
+def test_a_contact_shadow_is_below_its_caster_and_fades_with_height(gap_m: float, darkest: float) -> None:
+    grid = np.stack(np.meshgrid(np.arange(-0.1, 0.1, 0.005), np.arange(-0.1, 0.1, 0.005)), axis=-1).reshape(
+        -1, 2
+    )
+    points = np.column_stack([grid, np.full(len(grid), gap_m)])
+    tall = np.concatenate([points, points + np.array([0, 0, 0.5])])  # only its foot counts
+    shadows = shadow_map(tall)
+    world_from_camera = np.diag([1.0, -1.0, -1.0, 1.0])  # 2 m above the floor, looking down
+    world_from_camera[2, 3] = 2.0
+    colors, depth = np.ones((80, 80, 3), np.float32), np.full((80, 80), 2000, np.int16)
+    lens = np.array([100.0, 100.0, 40.0, 40.0])
+    darken(
+        colors, depth, np.ones((80, 80), bool), world_from_camera, lens,
+        shadows.origin, shadows.cover, shadows.lowest,
+    )  # fmt: skip
+    assert colors[40, 40, 0] == pytest.approx(darkest, abs=0.01)
+    assert np.all(np.diff(colors[40, 40:, 0]) >= -1e-3)  # lighter outwards
+    assert (colors[:, 50:] == 1).all()  # 20 cm from the middle
+
+
+@pytest.mark.render
+def test_a_moved_thing_shades_what_it_stands_on(splats_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, _ = _one_camera(splats_root, renderer="splats")
+    base = env.unwrapped
+    actor = base.builder.objects[BOX].actor._objs[0]
+    actor.set_pose(sapien.Pose(actor.pose.p + np.float32([-0.08, 0.0, 0.0]), actor.pose.q))
+
+    def image() -> np.ndarray:
+        return base._get_obs_sensor_data()["capture_0"]["rgb"][0].numpy().astype(int)
+
+    shaded = image()
+    monkeypatch.setattr("simrecon_envs.splats.cameras.shadow_map", lambda points: None)
+    plain = image()
+    assert (shaded <= plain).all()
+    assert (plain - shaded).max() > 20
+    assert 20 < ((plain - shaded).max(axis=-1) > 3).sum() < 0.05 * plain[..., 0].size
+    env.close()
 
 
 def _one_camera(root: Path, **options) -> tuple:
