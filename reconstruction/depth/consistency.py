@@ -5,6 +5,8 @@ import math
 import numba
 import numpy as np
 
+from reconstruction.depth.reprojection import reproject
+
 
 @numba.njit(cache=True, nogil=True)
 def _sample(depth, u, v, tolerance):  # pragma: no cover - compiled
@@ -56,16 +58,7 @@ def check_view(
                 if j < 0:
                     break
                 m = relative[s]
-                ax, ay, az = (
-                    m[0, 0] * xn + m[0, 1] * yn + m[0, 2],
-                    m[1, 0] * xn + m[1, 1] * yn + m[1, 2],
-                    m[2, 0] * xn + m[2, 1] * yn + m[2, 2],
-                )
-                qz = az * z + m[2, 3]
-                if qz <= 1e-9:
-                    continue
-                u = fx * (ax * z + m[0, 3]) / qz + cx
-                v = fy * (ay * z + m[1, 3]) / qz + cy
+                qz, u, v = reproject(m, k, xn, yn, z)
                 d = _sample(depth[j], u, v, 0.03)
                 if d <= 0.0 or abs(d - qz) > agree_depth * qz:
                     continue
@@ -117,12 +110,7 @@ def count_witnesses(
                 j = neighbors[s]
                 if j < 0:
                     break
-                m = relative[s]
-                qz = z * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
-                if qz <= 1e-9:
-                    continue
-                u = fx * (z * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
-                v = fy * (z * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
+                qz, u, v = reproject(relative[s], k, xn, yn, z)
                 if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
                     continue
                 d = depth[j, int(v), int(u)]

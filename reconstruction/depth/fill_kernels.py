@@ -3,6 +3,8 @@
 import numba
 import numpy as np
 
+from reconstruction.depth.reprojection import reproject
+
 
 @numba.njit(cache=True, nogil=True)
 def fill_small_gaps(depth, out):  # pragma: no cover - compiled
@@ -69,11 +71,7 @@ def exposure_gains(depth, tone, neighbors, relative, maps, tones, k, gains):  # 
                 if q <= 0.0:
                     continue
                 xn, yn = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
-                qz = q * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
-                if qz <= 1e-9:
-                    continue
-                u = fx * (q * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
-                v = fy * (q * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
+                qz, u, v = reproject(m, k, xn, yn, q)
                 if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
                     continue
                 if abs(maps[j, int(v), int(u)] - qz) > 0.01 * qz:
@@ -144,12 +142,7 @@ def label_costs(
                     j = neighbors[s]
                     if j < 0:
                         break
-                    m = relative[s]
-                    qz = q * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
-                    if qz <= 1e-9:
-                        continue
-                    u = fx * (q * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
-                    v = fy * (q * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
+                    qz, u, v = reproject(relative[s], k, xn, yn, q)
                     if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
                         continue
                     d = maps[j, int(v), int(u)]
@@ -201,12 +194,7 @@ def confirm_fill(i, neighbors, depth, confidence, relative, k, keep):  # pragma:
                 j = neighbors[s]
                 if j < 0:
                     break
-                m = relative[s]
-                qz = z * (m[2, 0] * xn + m[2, 1] * yn + m[2, 2]) + m[2, 3]
-                if qz <= 1e-9:
-                    continue
-                u = fx * (z * (m[0, 0] * xn + m[0, 1] * yn + m[0, 2]) + m[0, 3]) / qz + cx
-                v = fy * (z * (m[1, 0] * xn + m[1, 1] * yn + m[1, 2]) + m[1, 3]) / qz + cy
+                qz, u, v = reproject(relative[s], k, xn, yn, z)
                 if not (u >= 0.0 and v >= 0.0 and u < w and v < h):
                     continue
                 d = depth[j, int(v), int(u)]
