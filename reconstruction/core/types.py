@@ -167,6 +167,24 @@ class WorldFrame(CheckedArrays):
     floor_observed: bool  # False: the floor is assumed below all seen surface
     yaw_snapped: bool  # walls (or furniture faces) are parallel to x and y
 
+    def apply_to(self, posed: PosedFrames) -> PosedFrames:
+        """Return the frames with cameras and points in world space, in metres."""
+        m = self.world_from_sfm
+        _, rotation, _ = split_similarity(m)
+
+        def move(poses: np.ndarray) -> np.ndarray:
+            out = poses.copy()
+            out[:, :3, :3] = rotation @ poses[:, :3, :3]
+            out[:, :3, 3] = poses[:, :3, 3] @ m[:3, :3].T + m[:3, 3]
+            return out
+
+        return replace(
+            posed,
+            world_from_camera=move(posed.world_from_camera),
+            held_out_world_from_camera=move(posed.held_out_world_from_camera),
+            points=posed.points @ m[:3, :3].T + m[:3, 3],
+        )
+
     def scale_depth(self, depth: DepthMaps) -> DepthMaps:
         """Return the depth maps in metres."""
         return replace(depth, depth=depth.depth * np.float32(split_similarity(self.world_from_sfm)[0]))
