@@ -19,6 +19,7 @@ from registry.geometry import invert_rigid
 if TYPE_CHECKING:
     from reconstruction.assets.generation.complete import SurfaceColors
 
+_UNASSIGNED_WEIGHT = 0.1  # of pixels without an id: a hundredth of the others' say in a blend
 _GAIN = (0.6, 1.6)  # range of the gains that match a generator's colors to the frames
 
 
@@ -175,12 +176,29 @@ def bake_object(
         depths.append(
             rasterize_mesh(vertices_world, faces, depth_camera, posed.world_from_camera[frame]).depth
         )
-        mask = cv2.erode((pixels.ids[frame] == target).astype(np.uint8), np.ones((3, 3), np.uint8))
-        borders.append(np.minimum(cv2.distanceTransform(mask, cv2.DIST_L2, 3), 6.0) / 6.0)
+        unassigned = (pixels.ids[frame] == 0) & (pixels.depth[frame] > 0) & (depths[-1] > 0)
+        unassigned &= np.abs(pixels.depth[frame] - depths[-1]) < tolerance_m
+        borders.append(_view_weights(pixels.ids[frame] == target, unassigned))
     views = texture_views(posed, depth_camera, frames, depths, borders)
     color, seen, share = collect_colors(texels, views, tolerance_m)
     filled = None if beneath is None else _transferred(texels, color, seen, beneath)
     return _painted(texels, color, seen, size, frames, share, filled)
+
+
+def _view_weights(own: np.ndarray, unassigned: np.ndarray) -> np.ndarray:
+    """Return the weights float32 (h, w) of a frame's pixels, falling towards the object's outline.
+
+    Args:
+        own: bool (h, w), pixels that have the object's id.
+        unassigned: bool (h, w), pixels without an id whose depth is the object's. They count little, so that they
+            color only what no frame shows otherwise.
+    """
+    weights = np.zeros(own.shape, np.float32)
+    for mask, most in ((own | unassigned, _UNASSIGNED_WEIGHT), (own, 1.0)):
+        inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+        inside = np.minimum(cv2.distanceTransform(inner, cv2.DIST_L2, 3), 6.0) / 6.0
+        weights = np.maximum(weights, most * inside)
+    return weights
 
 
 def _texture_size(
