@@ -241,10 +241,11 @@ class SceneEnv(BaseEnv):
             self._randomizer.physics(every, self._batched_episode_rng)
 
     def _load_lighting(self, options: dict) -> None:
-        # Textures from the video contain the room's shading: use mostly ambient light.
-        self.scene.set_ambient_light([0.6, 0.6, 0.6])
-        self.scene.add_directional_light([0.4, 0.3, -1.0], [0.8, 0.8, 0.78], shadow=self.enable_shadow)
-        self.scene.add_directional_light([-0.5, -0.6, -0.6], [0.3, 0.3, 0.33])
+        # Textures from the video contain the room's shading: mostly ambient light shows them nearly as filmed. The rest
+        # shapes the robot and added things.
+        self.scene.set_ambient_light([0.8, 0.8, 0.8])
+        self.scene.add_directional_light([0.4, 0.3, -1.0], [0.4, 0.4, 0.39], shadow=self.enable_shadow)
+        self.scene.add_directional_light([-0.5, -0.6, -0.6], [0.15, 0.15, 0.165])
 
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
