@@ -21,7 +21,7 @@ from reconstruction.measure.planes import planes_figures
 from reconstruction.measure.rendering import render_views, score_pictures, video_frames
 from reconstruction.measure.scene import PlacedMesh, bundle_camera, bundle_poses, joined, placed_meshes
 from reconstruction.measure.stage_results import StageResults
-from reconstruction.measure.surfaces import COMPOSITION_POINTS, compare, sample_seen
+from reconstruction.measure.surfaces import COMPOSITION_POINTS, OBJECT_POINTS, compare, sample_seen
 from reconstruction.measure.visibility import spread_poses
 from registry import SceneBundle
 from registry.errors import UsageError
@@ -73,6 +73,7 @@ def evaluate_scene(
     stages: StageResults | None = None,
     video: Path | None = None,
     composition_points: int = COMPOSITION_POINTS,
+    object_points: int = OBJECT_POINTS,
     progress: Progress = NO_PROGRESS,
 ) -> Evaluation:
     """Evaluate a scene against ground truth, or without it what needs none (physics, rendering, registration).
@@ -84,6 +85,7 @@ def evaluate_scene(
         stages: results of the scene's stages, for figures per stage; None: no such figures.
         video: gives held-out frames if the stage results are missing; None: the video beside the ground truth.
         composition_points: samples per composition; the contract's figures need the default.
+        object_points: samples per object; the contract's figures need the default.
         progress: advanced after each part.
 
     Raises:
@@ -106,7 +108,7 @@ def evaluate_scene(
         _add_cameras(alignment, out)
         parts += [
             lambda: _add_composition(moved, truth, stages, alignment, composition_points, out),
-            lambda: _add_objects(bundle, moved, truth, out),
+            lambda: _add_objects(bundle, moved, truth, object_points, out),
             lambda: _add_stages(truth, stages, alignment, out),
         ]
     else:
@@ -265,12 +267,14 @@ def _add_composition(
         out.stages["surface"] = figures
 
 
-def _add_objects(bundle: SceneBundle, scene: list[PlacedMesh], truth: GroundTruth, out: Evaluation) -> None:
+def _add_objects(
+    bundle: SceneBundle, scene: list[PlacedMesh], truth: GroundTruth, count: int, out: Evaluation
+) -> None:
     if not truth.entities:
         names = ("object_recall_25", "object_precision_25", "object_cd_cm", "object_f_1cm", "graph_f1")
         out.leave_out("the truth has no entities", *names)
         return
-    scores = score_objects([m for m in scene if not m.base], truth)
+    scores = score_objects([m for m in scene if not m.base], truth, count)
     edges, base = bundle.scene["graph"]["edges"], [m for m in scene if m.base]
     out.metrics.update(scores.metrics)
     out.metrics.update(score_graph(edges, base, truth, scores.true_of, scores.records))

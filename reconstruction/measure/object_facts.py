@@ -10,6 +10,7 @@ from reconstruction.measure.surfaces import sample
 
 SUPPORTS = ("floor", "furniture", "thing", "wall")
 _SAMPLES = 10_000  # points per object for approximate distances
+_BOUNDING = 50  # points whose distance bounds that of all
 _NEIGHBORS_REFINED = 3  # nearest neighbors by samples whose exact distance is computed
 _STEPS, _CONVERGED_M = 60, 1e-6  # limits of the alternating projection
 
@@ -79,9 +80,8 @@ def _gaps(
         for b in sorted(others, key=lambda b: _box_distance(a, b)):
             if len(near) >= _NEIGHBORS_REFINED and _box_distance(a, b) > near[0][0]:
                 break  # the lower bound of this and all later ones exceeds the smallest distance found
-            distance, nearest = map(np.atleast_1d, trees[b.id].query(points[a.id]))
-            at = int(np.argmin(distance))
-            near.append((float(distance[at]), b.id, points[a.id][at], points[b.id][nearest[at]]))
+            distance, p, q = _closest_pair(points[a.id], trees[b.id])
+            near.append((distance, b.id, p, q))
             near.sort(key=lambda item: item[:2])
         exact = [
             (_surface_distance(triangles[a.id], triangles[i], p, q), i)
@@ -89,6 +89,15 @@ def _gaps(
         ]
         out[a.id] = min(exact, default=(float("inf"), None))
     return out
+
+
+def _closest_pair(points: np.ndarray, tree: KDTree) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return the smallest distance between points (n, 3) and those of a tree, and its two points (3,)."""
+    # The distance of a few points bounds the search of all: most of them are farther away and cost little.
+    bound = float(np.min(tree.query(points[:: 1 + len(points) // _BOUNDING])[0]))
+    distance, nearest = tree.query(points, distance_upper_bound=np.nextafter(bound, np.inf))
+    at = int(np.argmin(distance))
+    return float(distance[at]), points[at], np.asarray(tree.data)[nearest[at]]
 
 
 def _box_distance(a: TrueEntity, b: TrueEntity) -> float:

@@ -25,14 +25,17 @@ class ObjectScores:
     true_of: dict[int, int]  # id of a found object -> id of its true match
 
 
-def score_objects(found: list[PlacedMesh], truth: GroundTruth) -> ObjectScores:
-    """Match found objects, moved to the true world, with the evaluated true ones by boxes; compare their surfaces."""
+def score_objects(found: list[PlacedMesh], truth: GroundTruth, points: int = OBJECT_POINTS) -> ObjectScores:
+    """Match found objects, moved to the true world, with the evaluated true ones by boxes; compare their surfaces.
+
+    Surfaces are compared by `points` samples each.
+    """
     wanted = list(truth.evaluated)
     matched = match_boxes(wanted, np.array([m.bounds for m in found]))
     pairs = matched.pairs[IOU_BOUNDS[0]]
     records = object_records(wanted, object_facts(truth), matched, [m.id for m in found])
     for row, (entity, record) in enumerate(zip(wanted, records)):
-        record.update(_surface_score(entity, found[pairs[row]] if row in pairs else None))
+        record.update(_surface_score(entity, found[pairs[row]] if row in pairs else None, points))
     metrics: dict[str, float | None] = dict(matched.figures())
     metrics["object_cd_cm"] = _mean_or_none([r["cd_cm"] for r in records]) or 0.0
     metrics["object_f_1cm"] = float(np.mean([r["f_1cm"] for r in records])) if records else 100.0
@@ -48,15 +51,15 @@ def _mean_or_none(values: list[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-def _surface_score(entity: TrueEntity, found: PlacedMesh | None) -> dict[str, Any]:
+def _surface_score(entity: TrueEntity, found: PlacedMesh | None, points: int) -> dict[str, Any]:
     """Compare complete surfaces; a miss gets the object's diagonal as Chamfer distance and 0 as F-score."""
     diagonal = float(np.linalg.norm(entity.bounds[1] - entity.bounds[0]))
     miss = {"cd_cm": 100 * diagonal, "f_1cm": 0.0}
     if found is None:
         return miss
     out = {"found_label": found.label}
-    true = sample(entity.mesh.vertices, entity.mesh.faces, OBJECT_POINTS)
-    score = compare(sample(found.vertices, found.faces, OBJECT_POINTS), true, OBJECT_BOUND_M)
+    true = sample(entity.mesh.vertices, entity.mesh.faces, points)
+    score = compare(sample(found.vertices, found.faces, points), true, OBJECT_BOUND_M)
     if score is None:
         return out | miss
     center = found.bounds.mean(axis=0) - entity.bounds.mean(axis=0)

@@ -37,7 +37,9 @@ def render_textured(
         y = np.clip(((1.0 - uv[:, 1]) * rows).astype(int), 0, rows - 1)
         color[nearer] = mesh.texture[y, x]
         depth[nearer] = raster.depth[nearer]
-    picture = color.reshape(camera.height, supersample, camera.width, supersample, 3).mean(axis=(1, 3))
+    # Sums of whole numbers: no order of summing changes a bit, and slices are several times faster than `mean`.
+    each = (color[i::supersample, j::supersample] for i, j in np.ndindex(supersample, supersample))
+    picture = sum(each, np.zeros((camera.height, camera.width, 3), np.float32)) / np.float32(supersample**2)
     return picture.round().astype(np.uint8), depth[::supersample, ::supersample]
 
 

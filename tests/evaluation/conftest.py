@@ -8,7 +8,7 @@ from truth_bundle import Change, Truth, write_bundle, write_truth
 
 from reconstruction.measure import Evaluation, evaluate_scene
 
-POINTS = 40_000
+POINTS = {"composition_points": 40_000, "object_points": 15_000}
 
 
 @pytest.fixture(scope="session")
@@ -23,7 +23,7 @@ def evaluate(truth, tmp_path) -> Callable[..., Evaluation]:
 
     def run(change: Change | None = None, folder: Path | None = None) -> Evaluation:
         bundle = write_bundle(truth, folder or tmp_path / "bundle", change)
-        return evaluate_scene(bundle, truth.folder, video=truth.frames, composition_points=POINTS)
+        return evaluate_scene(bundle, truth.folder, video=truth.frames, **POINTS)
 
     return run
 
@@ -32,4 +32,4 @@ def evaluate(truth, tmp_path) -> Callable[..., Evaluation]:
 def perfect(truth, tmp_path_factory) -> Evaluation:
     """The evaluation of the truth against itself."""
     bundle = write_bundle(truth, tmp_path_factory.mktemp("perfect") / "bundle")
-    return evaluate_scene(bundle, truth.folder, video=truth.frames, composition_points=POINTS)
+    return evaluate_scene(bundle, truth.folder, video=truth.frames, **POINTS)

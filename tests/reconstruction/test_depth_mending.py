@@ -2,7 +2,6 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +17,25 @@ from reconstruction.depth.weights import load_network
 from synthetic.capture import make_test_capture
 
 pytestmark = pytest.mark.stage
+
+CONFIG = DepthConfig(depth_side_px=320, prior="mending")
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return make_test_capture(8, 320, 240)
+
+
+@pytest.fixture(scope="module")
+def found(capture):
+    """The evidence that the network mends: depth as it is without a prior."""
+    return gather_evidence(capture.posed, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def mended(capture):
+    """Depth maps of the capture with the network's prior."""
+    return estimate_depth(capture.posed, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -102,13 +120,10 @@ def test_the_weights_are_small_and_load_quickly():
     assert time.process_time() - started < 3.0  # .1 s on a machine at rest
 
 
-def test_things_end_where_they_end():
-    capture = make_test_capture(14, 400, 300)
-    plain = DepthConfig(depth_side_px=400)
+def test_things_end_where_they_end(capture, found, mended):
     rings, right = [], []
     things = [i for i in np.unique(capture.id_maps) if i > len(capture.room.base)]
-    for prior in ("none", "mending"):
-        maps = estimate_depth(capture.posed, replace(plain, prior=prior))
+    for maps in (found, mended):
         truth = capture.depth.depth
         counts = sum(ring_counts(d, t, i, things) for d, t, i in zip(maps.depth, truth, capture.id_maps))
         rings.append(counts[1] / counts[0])
@@ -118,10 +133,7 @@ def test_things_end_where_they_end():
     assert right[1] > right[0]
 
 
-def test_holes_are_filled_only_where_the_network_is_sure_enough():
-    capture = make_test_capture(8, 320, 240)
-    config = DepthConfig(depth_side_px=320)
-    found = gather_evidence(capture.posed, config)
+def test_holes_are_filled_only_where_the_network_is_sure_enough(capture, found):
     each = Workers(2).each
     filled, careful, never = (
         mending.mend_depth(found, capture.posed, 0.5, least, each).depth for least in (0.5, 0.8, 1.1)
@@ -142,13 +154,11 @@ def test_holes_are_filled_only_where_the_network_is_sure_enough():
     assert filled.shape == truth.shape
 
 
-def test_affinities_of_the_keyframes_go_with_the_maps():
-    capture = make_test_capture(6, 320, 240)
-    maps = estimate_depth(capture.posed, DepthConfig(depth_side_px=320, prior="mending"))
-    assert maps.affinity.shape == (6, mending.AFFINITIES, 120, 160)
+def test_affinities_of_the_keyframes_go_with_the_maps(capture, mended):
+    assert mended.affinity.shape == (8, mending.AFFINITIES, 120, 160)
     ids = capture.id_maps[:, ::2, ::2]
     step = OFFSETS_PX[-1] // 2
-    said = maps.affinity[:, 2 * (len(OFFSETS_PX) - 1), :, :-step]
+    said = mended.affinity[:, 2 * (len(OFFSETS_PX) - 1), :, :-step]
     same = ids[:, :, :-step] == ids[:, :, step:]
     known = (ids[:, :, :-step] > 0) & (ids[:, :, step:] > 0)
     assert said[known & same].mean() > said[known & ~same].mean() + 64

@@ -10,6 +10,7 @@ from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from, wi
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.core.types import InstanceSet, Surface
 from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig, find_instances
+from reconstruction.surface import SurfaceConfig, fuse_surface
 
 pytestmark = pytest.mark.stage
 
@@ -128,16 +129,21 @@ def test_empty_surface():
     assert not found.base[0].observed
 
 
-def test_generated_room(small_capture):
-    """On a filmed room with true depth most things are found, and pixels carry the right thing's id."""
-    from reconstruction.surface import SurfaceConfig, fuse_surface
+def find_in(capture, surface: Surface) -> InstanceSet:
+    return find_instances(capture.posed, capture.depth, surface, InstancesConfig(), progress=NO_PROGRESS)
 
-    surface = fuse_surface(
-        small_capture.posed, small_capture.depth, SurfaceConfig(voxel_size_m=0.012), progress=NO_PROGRESS
-    )
-    found = find_instances(
-        small_capture.posed, small_capture.depth, surface, InstancesConfig(), progress=NO_PROGRESS
-    )
+
+@pytest.fixture(scope="module")
+def room(small_capture) -> tuple[Surface, InstanceSet]:
+    """The surface of the generated room from true depth, and its instances."""
+    config = SurfaceConfig(voxel_size_m=0.016)
+    surface = fuse_surface(small_capture.posed, small_capture.depth, config, progress=NO_PROGRESS)
+    return surface, find_in(small_capture, surface)
+
+
+def test_generated_room(small_capture, room):
+    """On a filmed room with true depth most things are found, and pixels carry the right thing's id."""
+    surface, found = room
     assert found.id_maps.shape == small_capture.id_maps.shape
     assert found.id_maps.dtype == np.uint16
     assert found.vertex_instance.shape == (len(surface.vertices),)
@@ -160,19 +166,10 @@ def test_generated_room(small_capture):
     assert right >= 0.7 * seen
 
 
-def test_same_input_gives_same_bits(small_capture):
+def test_same_input_gives_same_bits(small_capture, room):
     """Two runs agree exactly."""
-    from reconstruction.surface import SurfaceConfig, fuse_surface
-
-    surface = fuse_surface(
-        small_capture.posed, small_capture.depth, SurfaceConfig(voxel_size_m=0.02), progress=NO_PROGRESS
-    )
-    one, two = (
-        find_instances(
-            small_capture.posed, small_capture.depth, surface, InstancesConfig(), progress=NO_PROGRESS
-        )
-        for _ in range(2)
-    )
+    surface, one = room
+    two = find_in(small_capture, surface)
     np.testing.assert_array_equal(one.id_maps, two.id_maps)
     np.testing.assert_array_equal(one.vertex_instance, two.vertex_instance)
     assert [o.label for o in one.objects] == [o.label for o in two.objects]

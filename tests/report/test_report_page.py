@@ -83,15 +83,21 @@ def test_it_says_what_the_bundle_says(page, reconstructed):
     assert "900 MB" in text  # the assembly stage's peak
 
 
-def test_text_from_outside_cannot_become_markup(page, reconstructed):
+def test_notes_cannot_become_markup(page):
     assert "<b>a note</b>" not in page
     assert html.escape("<b>a note</b> & more", quote=False) in page
+
+
+def test_a_bundle_alone_gives_a_page_and_its_text_cannot_become_markup(reconstructed):
     bundle, _ = reconstructed.open()
     bundle.scene["source"]["file"] = '"><script>alert(1)</script>.mp4'
     for item in bundle.scene["objects"]:
         item["label"] = "</svg><script>alert(2)</script> $\\x"
-    stages = StageResults({}, {"depth": "<script>alert(3)</script>"})
-    assert "<script>alert" not in build_page(bundle, stages)
+    gone = ("poses", "depth", "world", "gaussians", "surface", "instances", "assets")
+    page = build_page(bundle, StageResults({}, dict.fromkeys(gone, "<script>alert(3)</script>")))
+    assert "<script>alert" not in page
+    assert len(left_out(page)) >= 6
+    assert len(images(page)) >= len(bundle.scene["objects"]) + 4
 
 
 def test_gone_stage_results_are_named_and_the_rest_is_shown(reconstructed, tmp_path):
@@ -108,16 +114,6 @@ def test_gone_stage_results_are_named_and_the_rest_is_shown(reconstructed, tmp_p
     assert "Outlines on frames left out" in said
     assert "surface left out" not in said
     assert re.findall(r'<section id="([\w-]+)"', page) == SECTIONS
-
-
-def test_a_bundle_alone_gives_a_page(reconstructed):
-    bundle, _ = reconstructed.open()
-    stages = StageResults(
-        {}, dict.fromkeys(("poses", "depth", "world", "gaussians", "surface", "instances", "assets"), "gone")
-    )
-    page = build_page(bundle, stages)
-    assert len(left_out(page)) >= 6
-    assert len(images(page)) >= len(bundle.scene["objects"]) + 4
 
 
 def test_a_bundle_of_someone_else_gives_a_page(reconstructed):
@@ -219,9 +215,12 @@ def test_the_command_writes_the_same_page_again(page, reconstructed, tmp_path, c
 def test_a_stored_evaluation_is_shown_and_one_of_another_scene_refused(reconstructed, tmp_path, capsys):
     stored = dict(reconstructed.evaluation)
     stored["metrics"] = {**stored["metrics"], "cd_cm": 123.4}
+    registry = shutil.copytree(
+        reconstructed.registry, tmp_path / "registry"
+    )  # without stage results: quicker
     figures, out = tmp_path / "figures.json", tmp_path / "page.html"
     figures.write_text(json.dumps(stored))
-    command = ["report", "small_room", "--out", str(out), "--registry", str(reconstructed.registry)]
+    command = ["report", "small_room", "--out", str(out), "--registry", str(registry)]
     command += ["--evaluation", str(figures)]
     assert main(command) == 0
     assert "123.4 cm" in out.read_text()

@@ -92,7 +92,8 @@ def missing_view(g: Gathered, near: NearSurface, camera: Camera, pose: np.ndarra
     hit = raster.face >= 0
     points = truth.alignment.to_true(raster.interpolate(faces, vertices)[hit])
     distance, filmed = np.zeros(hit.shape), np.zeros(hit.shape, bool)
-    distance[hit], filmed[hit] = near.distance(points), truth.seen(points)
+    filmed[hit] = truth.seen(points)
+    distance[filmed] = near.distance(points[filmed[hit]])
     return _error_picture(distance, filmed, raster.depth, camera, what)
 
 
