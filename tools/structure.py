@@ -55,10 +55,10 @@ def measure(files: list[Path], package: str) -> Row:
         row.files += 1
         row.lines += lines
         row.long_files += lines > _LONG_FILE
-        indices = {
-            id(n) for node in ast.walk(tree) if isinstance(node, ast.Subscript) for n in ast.walk(node.slice)
-        }
-        for node in ast.walk(tree):
+        nodes = list(ast.walk(tree))
+        slices = [node.slice for node in nodes if isinstance(node, ast.Subscript)]
+        indices = {id(n) for part in slices for n in ast.walk(part)}
+        for node in nodes:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 length = node.end_lineno - node.lineno + 1
                 if length > row.longest_function:
