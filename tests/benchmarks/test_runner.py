@@ -14,11 +14,9 @@ import pytest
 from benchmarks.results import load_result, load_results
 from benchmarks.run import main, run_command
 from reconstruction.pipeline import DEFAULT_STAGE_NAMES
-from synthetic.camera_paths import handheld_path, phone_camera
-from synthetic.capture import write_ground_truth
-from synthetic.film import film_room, prepare
-from synthetic.room import build_room
-from synthetic.videos import write_not_a_video, write_video
+from synthetic.benchmark_capture import write_capture
+from synthetic.suites import CI_CAPTURES
+from synthetic.videos import write_not_a_video
 
 pytestmark = pytest.mark.stage
 
@@ -136,22 +134,9 @@ def test_the_last_lines_of_a_failed_command_are_kept(tmp_path):
     assert run_command([sys.executable, "-c", "print(1)"], tmp_path, tmp_path / "log", 60.0) == (0, "")
 
 
-def _film_with_truth(folder: Path) -> None:
-    """Write a short film of a generated room as a capture with full ground truth."""
-    folder.mkdir(parents=True)
-    room, camera, path = (
-        build_room(0, step_m=0.08, density=0.5),
-        phone_camera(320, 240),
-        handheld_path(96, seed=0),
-    )
-    film_set = prepare(room, shadow_px=256)
-    write_video(folder / "video.mp4", film_room(film_set, camera, path, None, seed=0, supersample=1))
-    write_ground_truth(folder / "ground_truth", room, film_set, camera, path, 12.0)
-
-
 @pytest.mark.end_to_end
 def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
-    _film_with_truth(tmp_path / "captures" / "room")
+    write_capture(CI_CAPTURES["ci_table"], tmp_path / "captures" / "room")
     out, page = tmp_path / "out", tmp_path / "page.md"
     line = [
         sys.executable,
@@ -184,12 +169,18 @@ def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
     assert "frames: already done" in log.read_text()
     result = load_results(out)[0]
     assert result.status == "done"
-    assert result.metrics["stable_rate"] is not None
-    assert result.metrics["psnr_db"] > 10
-    assert 0 < result.metrics["registered_share"] <= 1
-    assert result.metrics["object_recall_25"] > 0.2
-    assert result.metrics["ate_cm"] < 5
-    assert result.metrics["stages.depth.median_rel"] < 0.1
+    # Loose bounds that a working pipeline keeps on any machine; the real figures are in docs/benchmarks.md.
+    at_most = {
+        "ate_cm": 1.0,
+        "tilt_deg": 1.0,
+        "cd_cm": 4.0,
+        "stages.depth.median_rel": 0.02,
+        "registered_share": 1,
+    }
+    at_least = {"f_5cm": 80, "object_recall_25": 0.5, "stable_rate": 0.8, "psnr_db": 18, "coverage": 0.8}
+    assert {name: value for name, bound in at_most.items() if (value := result.metrics[name]) > bound} == {}
+    assert {name: value for name, bound in at_least.items() if (value := result.metrics[name]) < bound} == {}
+    assert result.metrics["registered_share"] > 0
     assert result.metrics["time_s"] == pytest.approx(sum(result.report["timings_s"].values()))
     assert result.metrics["peak_memory_mb"] > 100
     assert "### room" in page.read_text()
