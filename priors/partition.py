@@ -133,9 +133,9 @@ def _trained(splits: dict[str, list[Room]], cache: Path, options: argparse.Names
     }
     fit = replace(_SUPERPOINTS, steps=options.steps or _SUPERPOINTS.steps)
     members = partial(_members, kept=options.out / "networks", seed=options.seed)
-    finished = _ensemble(members(examples["train"], fit))
+    finished = ensemble_of(members(examples["train"], fit))
     halves = [examples["train"][0::2], examples["train"][1::2] or examples["train"]]
-    by_half = [_ensemble(members(half, replace(fit, members=1))) for half in halves]
+    by_half = [ensemble_of(members(half, replace(fit, members=1))) for half in halves]
     rounds, clusters = options.rounds or _ROUNDS["pairs"], {}
     for name, rooms in splits.items():  # those trained on first
         models = [by_half[1 - k % 2] if name == "train" else finished for k in range(len(rooms))]
@@ -248,7 +248,8 @@ def _shift(network: Network) -> None:
         network.node_out[-1].bias[LABELS.index("thing")] += _THINGS
 
 
-def _ensemble(networks: list[Network]) -> Ensemble:
+def ensemble_of(networks: list[Network]) -> Ensemble:
+    """Return trained networks as the ensemble that the stage runs."""
     return Ensemble(tuple(Model({k: v.numpy() for k, v in n.state_dict().items()}) for n in networks))
 
 
@@ -280,7 +281,7 @@ def train(examples: list[Example], fit: Fit, seed: int) -> Network:
     for step in range(1, fit.steps + 1):
         row = int(rng.integers(len(examples)))
         room, truth = crop(examples[row], targets[row], rng, fit.crop)
-        parts = losses(network, _blurred(room, network, fit, rng), truth)
+        parts = losses(network, blurred(room, network, fit, rng), truth)
         optimizer.zero_grad()
         sum(parts).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -295,7 +296,7 @@ def train(examples: list[Example], fit: Fit, seed: int) -> Network:
     return network.eval()
 
 
-def _blurred(room: Example, network: Network, fit: Fit, rng: np.random.Generator) -> Example:
+def blurred(room: Example, network: Network, fit: Fit, rng: np.random.Generator) -> Example:
     """Return a part of a room with noise on its features, and some of them replaced by their means."""
     if not fit.hidden and not fit.noise:
         return room

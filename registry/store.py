@@ -169,7 +169,7 @@ class SceneRegistry:
             SceneBusy: Another process holds the lock.
             EnvironmentMissing: The registry cannot be written.
         """
-        path = self._lock_path(scene_id, "hold")
+        path = self.lock_path(scene_id, "hold")
         with contextlib.ExitStack() as stack:
             try:
                 with _disk_errors(f"lock scene {scene_id}"):
@@ -214,7 +214,7 @@ class SceneRegistry:
         folder = self.scenes_folder / scene_id
         with _disk_errors(f"publish scene {scene_id} to {self.root}"):
             self._create_index()
-            with file_lock(self._lock_path(scene_id, "publish")):
+            with file_lock(self.lock_path(scene_id, "publish")):
                 self._sweep(folder)
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
@@ -232,7 +232,7 @@ class SceneRegistry:
         folder = record.path.parent
         with (
             _disk_errors(f"remove scene {scene_id} from {self.root}"),
-            file_lock(self._lock_path(scene_id, "publish")),
+            file_lock(self.lock_path(scene_id, "publish")),
         ):
             self._index.delete(scene_id)
             for revision in _revisions(folder):
@@ -279,7 +279,8 @@ class SceneRegistry:
 
     # ---- Writing.
 
-    def _lock_path(self, scene_id: str, purpose: str) -> Path:
+    def lock_path(self, scene_id: str, purpose: str) -> Path:
+        """Return the lock file of a scene for "publish" or "hold"."""
         return self.root / "locks" / f"{check_scene_id(scene_id)}.{purpose}.lock"
 
     def _create_index(self) -> None:
@@ -338,7 +339,7 @@ class SceneRegistry:
             # Skip folders in use by another process (LockHeld) and folders that are no scenes (UsageError).
             with (
                 contextlib.suppress(LockHeld, UsageError),
-                file_lock(self._lock_path(folder.name, "publish"), blocking=False),
+                file_lock(self.lock_path(folder.name, "publish"), blocking=False),
             ):
                 self._sweep(folder)
                 with contextlib.suppress(OSError):

@@ -148,12 +148,12 @@ class Randomizer:
         self._env.builder.rest(self._env.builder.movable_ids - moved)
         if moved:
             fell = settle_check(self._env)
-            for group in self._fallen(fell):
+            for group in self.fallen_groups(fell):
                 self._place(group, [np.eye(4)])
                 self.returned += tuple(key for key in group.members if key in moved)
             self._env.builder.rest()
 
-    def _fallen(self, fell: set[int]) -> list[Group]:
+    def fallen_groups(self, fell: set[int]) -> list[Group]:
         """Return the groups of fallen objects, and the groups that block their captured poses."""
         back = [group for group in self._groups if not fell.isdisjoint(group.members)]
         for group in back:  # grows during the loop

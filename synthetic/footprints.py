@@ -63,11 +63,11 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
     if gap <= 0:
         return gap
     return min(
-        _point_distance(a, b), _point_distance(b, a)
+        point_distance(a, b), point_distance(b, a)
     )  # corner to corner can be farther than any axis says
 
 
-def _point_distance(points: np.ndarray, polygon: np.ndarray) -> float:
+def point_distance(points: np.ndarray, polygon: np.ndarray) -> float:
     """Return the smallest distance of points (n, 2) to the edges of a polygon."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     away = points[:, None] - polygon

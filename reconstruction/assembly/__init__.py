@@ -131,7 +131,7 @@ def _settle_together(
         _joint_settle(placer, base, config.joint_settle_s, free_s)
         report = _report(placer.assets, placer.placed, base)
         progress.advance()
-        restless = _restless(report)
+        restless = restless_objects(report)
         deep = report["spawn_penetration_mm"] > _MARGIN * MOST_PENETRATION_MM
         key = (-report["stable_rate"], report["floating_rate"], deep, len(restless))
         if best is None or key < best[0]:
@@ -152,7 +152,7 @@ def _hold_the_rest(
 ) -> dict:
     """Fix unstable objects in place, clear of their neighbors, until none is left; return the report."""
     held: set[int] = set()
-    while faults := _faults(placer, base, report, held):
+    while faults := faults_of(placer, base, report, held):
         done = "it was made immovable" if config.freeze_unstable else "it was left as it is"
         for i, fault in faults.items():
             progress.note(f"assembly: {placer.placed[i].asset.label} {i} {fault}; {done}")
@@ -167,7 +167,7 @@ def _hold_the_rest(
     return report
 
 
-def _faults(placer: Placer, base: list[BodySpec], report: dict, held: set[int]) -> dict[int, str]:
+def faults_of(placer: Placer, base: list[BodySpec], report: dict, held: set[int]) -> dict[int, str]:
     """Describe overlaps, floating and instability, by object id; overlaps only of objects not in `held`."""
     found: dict[int, str] = {}
     if report["spawn_penetration_mm"] > MOST_PENETRATION_MM:
@@ -187,7 +187,7 @@ def _faults(placer: Placer, base: list[BodySpec], report: dict, held: set[int]) 
     return found
 
 
-def _restless(report: dict) -> set[int]:
+def restless_objects(report: dict) -> set[int]:
     """Return the ids of floating objects and of those beyond the margin of the stability bounds."""
     most_m, most_deg = _MARGIN * STABLE_MOVE_M, _MARGIN * STABLE_TURN_DEG
     objects = report["objects"]

@@ -34,7 +34,7 @@ def complete(
     volume: ObjectVolume, frame: ObjectFrame, config: AssetsConfig, *, furniture: bool
 ) -> CompletedField:
     """Decide the unknown voxels of an object's volume; see the module."""
-    volume = _settle_on_support(volume, frame)
+    volume = settle_on_support(volume, frame)
     names: list[str] = []
     if config.symmetry and frame.wall_y is None:
         volume, names = _apply_symmetries(volume, frame)
@@ -55,7 +55,7 @@ def complete(
     return CompletedField(volume.origin, volume.voxel_m, field, tuple(names))
 
 
-def _settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume:
+def settle_on_support(volume: ObjectVolume, frame: ObjectFrame) -> ObjectVolume:
     """Free everything below the support, and extend the object straight down to it.
 
     Noise hides free space just above the support: unknown voxels there take the value above them.

@@ -57,14 +57,14 @@ def front_of(
     scores = np.array(
         [_disagreement(transform_points(world_from_grid, wall - [0, t, 0]), posed, views) for t in away]
     )
-    best, ends = _first_minimum(scores), min(scores[0], scores[-1])
+    best, ends = first_minimum(scores), min(scores[0], scores[-1])
     if not 0 < best < len(away) - 1 or scores[best] > min(_MIN_CONTRAST * ends, ends - _MIN_RISE):
         return None
     before, here, after = scores[best - 1 : best + 2]
     return float(away[best] + 0.5 * _STEP_M * (before - after) / max(before - 2 * here + after, 1e-12))
 
 
-def _first_minimum(scores: np.ndarray) -> int:
+def first_minimum(scores: np.ndarray) -> int:
     """Return the local minimum nearest to the wall among those close to the least score: few views tell them apart."""
     least = float(scores.min())
     inner = np.arange(1, len(scores) - 1)

@@ -177,7 +177,7 @@ def lighten(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
         light = lightened(solid, max_faces)
         if light is not None:
             return light
-        solid = _simplify_manifold(solid, max_faces, tolerance_m)
+        solid = simplify_manifold(solid, max_faces, tolerance_m)
     closed = to_manifold(solid)
     return solid if closed is None else closed
 
@@ -217,7 +217,7 @@ def from_manifold(body: "manifold3d.Manifold") -> Solid:
     return Solid(vertices, np.array(out.tri_verts, np.int32, order="C"))
 
 
-def _simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
+def simplify_manifold(solid: Solid, max_faces: int, tolerance_m: float) -> Solid:
     """Decimate within a growing tolerance until `max_faces` is reached or the volume changes."""
     import manifold3d
 

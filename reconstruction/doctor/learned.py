@@ -17,7 +17,7 @@ _PATIENCE_S = 3.0  # for the answer of a service
 
 def learned_checks() -> list[Check]:
     """Check transformers, weights of default models, the endpoint of a vision-language model, and generators."""
-    return [*_models(), _endpoint(), *generator_checks()]
+    return [*_models(), endpoint_check(), *generator_checks()]
 
 
 def _models() -> list[Check]:
@@ -52,7 +52,8 @@ def has_weights(model: str) -> bool:
     return any(True for pattern in _WEIGHTS for _ in snapshots.glob(f"*/{pattern}"))
 
 
-def _endpoint() -> Check:
+def endpoint_check() -> Check:
+    """Check that the endpoint of the environment's variables answers and serves the model."""
     name = "instances.labels=vlm"
     url, model = os.environ.get("SIMRECON_VLM_URL", ""), os.environ.get("SIMRECON_VLM_MODEL", "")
     if not url or not model:

@@ -19,7 +19,7 @@ def _check(plugin: Plugin) -> Check:
     name, detail = f"{plugin.option}={plugin.name}", f"{plugin.distribution}, {plugin.entry.value}"
     if plugin.option == _TASKS:
         return _imported(f"tasks of {plugin.name}", plugin)
-    accepting = _options()
+    accepting = pluggable_options()
     if plugin.option not in accepting:
         fix = f"its entry points are in the group {GROUP}{plugin.option}; use {GROUP} and one of {', '.join(accepting)}"
         return Check(name, False, f"{detail}: there is no such option", fix, False)
@@ -36,7 +36,7 @@ def _imported(name: str, plugin: Plugin) -> Check:
     return Check(name, True, f"{plugin.distribution}, {plugin.entry.value}", "", False)
 
 
-def _options() -> dict[str, tuple[str, ...]]:
+def pluggable_options() -> dict[str, tuple[str, ...]]:
     """Return the options that accept plugins, with their built-in values."""
     config = PipelineConfig()
     out = {}

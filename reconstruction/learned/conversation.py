@@ -38,7 +38,7 @@ class VlmUnavailable(VlmError):
 
 
 class Conversation:
-    """Asks a model, one question at a time; subclasses implement `_request`, which sends messages."""
+    """Asks a model, one question at a time; subclasses implement `request`, which sends messages."""
 
     def __init__(self, name: str, records: Path | None = None) -> None:
         """Set the model's name and the folder of recorded exchanges."""
@@ -93,12 +93,12 @@ class Conversation:
         file = self.records / f"{digest}.json" if self.records else None
         if file is not None and file.is_file():
             return _recorded(file)
-        text = self._request(messages, schema, schema_name, f"{digest}.json")
+        text = self.request(messages, schema, schema_name, f"{digest}.json")
         if file is not None:
             _record(file, described | {"answer": text}, messages)
         return text
 
-    def _request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
+    def request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
         """Send messages, with images as parts {"type": "image", "image": RGB array}; return the answer.
 
         Raises:

@@ -37,7 +37,8 @@ class QwenModel(Conversation):
         self._images = load_part(request, "Qwen2VLImageProcessorPil")  # needs no torchvision
         self._model = load_model(request, "Qwen2_5_VLForConditionalGeneration")
 
-    def _request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
+    def request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
+        """Answer from the local model; see `Conversation`."""
         import torch
 
         if self._model is None:

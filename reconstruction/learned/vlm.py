@@ -76,7 +76,8 @@ class VlmClient(Conversation):
         self._session = requests.Session()
         self._refused: set[str] = set()  # optional fields that the endpoint refuses
 
-    def _request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
+    def request(self, messages: list[dict], schema: dict, schema_name: str, record: str) -> str:
+        """Answer from the endpoint; see `Conversation`."""
         if not self._endpoint.url:
             raise VlmUnavailable(
                 f"{self.records}: no recorded answer of {self.name} to this question ({record}), and SIMRECON_VLM_URL "

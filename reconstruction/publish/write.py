@@ -97,7 +97,9 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "world": {name: getattr(world, name) for name in _WORLD_FIELDS},
         "cameras": _cameras(posed),
         "base": [_base(item, folder) for item in assets.base],
-        "objects": [_object(item, placed[item.id], item.id in attached, folder) for item in assets.objects],
+        "objects": [
+            object_entry(item, placed[item.id], item.id in attached, folder) for item in assets.objects
+        ],
         "graph": graph_of_bundle(assembled.graph.edges, run.results["scene_graph"], folder),
         "gaussians": _gaussians(run, folder),
         "report": _report(run),
@@ -178,7 +180,8 @@ def _base(item: BaseAsset, folder: Path) -> dict:
     }
 
 
-def _object(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Path) -> dict:
+def object_entry(item: ObjectAsset, placed: PlacedObject, attached: bool, folder: Path) -> dict:
+    """Write the meshes of an object below a folder, and return its entry of `objects`."""
     home = Path("objects") / f"{item.id:03d}"
     (folder / home).mkdir(parents=True)
     write_glb(item.visual, folder / home / "visual.glb")
@@ -250,7 +253,7 @@ def _report(run: "Run") -> dict:
             # With these `simrecon evaluate` and `report` find the stage results in the work folder.
             "work": {"input_digest": run.input_digest, "stage_keys": dict(run.keys)},
         },
-        "backends": _backends(run),
+        "backends": backends_of(run),
         "config": json.loads(canonical_json(run.config)),
         "overrides": run.overrides.entries,
         "notes": run.notes,
@@ -262,14 +265,14 @@ def _report(run: "Run") -> dict:
     }
 
 
-def _backends(run: "Run") -> dict[str, str]:
+def backends_of(run: "Run") -> dict[str, str]:
     """Return the backend of each stage; `ground-truth` for stages that were replaced by the truth."""
     backends = {
         "poses": "pycolmap",
         "depth": "plane-sweep",
         "gaussians": run.config.gaussians.backend,
         **instance_backends(run.config.instances),
-        "assets": _completion(run.config.assets.generator),
+        "assets": completion_of(run.config.assets.generator),
         "physics": physics_backend(run.config.assets),
         "relations": backend_name(run.config.scene_graph),
     }
@@ -285,7 +288,8 @@ def _backends(run: "Run") -> dict[str, str]:
     return backends
 
 
-def _completion(generator: str) -> str:
+def completion_of(generator: str) -> str:
+    """Describe the completion of shapes by the name of the generator."""
     return "embedded" if generator == "none" else f"{generator}, embedded where it is rejected"
 
 

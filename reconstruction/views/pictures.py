@@ -76,7 +76,7 @@ def draw_view(scene: ViewScene, target: Target, point: "Viewpoint", inpainter: I
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(outline > 1e-6, alone[..., 3] / outline, 0.0)
     clean, holes = _without_occluders(scene, own, camera, pose, outline > _OPAQUE, depth, whole)
-    behind = _hidden_holes(outline > _OPAQUE, depth, whole)
+    behind = hidden_holes(outline > _OPAQUE, depth, whole)
     holes |= _grown(behind)
     total = float(outline.sum())
     return View(
@@ -155,7 +155,7 @@ def _without_occluders(
     return _uint8(np.where(opacity[..., None] > _OPAQUE, color, 0.0)), _grown(opacity <= _OPAQUE)
 
 
-def _hidden_holes(outline: np.ndarray, depth: np.ndarray, whole: np.ndarray) -> np.ndarray:
+def hidden_holes(outline: np.ndarray, depth: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """Return the holes enclosed by the silhouette (h, w) that are unseen because of occluders, bool (h, w).
 
     There the scene (features `whole` (h, w, c)) is nearer than the target around the hole; in true openings it is not.

@@ -80,15 +80,17 @@ def read_splats(bundle: SceneBundle, bodies: Sequence[Body], solids: Sequence[Co
     shapes = [(row_of[solid.owner], solid) for solid in solids if row_of.get(solid.owner, 0) in movable]
     world_from_body = [np.eye(4)] * (1 + len(base)) + [body.world_from_root for body in bodies]
     keys = (*base, *(body.root for body in bodies))
-    scene = _pack(found, row_of, keys, np.array(world_from_body))
+    scene = packed_scene(found, row_of, keys, np.array(world_from_body))
     _claim(scene, shapes)
     shown = ~_covered(scene, shapes)
     return replace(scene, rows=scene.rows[shown], colors=scene.colors[shown], bodies=scene.bodies[shown])
 
 
-def _pack(
+def packed_scene(
     found: dict[str, np.ndarray], row_of: dict[int, int], keys: tuple[int, ...], world_from_body: np.ndarray
 ) -> SplatScene:
+    """Sort the columns of a file into a scene, each Gaussian in the frame of its body."""
+
     def take(*names: str) -> np.ndarray:
         return np.stack([np.asarray(found[name], np.float64) for name in names], axis=1)
 

@@ -109,7 +109,7 @@ def test_numpy_says_what_pytorch_says(tmp_path):
     networks = [Network(FEATURES, 16, 2) for _ in range(2)]
     rng = np.random.default_rng(0)
     trees = {name: stumps(count, rng)[0] for name, count in TREES.items()}
-    partition.export(partition._ensemble(networks), trees, 0.25, tmp_path / "w.safetensors")
+    partition.export(partition.ensemble_of(networks), trees, 0.25, tmp_path / "w.safetensors")
     models = load_models(tmp_path / "w.safetensors")
     assert models.least_iou == 0.25
     nodes, edges, pairs = graph_of(rng, FEATURES)
@@ -167,7 +167,7 @@ def test_noise_on_features_keeps_their_means(graph):
     fit = partition.Fit(1, 1, 16, 1, 0.0, 0.3, 0.5, 300)
     network = partition.train([graph], fit, 0)
     rng = np.random.default_rng(0)
-    blurred = partition._blurred(graph, network, fit, rng)
+    blurred = partition.blurred(graph, network, fit, rng)
     scale = network.edge_scale.numpy()
     away = (blurred.edges - graph.edges) * scale
     assert np.abs(away.mean(axis=0)).max() < 0.2

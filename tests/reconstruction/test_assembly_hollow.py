@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from boxes import box, box_part, floor, mesh_of, room, thing, wall
 
-from reconstruction.assembly import AssemblyConfig, _faults, assemble, scene_specs
+from reconstruction.assembly import AssemblyConfig, assemble, faults_of, scene_specs
 from reconstruction.assembly.base import convex_part
 from reconstruction.assembly.collision_trimming import cut_out
 from reconstruction.assembly.hollow import fills_air, hollowed, volume
@@ -232,5 +232,5 @@ def test_what_is_inside_something_in_the_end_is_found_with_who_came_later():
         placer.placed[item.id] = placement(item)
     base = base_specs(assets)
     report = physics_report(scene_specs(placer.placed.values(), base), graph.edges)
-    assert _faults(placer, base, report, set()) == {11: "overlaps cabinet 10"}
-    assert _faults(placer, base, report, {11}) == {}
+    assert faults_of(placer, base, report, set()) == {11: "overlaps cabinet 10"}
+    assert faults_of(placer, base, report, {11}) == {}

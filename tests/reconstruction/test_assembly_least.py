@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from boxes import box, box_part, floor, room, thing
 
-from reconstruction.assembly import AssemblyConfig, _restless, assemble
+from reconstruction.assembly import AssemblyConfig, assemble, restless_objects
 from reconstruction.assembly.collision_trimming import cut_out, give_way
 from reconstruction.assembly.depenetration import least_move, make_clear
 from reconstruction.assembly.placement import base_specs
@@ -221,4 +221,4 @@ def test_the_margin_to_the_bounds_is_half_of_them():
     still = {"id": 1, "floating": False, "moved_m": 0.0, "turned_deg": 0.0}
     entries = [still, still | {"id": 2, "moved_m": 0.011}, still | {"id": 3, "turned_deg": 2.6}]
     entries += [still | {"id": 4, "floating": True}, still | {"id": 5, "moved_m": 0.009, "turned_deg": 2.4}]
-    assert _restless({"objects": entries}) == {2, 3, 4}
+    assert restless_objects({"objects": entries}) == {2, 3, 4}

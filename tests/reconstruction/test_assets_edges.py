@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from reconstruction.assembly.base import convex_part
-from reconstruction.assets.collision.build import _part
+from reconstruction.assets.collision.build import hull_part
 from reconstruction.assets.edges import with_simple_edges
 from reconstruction.assets.gltf import read_obj, write_obj
 from reconstruction.assets.solid import Solid, box_solid, manifold_of
@@ -73,7 +73,7 @@ def test_collision_parts_are_watertight_in_their_files(tmp_path):
     """Corners a hundredth of a micrometre apart are one in the file."""
     rng = np.random.default_rng(1)
     corners = box_solid(np.zeros(3), np.array([0.3, 0.2, 0.1])).vertices
-    part = _part(np.concatenate([corners, corners + rng.uniform(-1e-8, 1e-8, corners.shape)]))
+    part = hull_part(np.concatenate([corners, corners + rng.uniform(-1e-8, 1e-8, corners.shape)]))
     write_obj(part, tmp_path / "part.obj")
     back = read_obj(tmp_path / "part.obj")
     assert is_watertight(Solid(back.vertices.astype(float), back.faces))

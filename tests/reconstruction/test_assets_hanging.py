@@ -6,7 +6,7 @@ from facing import CAMERA, frames
 
 from reconstruction.assets import AssetsConfig
 from reconstruction.assets.hanging import hanging_slab, is_outlined, outlined_slab
-from reconstruction.assets.hanging_front import _first_minimum, front_of
+from reconstruction.assets.hanging_front import first_minimum, front_of
 from reconstruction.assets.volume import ObjectFrame
 from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, PosedFrames
 from registry.geometry import rigid, transform_points
@@ -130,9 +130,9 @@ def test_the_images_measure_the_thickness(thickness):
 def test_the_nearest_of_several_minima_is_the_front():
     near = np.linspace(5, 9, 13)
     curve = np.concatenate([near[::-1], [5.2, 6, 5.4, 4.9, 5.6, 6.5, 8, 9, 10, 11, 12, 13]])
-    assert _first_minimum(curve) == 12
+    assert first_minimum(curve) == 12
     curve[:14] += 2.0
-    assert _first_minimum(curve) == int(np.argmin(curve))
+    assert first_minimum(curve) == int(np.argmin(curve))
 
 
 def test_a_plain_picture_or_a_still_camera_give_no_thickness():

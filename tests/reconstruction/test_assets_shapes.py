@@ -7,7 +7,7 @@ from reconstruction.assets.collision import collision_parts
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.physics.mass import mass_properties, physical_attributes, shell_properties
 from reconstruction.assets.physics.materials import MATERIALS, MaterialChoice, choose_material
-from reconstruction.assets.solid import _simplify_manifold, box_solid, from_manifold, lighten, to_manifold
+from reconstruction.assets.solid import box_solid, from_manifold, lighten, simplify_manifold, to_manifold
 
 
 def bowl(outer=0.08, wall=0.006, height=0.06):
@@ -129,7 +129,7 @@ def test_decimation_keeps_the_solid_closed():
 def test_decimation_keeps_parts_thinner_than_its_tolerance():
     manifold3d = pytest.importorskip("manifold3d")
     ball = from_manifold(manifold3d.Manifold.sphere(0.002, 128))
-    light = _simplify_manifold(ball, 100, 0.01)
+    light = simplify_manifold(ball, 100, 0.01)
     assert light.volume == pytest.approx(ball.volume, rel=0.11)
 
 

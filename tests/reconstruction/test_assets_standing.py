@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reconstruction.assets.completion import _settle_on_support
+from reconstruction.assets.completion import settle_on_support
 from reconstruction.assets.standing import (
     Standing,
     _agreed,
@@ -195,7 +195,7 @@ def flat_on_its_support(rim) -> tuple[ObjectVolume, ObjectFrame]:
 
 def lowest_layer(volume: ObjectVolume, frame: ObjectFrame) -> np.ndarray:
     """Columns (nx, ny) where the object is solid just above its support."""
-    made = _settle_on_support(volume, frame)
+    made = settle_on_support(volume, frame)
     return made.distance[:, :, int(np.searchsorted(made.centers(2), 0.0))] < 0
 
 

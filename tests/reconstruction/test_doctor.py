@@ -127,15 +127,15 @@ def test_the_endpoint_is_asked_for_its_models(monkeypatch: pytest.MonkeyPatch) -
     with Server() as server:
         monkeypatch.setenv("SIMRECON_VLM_URL", server.url)
         monkeypatch.setenv("SIMRECON_VLM_MODEL", "tiny-vl")
-        assert learned._endpoint().ok
+        assert learned.endpoint_check().ok
         monkeypatch.setenv("SIMRECON_VLM_MODEL", "large-vl")
-        other = learned._endpoint()
+        other = learned.endpoint_check()
         assert not other.ok
         assert "serves tiny-vl, not large-vl" in other.detail
         monkeypatch.setenv("SIMRECON_VLM_URL", server.url + "/nothing")
-        assert "does not list its models" in learned._endpoint().detail
+        assert "does not list its models" in learned.endpoint_check().detail
     monkeypatch.delenv("SIMRECON_VLM_URL")
-    assert "SIMRECON_VLM_URL" in learned._endpoint().fix
+    assert "SIMRECON_VLM_URL" in learned.endpoint_check().fix
 
 
 def test_packages_too_broken_to_look_are_no_crash() -> None:

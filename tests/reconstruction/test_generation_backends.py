@@ -22,7 +22,7 @@ from reconstruction.assets.generation import records as records_module
 from reconstruction.assets.generation.base import Picture
 from reconstruction.assets.generation.hunyuan import Hunyuan3D
 from reconstruction.assets.generation.meshes import read_generated
-from reconstruction.assets.generation.pictures import _without_specks
+from reconstruction.assets.generation.pictures import without_specks
 from reconstruction.assets.generation.records import Records
 from reconstruction.assets.generation.rodin import Rodin
 from reconstruction.assets.generation.service import ServiceLimits
@@ -89,7 +89,7 @@ def test_rodin_is_sent_pictures_of_the_object_alone(rodin):
 def test_specks_are_removed_from_pictures():
     mask = np.zeros((40, 60), bool)
     mask[5:25, 5:25] = mask[5:25, 40:50] = mask[35:37, 55:58] = True
-    kept = _without_specks(mask)
+    kept = without_specks(mask)
     assert kept[5:25, 5:25].all()
     assert kept[5:25, 40:50].all()  # cut in two by something in front
     assert kept.sum() == mask.sum() - 6
@@ -275,7 +275,7 @@ def test_records_differ_by_the_inputs_of_the_mesh(rodin, tmp_path):
 def test_a_damaged_task_file_is_ignored(tmp_path):
     note = tmp_path / "x.pending.json"
     note.write_text('{"uuid": 3')
-    assert records_module._read_task(note) is None
+    assert records_module.read_task(note) is None
 
 
 def test_missing_keys_and_packages_are_reported_first(tmp_path, monkeypatch):

@@ -20,7 +20,7 @@ from reconstruction.assets.solid import to_manifold
 from reconstruction.assets.views import lift_object, prepare_pixels
 from reconstruction.config import PipelineConfig
 from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, Surface
-from reconstruction.publish.write import _completion
+from reconstruction.publish.write import completion_of
 from registry.geometry import transform_points
 from synthetic.containers import make_bowl, make_mug
 from synthetic.furnishing import make_chair
@@ -205,6 +205,6 @@ def test_a_closed_mesh_keeps_its_own_surface():
 def test_options_are_checked_and_recorded():
     config = PipelineConfig().with_option("assets.generator=rodin").with_option("assets.generator_budget=2.5")
     assert config.assets.generator_budget == 2.5
-    assert _completion("none") == "embedded"
-    assert _completion("rodin").startswith("rodin")
+    assert completion_of("none") == "embedded"
+    assert completion_of("rodin").startswith("rodin")
     assert all(preset.generator == "none" for preset in ASSETS_PRESETS.values())

@@ -199,10 +199,10 @@ def test_a_clip_model_is_loaded_and_names_what_it_sees(clip_folder, monkeypatch)
     assert names[2] is None  # nothing shows it
     assert {name.label for name in names[:2]} <= {"cup", "lamp", "box", "chair"}
     views = best_views(found, posed)[2]
-    probabilities = namer._probabilities([view.dimmed() for view in views])
+    probabilities = namer.probabilities([view.dimmed() for view in views])
     assert probabilities.shape == (3, 4)
     assert np.allclose(probabilities.sum(axis=1), 1)
-    alone = namer._probabilities([views[0].dimmed()])
+    alone = namer.probabilities([views[0].dimmed()])
     assert np.allclose(alone, probabilities[:1], atol=1e-5)
     named = name_instances(namer, found, posed, progress=NO_PROGRESS)
     assert unchanged(found, named)

@@ -81,7 +81,7 @@ def test_moves_and_joins_never_lose_against_contraction_alone():
     gains = []
     for _ in range(10):
         pairs, weights = random_graph(rng, 40)
-        alone = solver._contract(40, pairs, weights)
+        alone = solver.contract_edges(40, pairs, weights)
         gains.append(
             solver.energy(pairs, weights, solver.multicut(40, pairs, weights))
             - solver.energy(pairs, weights, alone)

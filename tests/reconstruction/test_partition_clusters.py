@@ -106,12 +106,12 @@ def test_small_clusters_are_compared_with_near_ones_only():
     box = np.random.default_rng(0).uniform(0, 2, (300, 1, 3)) + np.array([[0.0], [0.01]])
     box[0] = [[0, 0, 0], [2, 2, 0.1]]
     size = np.linalg.norm(box[:, 1] - box[:, 0], axis=1)
-    found = {(a, b): reach for a, b, reach in clusters._boxes_in_reach(box, size)}
+    found = {(a, b): reach for a, b, reach in clusters.boxes_in_reach(box, size)}
     for a, b in itertools.combinations(range(300), 2):
         gap = np.linalg.norm(np.maximum(np.maximum(box[a, 0] - box[b, 1], box[b, 0] - box[a, 1]), 0))
         assert ((a, b) in found) == (gap < max(0.02, min(size[a], size[b])))
     pairs = np.array(list(itertools.combinations(range(30), 2)))
-    kept = clusters._among_nearest(pairs, np.abs(pairs[:, 0] - pairs[:, 1]).astype(float))
+    kept = clusters.among_nearest(pairs, np.abs(pairs[:, 0] - pairs[:, 1]).astype(float))
     away = np.abs(pairs[:, 0] - pairs[:, 1])
     assert kept[away <= clusters.NEAREST // 2].all()
     assert not kept[away > clusters.NEAREST].any()

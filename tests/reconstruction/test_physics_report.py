@@ -14,7 +14,7 @@ from reconstruction.cli import main
 from reconstruction.commands.scenes import describe_physics
 from reconstruction.core.types import Edge, SceneGraph
 from reconstruction.exports import export_scene
-from reconstruction.publish.write import _object, publish_scene
+from reconstruction.publish.write import object_entry, publish_scene
 from registry import SceneRegistry, seal_bundle
 from registry.errors import SimReconError
 
@@ -71,7 +71,7 @@ def test_assembly_without_a_collision_shape_is_published_without_one(tmp_path):
     assets = room(box(10, (1.2, 0.6, 0.9), (0, 0, 0)), box(11, (1.2, 0.6, 0.9), (0, 0, 0)))
     graph = SceneGraph(tuple(Edge(i, "supported_by", 1, 1.0, "") for i in (10, 11)))
     placed = assemble(assets, graph, AssemblyConfig()).placed
-    entries = [_object(a, p, False, tmp_path) for a, p in zip(assets.objects, placed)]
+    entries = [object_entry(a, p, False, tmp_path) for a, p in zip(assets.objects, placed)]
     assert [len(entry["collision"]) for entry in entries] == [1, 0]
     assert not list((tmp_path / "objects" / "011").glob("collision*"))
 

@@ -26,7 +26,7 @@ from reconstruction.instances import InstancesConfig, find_instances, load_namer
 from reconstruction.instances.masks import load_mask_backend
 from reconstruction.pipeline import STAGES
 from reconstruction.poses.backends import load_pose_backend
-from reconstruction.publish.write import _backends
+from reconstruction.publish.write import backends_of
 from reconstruction.runner import Run, StageStore
 from reconstruction.scene_graph import SceneGraphConfig
 from reconstruction.scene_graph.load import load_relations
@@ -144,7 +144,7 @@ def test_every_option_with_backends_accepts_those_of_other_packages(site, option
 
 def test_the_docs_list_every_option_that_accepts_plugins():
     listed = re.findall(r"^\| `([\w.]+)` \|", SECTION, re.MULTILINE)
-    assert listed == list(doctor_plugins._options())
+    assert listed == list(doctor_plugins.pluggable_options())
     assert set(listed) == set(LOADERS)
 
 
@@ -210,6 +210,6 @@ def test_the_bundle_names_the_plugins(flatcolors, tmp_path):
     run = Run(
         tmp_path, PipelineConfig().with_option("instances.masks=flat"), StageStore(tmp_path), input_digest="a"
     )
-    assert _backends(run)["masks"] == "flat"
-    assert _backends(run)["plugins"] == "instances.masks=flat of flatcolors 1.0"
-    assert "plugins" not in _backends(replace(run, config=PipelineConfig()))
+    assert backends_of(run)["masks"] == "flat"
+    assert backends_of(run)["plugins"] == "instances.masks=flat of flatcolors 1.0"
+    assert "plugins" not in backends_of(replace(run, config=PipelineConfig()))

@@ -130,7 +130,7 @@ def test_the_camera_walks_freely_at_a_persons_height(kind, objects, seed, walls)
     assert at[:, 2].min() > 1.05
     assert at[:, 2].max() < 1.75
     for item in plan.items:
-        nearest = min(footprints._point_distance(p[None, :2], item.silhouette) for p in at)
+        nearest = min(footprints.point_distance(p[None, :2], item.silhouette) for p in at)
         inside = any(footprints.depth_inside(p[None, :2], item.silhouette) > 0 for p in at)
         assert not inside, item.name
         assert nearest > 0.15, (item.name, nearest)

@@ -36,15 +36,15 @@ def test_the_choice_is_as_good_as_trying_all():
 def test_without_time_the_best_are_taken_one_by_one():
     regions = [[0], [1], [0, 1], [2]]
     gain = np.array([0.5, 0.1, 0.4, 0.2])
-    chosen = trees._greedy(members_of(regions, 3), gain, np.arange(4))
+    chosen = trees.disjoint_by_gain(members_of(regions, 3), gain, np.arange(4))
     np.testing.assert_array_equal(chosen, [0, 1, 3])
     assert len(best_disjoint(members_of(regions, 3), -gain)) == 0
 
 
 def test_a_merge_tree_joins_what_belongs_together_first():
     pairs, odds = np.array([[0, 1], [1, 2], [2, 3]]), np.array([3.0, -1.0, 2.0])
-    for linkage in (trees._total, trees._mean):
-        merged = trees._merged(np.ones(4), pairs, odds, linkage)
+    for linkage in (trees.total_odds, trees._mean):
+        merged = trees.regions_of_tree(np.ones(4), pairs, odds, linkage)
         assert merged == [frozenset({0, 1}), frozenset({2, 3}), frozenset({0, 1, 2, 3})]
 
 
@@ -52,16 +52,16 @@ def test_a_region_is_proposed_with_all_that_is_below_it():
     """A top, a pedestal below it, a box on it, and a chair beside it."""
     low = np.array([[0, 0, 0.7], [0.4, 0.4, 0], [0.2, 0.2, 0.75], [1.5, 0, 0]])
     high = np.array([[1, 1, 0.75], [0.6, 0.6, 0.7], [0.3, 0.3, 0.9], [2.0, 0.5, 0.9]])
-    assert trees._with_all_below(frozenset({0}), low, high, 0.5 * (low + high)) == {0, 1}
-    assert trees._with_all_below(frozenset({0, 2}), low, high, 0.5 * (low + high)) == {0, 1, 2}
-    assert trees._with_all_below(frozenset({3}), low, high, 0.5 * (low + high)) == {3}
+    assert trees.with_all_below(frozenset({0}), low, high, 0.5 * (low + high)) == {0, 1}
+    assert trees.with_all_below(frozenset({0, 2}), low, high, 0.5 * (low + high)) == {0, 1, 2}
+    assert trees.with_all_below(frozenset({3}), low, high, 0.5 * (low + high)) == {3}
 
 
 def test_regions_that_hardly_grow_are_left_out():
     count = 30
     area = np.r_[1.0, np.full(count - 1, 0.01)]
     pairs = np.stack([np.zeros(count - 1, int), np.arange(1, count)], axis=1)
-    merged = trees._merged(area, pairs, -np.arange(1.0, count), trees._total)
+    merged = trees.regions_of_tree(area, pairs, -np.arange(1.0, count), trees.total_odds)
     sizes = np.array([area[list(m)].sum() for m in merged])
     assert len(merged) < count / 2
     assert sizes[-1] == pytest.approx(area.sum())

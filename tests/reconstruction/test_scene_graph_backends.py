@@ -194,7 +194,7 @@ def test_a_model_in_process_sees_the_picture_and_answers_alike(qwen, tmp_path):
 
     def ask(image):
         content = [{"type": "text", "text": "What is on what?"}, {"type": "image", "image": image}]
-        return model._request([{"role": "user", "content": content}], {}, "", "")
+        return model.request([{"role": "user", "content": content}], {}, "", "")
 
     with one_thread():
         assert ask(picture) == ask(picture) != ask(255 - picture)

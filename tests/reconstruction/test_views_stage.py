@@ -20,7 +20,7 @@ from reconstruction.instances.naming.views import ObjectView
 from reconstruction.pipeline import DEFAULT_STAGE_NAMES, STAGE_NAMES, STAGES
 from reconstruction.runner import Run
 from reconstruction.views import AvoConfig, SceneViews, find_views, make_views
-from reconstruction.views.pictures import _hidden_holes
+from reconstruction.views.pictures import hidden_holes
 from registry.errors import UsageError
 
 QUICK = AvoConfig(
@@ -122,7 +122,7 @@ def test_what_things_hide_from_all_frames_is_of_the_target_and_open_holes_are_no
     whole = np.zeros((40, 60, 8))
     whole[..., 7], whole[..., 3] = 1.0, 3.0
     whole[10:20, 10:20, 3] = 1.5  # something stands before the left gap
-    hidden = _hidden_holes(outline, depth, whole)
+    hidden = hidden_holes(outline, depth, whole)
     assert hidden[10:20, 10:20].all()
     assert hidden.sum() == 100
 

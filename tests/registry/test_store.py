@@ -328,7 +328,7 @@ def test_a_temporary_folder_in_use_is_not_swept(reg, make_staging):
     reg.publish(make_staging(), "scene0001")
     in_use = reg.root / "scenes" / "scene0009" / ".publishing-1-abc"
     in_use.mkdir(parents=True)
-    with store_module.file_lock(reg._lock_path("scene0009", "publish")):
+    with store_module.file_lock(reg.lock_path("scene0009", "publish")):
         reg.publish(make_staging(), "scene0002")
         assert in_use.exists()
     reg.publish(make_staging(), "scene0003")

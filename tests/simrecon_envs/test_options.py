@@ -155,7 +155,7 @@ def test_what_stands_in_the_place_of_what_fell_goes_back_too(tmp_path: Path) -> 
             id(first): [hull - np.array([0.2, 0]) for hull in first.outlines],
             id(second): [hull + np.array([0.01, 0]) for hull in there.outlines],
         }
-        found = randomizer._fallen({first.members[0]})
+        found = randomizer.fallen_groups({first.members[0]})
         assert [group.members for group in found] == [group.members for group in back]
     env.close()
 

@@ -51,13 +51,13 @@ def _packed(count: int, seed: int = 0) -> np.ndarray:
 
 
 def _scene(packed: np.ndarray, bodies: np.ndarray | None = None) -> SplatScene:
-    from simrecon_envs.splats.scene import _pack
+    from simrecon_envs.splats.scene import packed_scene
 
     names = ("x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "opacity")
     names += ("f_dc_0", "f_dc_1", "f_dc_2")
     found = {name: packed[:, column] for column, name in enumerate(names)}
     found["instance_id"] = np.zeros(len(packed), int) if bodies is None else bodies
-    return _pack(found, {1: 1}, (1,), np.array([np.eye(4), np.eye(4)]))
+    return packed_scene(found, {1: 1}, (1,), np.array([np.eye(4), np.eye(4)]))
 
 
 def _draw(scene: SplatScene, moves: np.ndarray | None = None, **options) -> Drawn:

@@ -115,10 +115,10 @@ def _clipped(vertices: np.ndarray, low: np.ndarray, high: np.ndarray) -> ConvexP
             if abs(nearest - bound[axis]) < snap[axis]:
                 at = np.abs(clipped[:, axis] - nearest) < 0.5 * snap[axis]
                 clipped[at, axis] = bound[axis]
-    return _part(clipped)
+    return hull_part(clipped)
 
 
-def _part(vertices: np.ndarray) -> ConvexPart | None:
+def hull_part(vertices: np.ndarray) -> ConvexPart | None:
     """Return the hull of vertices as a part; None if it is too thin."""
     from scipy.spatial import QhullError
 

@@ -36,7 +36,7 @@ def object_pictures(
 def view_pictures(views: Sequence[View], count: int) -> list[Picture]:
     """Return up to `count` pictures of an object from its views, without occluders and without views of back faces."""
     shown = [view.cleared() for view in views if view.fronts >= _LEAST_FRONTS]
-    return [Picture(color, _without_specks(mask)) for color, mask in filter(None, shown)][:count]
+    return [Picture(color, without_specks(mask)) for color, mask in filter(None, shown)][:count]
 
 
 def keyframe_pictures(found: InstanceSet, posed: PosedFrames, count: int) -> dict[int, list[Picture]]:
@@ -44,12 +44,12 @@ def keyframe_pictures(found: InstanceSet, posed: PosedFrames, count: int) -> dic
     from reconstruction.instances.naming.views import best_views
 
     return {
-        number: [Picture(view.crop, _without_specks(view.mask)) for view in views if view.mask.any()]
+        number: [Picture(view.crop, without_specks(view.mask)) for view in views if view.mask.any()]
         for number, views in best_views(found, posed, count).items()
     }
 
 
-def _without_specks(mask: np.ndarray) -> np.ndarray:
+def without_specks(mask: np.ndarray) -> np.ndarray:
     """Drop small components of a mask, such as depth bleeding from neighbors."""
     _, labels, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     sizes = facts[1:, cv2.CC_STAT_AREA]

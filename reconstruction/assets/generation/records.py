@@ -44,7 +44,7 @@ class Records:
         if mesh.is_file():
             return mesh.read_bytes()
         waiting = self._file(pictures, ".pending.json")
-        job = Job(_read_task(waiting), lambda task: _keep_task(waiting, task))
+        job = Job(read_task(waiting), lambda task: _keep_task(waiting, task))
         record = self._description(pictures)
         try:
             data = self._backend.generate(pictures, job)
@@ -77,7 +77,7 @@ class Records:
         return self._folder / f"{self._backend.name}-{digest}{suffix}"
 
 
-def _read_task(file: Path) -> dict[str, str] | None:
+def read_task(file: Path) -> dict[str, str] | None:
     """Return a pending task; None where there is none, or the file is damaged."""
     try:
         task = json.loads(file.read_text())

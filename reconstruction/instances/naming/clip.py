@@ -51,11 +51,11 @@ class ClipNamer:
         names = []
         for item in found.objects:
             pictures = [view.dimmed() for view in views[item.id]]
-            names.append(choose(self._words, self._probabilities(pictures)) if pictures else None)
+            names.append(choose(self._words, self.probabilities(pictures)) if pictures else None)
             progress.advance()
         return names
 
-    def _probabilities(self, pictures: list[np.ndarray]) -> np.ndarray:
+    def probabilities(self, pictures: list[np.ndarray]) -> np.ndarray:
         """Return (views, words + negative prompts), each row summing to 1."""
         import torch
 

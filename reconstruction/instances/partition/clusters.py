@@ -142,7 +142,7 @@ def _near_pairs(view: View, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray, np
     """Return pairs of nodes (e, 2), their nearest vertices (e, 2), and the gaps (e,) in metres."""
     size = np.linalg.norm(pieces.box[:, 1] - pieces.box[:, 0], axis=1)
     pairs, ends, gaps = [], [], []
-    for a, b, reach in _boxes_in_reach(pieces.box, size):
+    for a, b, reach in boxes_in_reach(pieces.box, size):
         small, large = (a, b) if len(pieces.all_vertices[a]) <= len(pieces.all_vertices[b]) else (b, a)
         points = view.mesh.points[pieces.all_vertices[small]]
         distance, found = pieces.trees[large].query(points, distance_upper_bound=reach)
@@ -155,11 +155,11 @@ def _near_pairs(view: View, pieces: _Pieces) -> tuple[np.ndarray, np.ndarray, np
     pairs, ends, gaps = (
         np.array(pairs, np.int64).reshape(-1, 2), np.array(ends, np.int64).reshape(-1, 2), np.array(gaps, float)
     )  # fmt: skip
-    kept = (gaps < _TOUCHING_M) | _among_nearest(pairs, gaps)
+    kept = (gaps < _TOUCHING_M) | among_nearest(pairs, gaps)
     return pairs[kept], ends[kept], gaps[kept]
 
 
-def _boxes_in_reach(box: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, int, float]]:
+def boxes_in_reach(box: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, int, float]]:
     """Yield pairs of boxes float (n, 2, 3) within reach of each other, and their reach in metres."""
     reach = np.clip(REACH_OF_SIZE * size, _TOUCHING_M, REACH_M)
     for a in range(len(box)):
@@ -169,7 +169,7 @@ def _boxes_in_reach(box: np.ndarray, size: np.ndarray) -> Iterator[tuple[int, in
             yield a, a + 1 + int(k), float(allowed[k])
 
 
-def _among_nearest(pairs: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+def among_nearest(pairs: np.ndarray, gaps: np.ndarray) -> np.ndarray:
     """Return which pairs (e, 2) have an end that is among the `NEAREST` neighbors of the other end."""
     ends, row = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.lexsort((row, gaps[row], ends))

@@ -25,7 +25,7 @@ def multicut(count: int, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
         return np.zeros(0, np.int32)
     pairs = np.ascontiguousarray(pairs, np.int64).reshape(-1, 2)
     weights = np.maximum(np.asarray(weights, np.float64), -1e9)
-    label = _contract(count, pairs, weights)
+    label = contract_edges(count, pairs, weights)
     for _ in range(_ROUNDS):
         before = label
         label = _joined(_moved(count, pairs, weights, label), pairs, weights)
@@ -77,7 +77,7 @@ def _numbered(label: np.ndarray) -> np.ndarray:
     return rank[inverse.reshape(-1)]
 
 
-def _contract(count: int, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def contract_edges(count: int, pairs: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Contract the heaviest edge, parallel edges summed, while its weight is positive; return roots int (count,)."""
     if len(pairs) == 0:
         return np.arange(count)
@@ -94,7 +94,7 @@ def _joined(label: np.ndarray, pairs: np.ndarray, weights: np.ndarray) -> np.nda
     count = int(label.max()) + 1
     keys, inverse = np.unique(ends[across, 0].astype(np.int64) * count + ends[across, 1], return_inverse=True)
     summed = np.bincount(inverse, weights=weights[across], minlength=len(keys))
-    return _contract(count, np.stack([keys // count, keys % count], axis=1), summed)[label]
+    return contract_edges(count, np.stack([keys // count, keys % count], axis=1), summed)[label]
 
 
 def _moved(count: int, pairs: np.ndarray, weights: np.ndarray, label: np.ndarray) -> np.ndarray:

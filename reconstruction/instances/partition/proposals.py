@@ -49,14 +49,14 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
     pairs = pieces.graph.pairs.astype(np.int64)
     odds = np.clip(odds.astype(np.float64), -_CLIP_ODDS, _CLIP_ODDS)
     found = {frozenset([k]) for k in range(count)}
-    for linkage in (_total, _mean):
-        found |= set(_merged(area, pairs, odds, linkage))
+    for linkage in (total_odds, _mean):
+        found |= set(regions_of_tree(area, pairs, odds, linkage))
     inside = region < count
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, region[inside], view.mesh.points[inside])
     np.maximum.at(high, region[inside], view.mesh.points[inside])
     middle = 0.5 * (low + high)
-    found |= {_with_all_below(members, low, high, middle) for members in found}
+    found |= {with_all_below(members, low, high, middle) for members in found}
     regions = sorted(sorted(members) for members in found)
     members = members_of(regions, count)
     if not regions:
@@ -68,7 +68,7 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
     return Proposals(members[kept], low[kept], high[kept])
 
 
-def _with_all_below(
+def with_all_below(
     members: frozenset[int], low: np.ndarray, high: np.ndarray, middle: np.ndarray
 ) -> frozenset[int]:
     """Return a region with the clusters whose box centers (n, 3) are below its box and inside its footprint."""
@@ -88,7 +88,8 @@ def members_of(regions: list[list[int]], count: int) -> csr_matrix:
 Link = tuple[float, int]  # sum and number of the pairwise log-odds between two regions
 
 
-def _total(link: Link) -> float:
+def total_odds(link: Link) -> float:
+    """Return the sum of the odds of a link."""
     return link[0]
 
 
@@ -96,7 +97,7 @@ def _mean(link: Link) -> float:
     return link[0] / link[1]
 
 
-def _merged(
+def regions_of_tree(
     area: np.ndarray, pairs: np.ndarray, odds: np.ndarray, linkage: Callable[[Link], float]
 ) -> list[frozenset[int]]:
     """Return the regions of one merge tree, without those that are almost as large as their parent; see `ALIKE`."""
@@ -151,11 +152,12 @@ def best_disjoint(members: csr_matrix, gain: np.ndarray) -> np.ndarray:
         options={"time_limit": _TIME_S},
     )  # fmt: skip
     if found.x is None:  # no solution within the time limit
-        return _greedy(members, gain, rows)
+        return disjoint_by_gain(members, gain, rows)
     return rows[found.x > 0.5]
 
 
-def _greedy(members: csr_matrix, gain: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def disjoint_by_gain(members: csr_matrix, gain: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Choose disjoint rows by falling gain; return their numbers."""
     taken, out = np.zeros(members.shape[1], bool), []  # pyright: ignore[reportOptionalSubscript]
     for row in rows[np.argsort(-gain[rows], kind="stable")].tolist():
         own = members.indices[members.indptr[row] : members.indptr[row + 1]]
