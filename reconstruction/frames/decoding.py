@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from reconstruction.frames.tone_mapping import HLG, PQ, to_standard_range
 from reconstruction.phone_exports.exports import natural
 from registry.errors import EnvironmentMissing, InputError
 
@@ -151,25 +152,34 @@ class VideoReader:
         self.quarter_turns = turns
         self.width, self.height = self._stored_size if turns % 2 == 0 else self._stored_size[::-1]
         self.interlaced = bool(frame.interlaced_frame)
-        self.high_dynamic_range = int(frame.color_trc or 0) in (16, 18)  # PQ, HLG
+        self.high_dynamic_range = int(frame.color_trc or 0) in (PQ, HLG)
 
     def to_rgb(self, frame, max_side_px: int) -> np.ndarray:
         """Convert a decoded frame to upright RGB uint8 (h, w, 3), scaled down to `max_side_px`."""
+        if self.high_dynamic_range:
+            return to_standard_range(self._convert(frame, max_side_px, "rgb48le"), int(frame.color_trc))
         return self._convert(frame, max_side_px, "rgb24")
 
     def to_gray(self, frame, max_side_px: int) -> np.ndarray:
         """Convert a decoded frame to upright gray uint8 (h, w), scaled down to `max_side_px`."""
+        if self.high_dynamic_range:
+            return cv2.cvtColor(self.to_rgb(frame, max_side_px), cv2.COLOR_RGB2GRAY)
         return self._convert(frame, max_side_px, "gray")
 
     def _convert(self, frame, max_side_px: int, pixel_format: str) -> np.ndarray:
+        from av.video.reformatter import Interpolation
+
         width, height = working_size(*self._stored_size, max_side_px)
+        # Without these, swscale drops fractions: values are 1 to 2 levels too low, of 10-bit video most.
+        exact = Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
         if self.interlaced:
             # One field only: the two fields of a moving camera show different instants.
-            image = frame.reformat(format=pixel_format).to_ndarray()[::2]
+            flags = Interpolation.BICUBIC | exact
+            image = frame.reformat(format=pixel_format, interpolation=flags).to_ndarray()[::2]
             image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         else:
             shrinks = width < frame.width or height < frame.height
-            flags = "AREA" if shrinks else "BICUBIC"
+            flags = (Interpolation.AREA if shrinks else Interpolation.BICUBIC) | exact
             image = frame.reformat(width, height, pixel_format, interpolation=flags).to_ndarray()
         return np.ascontiguousarray(np.rot90(image, self.quarter_turns))
 

@@ -177,7 +177,7 @@ def _note_decoding(reader: VideoReader, decoded: int, progress: Progress) -> str
     if reader.interlaced:
         progress.note("interlaced video: one field of every frame is used")
     if reader.high_dynamic_range:
-        progress.note("high dynamic range video: read without tone mapping, colors will look flat")
+        progress.note("high dynamic range video: converted to standard range")
     if reader.quarter_turns:
         progress.note(
             f"rotated by {360 - 90 * reader.quarter_turns} degrees clockwise, by the file's metadata"
