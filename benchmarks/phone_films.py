@@ -246,7 +246,10 @@ def _people(scene: Scene, count: int, seed: int) -> list[_Person]:
     for number in range(count):
         mesh = trimesh.creation.capsule(height=1.3, radius=0.2, count=[20, 20]).subdivide_to_size(0.06)
         vertices = np.asarray(mesh.vertices) - [0, 0, mesh.vertices[:, 2].min()]
-        colors = rng.uniform(20, 235, (len(mesh.faces), 3)).astype(np.float32)
+        # Trousers and a shirt, each of one color with a pattern.
+        shirt = vertices[mesh.faces].mean(1)[:, 2] > 0.9
+        plain = np.where(shirt[:, None], *rng.uniform(50, 200, (2, 3)))
+        colors = (plain + rng.normal(0, 22, (len(mesh.faces), 1))).astype(np.float32)
         start, end = (0.35, 0.65) if number == 0 else (0.25, 0.85)
         reach, far = (1.6, 1.3) if number == 0 else (0.5, 1.6)
 

@@ -19,9 +19,10 @@ from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, extract_features, match
 from reconstruction.poses.held_out import candidates_in_time, locate_frames
 from reconstruction.poses.imported import use_imported
-from reconstruction.poses.matching import matched_database
+from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.refine import refine_model
 from reconstruction.poses.undistort import undistort
+from reconstruction.poses.zoom import without_zoom
 
 _PLAUSIBLE_FOCAL = (0.35, 4.0)  # of the longer image side; metadata beyond is ignored
 _DEFAULT_FOCAL_SHARE = 1.0  # of the longer image side, where the metadata has no focal length
@@ -71,7 +72,7 @@ def estimate_poses(
             always = replace(config, refine_imported="always")
             model, known = use_imported(predicted, frames, features, always, work_dir, progress)
         else:
-            model = _reconstruct(frames, features, config, work_dir, progress)
+            frames, features, model = _reconstruct(frames, features, config, work_dir, progress)
         registered = sorted(i - 1 for i in model.reg_image_ids())
         held_out = _locate_held_out(frames, features, model, registered, known, config, progress)
     return replace(_package(frames, model, registered, held_out), metric=metric)
@@ -105,12 +106,15 @@ def initial_camera(frames: FrameSet, config: PosesConfig) -> ColmapCamera:
 
 def _reconstruct(
     frames: FrameSet, features: list[Features], config: PosesConfig, work_dir: Path, progress: Progress
-) -> Reconstruction:
-    """Run structure from motion; return the largest model, refined by bundle adjustment."""
+) -> tuple[FrameSet, list[Features], Reconstruction]:
+    """Run structure from motion; return the frames with one focal length, their features, and the largest refined model."""
     camera = initial_camera(frames, config)
     database = work_dir / "database.db"
-    pairs = matched_database(frames, features, camera, config, database, progress)
+    pairs = consistent_pairs(frames, features, camera, config, progress)
     diagnose.check_motion(features, pairs, (camera.width, camera.height))
+    frames, features, pairs = without_zoom(frames, features, pairs, camera, config, work_dir, progress)
+    database.unlink(missing_ok=True)
+    mapping.write_database(database, camera, features, pairs)
     chosen = len(frames.images)
     progress.start(chosen, "mapping")
     models = mapping.incremental_models(database, work_dir, config, chosen, progress)
@@ -129,7 +133,7 @@ def _reconstruct(
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
     for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
         progress.note(note)
-    return models[0]
+    return frames, features, models[0]
 
 
 def _locate_held_out(

@@ -49,17 +49,30 @@ def frame_name(row: int) -> str:
 
 
 def write_database(
-    path: Path, camera: ColmapCamera, features: list[Features], pairs: list[VerifiedPair]
+    path: Path,
+    camera: ColmapCamera,
+    features: list[Features],
+    pairs: list[VerifiedPair],
+    *,
+    own_cameras: bool = False,
 ) -> None:
-    """Write the database that the mapper reads; image and frame ids are row + 1."""
+    """Write the database that the mapper reads; image and frame ids are row + 1.
+
+    `own_cameras`: each image has a pinhole camera of its own with the size and focal length of `camera`.
+    """
     import pycolmap
 
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        camera.camera_id = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
-        rig.rig_id = database.write_rig(rig)
         for row, feature in enumerate(features):
+            if own_cameras:
+                camera = pycolmap.Camera.create_from_model_name(
+                    row + 1, "SIMPLE_PINHOLE", camera.focal_length, camera.width, camera.height
+                )
+            if own_cameras or row == 0:
+                camera.camera_id = database.write_camera(camera)
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(camera.sensor_id)
+                rig.rig_id = database.write_rig(rig)
             image = pycolmap.Image(name=frame_name(row), camera_id=camera.camera_id, image_id=row + 1)
             image.image_id = database.write_image(image, use_image_id=True)
             frame = pycolmap.Frame()

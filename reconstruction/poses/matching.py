@@ -24,6 +24,16 @@ def matched_database(
     progress: Progress,
 ) -> list[VerifiedPair]:
     """Match likely pairs and write the database at `path`; return the verified, consistent pairs."""
+    pairs = consistent_pairs(frames, features, camera, config, progress)
+    path.unlink(missing_ok=True)
+    mapping.write_database(path, camera, features, pairs)
+    return pairs
+
+
+def consistent_pairs(
+    frames: FrameSet, features: list[Features], camera: ColmapCamera, config: PosesConfig, progress: Progress
+) -> list[VerifiedPair]:
+    """Match likely pairs; return the verified ones that do not contradict each other."""
     progress.start(len(features) - 1, "overlap")
     scores = overlap_scores(features, progress)
     pairs = choose_pairs(scores, frames.ordered, config)
@@ -42,6 +52,4 @@ def matched_database(
             f"poses: {consistent.rejected} of {len(verified)} pairs of frames match copies of a thing at different "
             "places (tiles, posters, chairs); they are not used"
         )
-    path.unlink(missing_ok=True)
-    mapping.write_database(path, camera, features, consistent.pairs)
     return consistent.pairs
