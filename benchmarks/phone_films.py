@@ -1,7 +1,7 @@
-"""Generated films as phones take them: codec, depth, rate, rotation, shutter, exposure, zoom, stabilization, passers-by.
+"""Generated films as phones take them: codec, rate, rotation, shutter, exposure, zoom, stabilization, passers-by.
 
-A film shows a room while somebody walks around its middle once, in `_SECONDS`. Its truth is kept beside it: times, poses,
-focal lengths, the frames before they were encoded, and where passers-by stand.
+A film shows a room while somebody walks around its middle once, in `_SECONDS`. Its truth is kept beside it: times,
+poses, focal lengths, the frames before they were encoded, and where passers-by stand.
 """
 
 import json
@@ -51,7 +51,7 @@ class PhoneFilm:
     wander: float = 0.0
     """Way of the crop of a stabilized film, as a share of the longer side."""
     size: tuple[int, int] = (480, 360)
-    """Width and height as watched, pixels; swapped for portrait films."""
+    """Width and height as stored, pixels; swapped when a portrait film is watched."""
 
 
 FILMS: tuple[PhoneFilm, ...] = (
@@ -138,12 +138,13 @@ def make_film(film: PhoneFilm, seed: int, folder: Path) -> Path:
 
 def shoot(film: PhoneFilm, seed: int) -> Truth:
     """Draw all frames of a film."""
-    width, height = film.size[::-1] if film.rotation % 180 else film.size
+    width, height = film.size
     room = draw_room(seed, shapes=tuple(SHAPE_FAMILIES), step_m=0.08, density=0.6)
     spec = CaptureSpec(room, int(_SECONDS * _PATH_FPS), width, height, seed=seed)
     scene = stage(spec)
     times, place = _times(film, seed)
-    poses = _along(scene.world_from_camera, place)
+    upright = _along(scene.world_from_camera, place)
+    poses = upright @ _upright_from_stored(film.rotation)
     lenses = _lenses(film, scene.camera, times, seed)
     people = _people(scene, film.passers, seed)
     frames, masks, depths = [], [], []
@@ -152,8 +153,18 @@ def shoot(film: PhoneFilm, seed: int) -> Truth:
         masks.append(mask)
         depths.append(depth)
     focal = np.array([lens.fx for lens in lenses])
-    depth = np.stack(depths) if film.passers else np.zeros(0, np.float32)
-    return Truth(times, poses, focal, np.stack(frames), np.stack(masks), depth)
+    watched = [np.rot90(np.stack(x), film.rotation // 90, axes=(1, 2)) for x in (frames, masks, depths)]
+    if not film.passers:
+        watched[2] = np.zeros(0, np.float32)
+    return Truth(times, upright, focal, *watched)
+
+
+def _upright_from_stored(rotation: int) -> np.ndarray:
+    """Return the rotation (4, 4) from the axes of the frames as stored, whose rows are read from the top, to upright."""
+    c, s = round(np.cos(np.radians(rotation))), round(np.sin(np.radians(rotation)))
+    out = np.eye(4)
+    out[:2, :2] = [[c, s], [-s, c]]
+    return out
 
 
 def _times(film: PhoneFilm, seed: int) -> tuple[np.ndarray, np.ndarray]:

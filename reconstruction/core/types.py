@@ -43,6 +43,7 @@ class FrameSet(CheckedArrays):
     held_out_times_s: Annotated[np.ndarray, "float64 m"]
     focal_prior_px: float  # focal length from metadata, 0 = unknown
     ordered: bool  # True: video; False: image folder, where neighbours in name order may be far apart
+    quarter_turns: int = 0  # counter-clockwise, from frames as stored in the file to upright
 
 
 @dataclass(frozen=True)

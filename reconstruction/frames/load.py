@@ -92,7 +92,8 @@ def _from_video(path: Path, config: FramesConfig, progress: Progress) -> FrameSe
     progress.note(f"{len(keep)} keyframes of {len(times)} frames, {len(held)} held out for evaluation")
     sharpness = [stats.sharpness[row] for row in chosen]
     focal_px = reader.focal_prior_px(config.max_side_px)
-    return _frame_set(source, images, keep, held, times, sharpness, focal_px, ordered=True)
+    frames = _frame_set(source, images, keep, held, times, sharpness, focal_px, ordered=True)
+    return replace(frames, quarter_turns=reader.quarter_turns)
 
 
 def _measure_video(

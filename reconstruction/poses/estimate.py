@@ -21,6 +21,7 @@ from reconstruction.poses.held_out import candidates_in_time, locate_frames
 from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.refine import refine_model
+from reconstruction.poses.rolling_shutter import Shutter, correct_rolling_shutter
 from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import without_zoom
 
@@ -74,8 +75,9 @@ def estimate_poses(
         else:
             frames, features, model = _reconstruct(frames, features, config, work_dir, progress)
         registered = sorted(i - 1 for i in model.reg_image_ids())
+        shutter = correct_rolling_shutter(model, frames, work_dir, progress) if not known else None
         held_out = _locate_held_out(frames, features, model, registered, known, config, progress)
-    return replace(_package(frames, model, registered, held_out), metric=metric)
+    return replace(_package(frames, model, registered, held_out, shutter), metric=metric)
 
 
 def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> importers.ImportedPoses:
@@ -175,9 +177,13 @@ def _most_alike(query: Features, features: list[Features], registered: list[int]
 
 
 def _package(
-    frames: FrameSet, model: Reconstruction, registered: list[int], held_out: list[tuple[int, np.ndarray]]
+    frames: FrameSet,
+    model: Reconstruction,
+    registered: list[int],
+    held_out: list[tuple[int, np.ndarray]],
+    shutter: Shutter | None,
 ) -> PosedFrames:
-    """Undistort the images and collect poses, points and observations."""
+    """Undo rolling shutter and distortion of the images; collect poses, points and observations."""
     poses = mapping.poses_of(model)
     point_ids = sorted(model.point3D_ids())
     frame_row = {row + 1: new for new, row in enumerate(registered)}
@@ -193,6 +199,9 @@ def _package(
     colors = _point_colors(model, point_ids, frames.images)
     held_rows = [row for row, _ in held_out]
     recorded = [frames.images[registered], frames.held_out_images[held_rows]]
+    if shutter is not None:
+        times = frames.times_s[registered], frames.held_out_times_s[held_rows]
+        recorded = [shutter.straightened(images, at) for images, at in zip(recorded, times)]
     camera, (images, held_out_images), distorted = undistort(model.cameras[min(model.cameras)], recorded)
     return PosedFrames(
         source=frames.source,

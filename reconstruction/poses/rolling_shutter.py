@@ -6,15 +6,25 @@ The readout time is the one with the least reprojection error.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from reconstruction.core.progress import Progress
+from reconstruction.core.types import FrameSet
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.mapping import poses_of
 from reconstruction.poses.refine import bundle_adjust
 
-_TRIED_S = (0.0, 0.016, 0.032)  # readout times of the parabola; phones have 5 to 35 ms
+_STEP_S = 0.016  # between readout times that are tried; phones have 5 to 35 ms
+_LONGEST_S = 0.048
+_MATTERS_PX = (
+    0.5  # shift of the outer tenth of the points, in a quarter of the frames; that is the error of SIFT
+)
+_TYPICAL_S = 0.02  # readout time that the shift is judged by
+_LEAST_S = 0.004  # shorter readouts move points by less than they are off
+_LEAST_GAIN = 0.01  # of the cost; films without rolling shutter gain nothing
 _LONGEST_S = 0.04
 _MAX_GAP_S = 1.0  # between the neighbors in time that the motion of a frame comes from
 _LOSS_SCALE_PX = 0.5  # as of the bundle adjustment
@@ -83,21 +93,28 @@ class Observations:
             self.indices[row] = [k for k, p in enumerate(points) if p.has_point3D()]
             self.pixels[row] = np.array([points[k].xy for k in self.indices[row]]).reshape(-1, 2)
 
-    def move(self, readout_s: float) -> None:
-        """Put the observed points where the camera of the middle row sees them, for a readout time."""
+    def shifts(self, readout_s: float) -> list[np.ndarray]:
+        """Return for each frame how far each point (k, 2) is from where the camera of the middle row sees it."""
         poses = poses_of(self.model)
         motion = Motion.of(self.times_s[self.rows], np.stack([poses[row] for row in self.rows]))
         size = self.camera.width, self.camera.height
+        out = []
         for number, row in enumerate(self.rows):
-            points = self._in_camera(row, poses[row])
+            points = self.points_in_camera(row, poses[row])
             when = row_times(self.pixels[row], size, readout_s, self.quarter_turns)
             seen = project(self.camera, moved(points, motion.angular[number], motion.linear[number], when))
-            shift = np.nan_to_num(project(self.camera, points) - seen)
+            out.append(np.nan_to_num(project(self.camera, points) - seen))
+        return out
+
+    def move(self, readout_s: float) -> None:
+        """Put the observed points where the camera of the middle row sees them, for a readout time."""
+        for row, shift in zip(self.rows, self.shifts(readout_s)):
             image = self.model.image(row + 1)
             for index, pixel in zip(self.indices[row], self.pixels[row] + shift):
                 image.point2D(index).xy = pixel
 
-    def _in_camera(self, row: int, world_from_camera: np.ndarray) -> np.ndarray:
+    def points_in_camera(self, row: int, world_from_camera: np.ndarray) -> np.ndarray:
+        """Return the observed points (k, 3) of a frame in its camera space."""
         image = self.model.image(row + 1)
         points = np.array(
             [self.model.point3D(image.point2D(k).point3D_id).xyz for k in self.indices[row]]
@@ -109,9 +126,107 @@ class Observations:
         poses, total, count = poses_of(self.model), 0.0, 0
         for row in self.rows:
             image = self.model.image(row + 1)
-            seen = project(self.camera, self._in_camera(row, poses[row]))
+            seen = project(self.camera, self.points_in_camera(row, poses[row]))
             given = np.array([image.point2D(k).xy for k in self.indices[row]]).reshape(-1, 2)
             error = ((seen - given) ** 2).sum(1)
             total += float(np.nansum(np.log1p(error / _LOSS_SCALE_PX**2)))
             count += len(error)
         return total / max(count, 1)
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """The rolling shutter of a film, and the motion and depth of its registered keyframes."""
+
+    readout_s: float
+    quarter_turns: int
+    camera: ColmapCamera
+    times_s: np.ndarray  # float64 (n,)
+    motion: Motion
+    depth: np.ndarray  # float64 (n,) median of the points in view
+
+    def straightened(self, images: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+        """Resample images uint8 (m, h, w, 3), taken at `times_s`, to the poses of their middle rows.
+
+        Motion and depth are those of the keyframe nearest in time. The depth of a frame is taken to be its median.
+        """
+        out = np.empty_like(images)
+        height, width = images.shape[1:3]
+        u, v = np.meshgrid(np.arange(0, width + 8, 8) + 0.5, np.arange(0, height + 8, 8) + 0.5)
+        pixels = np.column_stack([u.ravel(), v.ravel()])
+        rays = np.column_stack([np.asarray(self.camera.cam_from_img(pixels)), np.ones(len(pixels))])
+        for number, time_s in enumerate(times_s):
+            row = int(np.argmin(np.abs(self.times_s - time_s)))
+            source = pixels
+            for _ in range(2):  # the row that shows a point depends on where the point is
+                when = row_times(source, (width, height), self.readout_s, self.quarter_turns)
+                points = moved(
+                    self.depth[row] * rays, self.motion.angular[row], self.motion.linear[row], when
+                )
+                source = np.nan_to_num(project(self.camera, points))
+            shift = (source - pixels).reshape(*u.shape, 2).astype(np.float32)
+            out[number] = _shifted(images[number], shift)
+        return out
+
+
+def _shifted(image: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Resample an image by shifts (rows, columns, 2) given at every eighth pixel."""
+    height, width = image.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    dense = cv2.remap(shift, x / 8, y / 8, cv2.INTER_LINEAR)
+    pixels, mode = np.ascontiguousarray(image), cv2.BORDER_REPLICATE
+    return cv2.remap(pixels, x + dense[..., 0], y + dense[..., 1], cv2.INTER_LANCZOS4, borderMode=mode)
+
+
+def correct_rolling_shutter(
+    model: Reconstruction, frames: FrameSet, work_dir: Path, progress: Progress
+) -> Shutter | None:
+    """Estimate the readout time and adjust the model to it, in place; None where it does not matter or is not found."""
+    observations = Observations(model, frames.times_s, frames.quarter_turns)
+    largest = [np.quantile(np.hypot(*s.T), 0.9) for s in observations.shifts(_TYPICAL_S) if len(s)]
+    if not frames.ordered or np.quantile(largest, 0.75) < _MATTERS_PX:
+        return None
+    readout_s, gain = _least_cost(model, frames, work_dir / "rolling_shutter")
+    if readout_s < _LEAST_S or gain < _LEAST_GAIN:
+        return None
+    observations.move(readout_s)
+    bundle_adjust(model)
+    observations.move(readout_s)
+    model.update_point_3d_errors()
+    poses = poses_of(model)
+    depth = [np.median(observations.points_in_camera(row, poses[row])[:, 2]) for row in observations.rows]
+    times_s = frames.times_s[observations.rows]
+    motion = Motion.of(times_s, np.stack([poses[row] for row in observations.rows]))
+    progress.note(
+        f"poses: rolling shutter of {1000 * readout_s:.0f} ms from the first row to the last, corrected"
+    )
+    return Shutter(readout_s, frames.quarter_turns, observations.camera, times_s, motion, np.array(depth))
+
+
+def _least_cost(model: Reconstruction, frames: FrameSet, folder: Path) -> tuple[float, float]:
+    """Return the readout time with the least cost, by a parabola, and what it gains relative to none."""
+    import pycolmap
+
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)
+    costs: dict[int, float] = {}
+
+    def cost(step: int) -> float:
+        if step not in costs:
+            trial = pycolmap.Reconstruction(folder)
+            observations = Observations(trial, frames.times_s, frames.quarter_turns)
+            observations.move(step * _STEP_S)
+            bundle_adjust(trial)
+            observations.move(step * _STEP_S)
+            costs[step] = observations.cost()
+        return costs[step]
+
+    best = 0
+    while (best + 1) * _STEP_S <= _LONGEST_S and cost(best + 1) < cost(best):
+        best += 1
+    low, middle, high = (cost(best + k) for k in (-1, 0, 1))
+    offset = 0.5 * (low - high) / max(low - 2 * middle + high, 1e-12)
+    readout_s = _STEP_S * (best + float(np.clip(offset, -0.5, 0.5)))
+    # The parabola's minimum; between the steps it is not tried.
+    least = middle - 0.25 * (low - high) * float(np.clip(offset, -0.5, 0.5))
+    return readout_s, 1 - least / cost(0)
