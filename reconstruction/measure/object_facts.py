@@ -97,7 +97,7 @@ def _closest_pair(points: np.ndarray, tree: KDTree) -> tuple[float, np.ndarray, 
     bound = float(np.min(tree.query(points[:: 1 + len(points) // _BOUNDING])[0]))
     distance, nearest = tree.query(points, distance_upper_bound=np.nextafter(bound, np.inf))
     at = int(np.argmin(distance))
-    return float(distance[at]), points[at], np.asarray(tree.data)[nearest[at]]
+    return float(distance[at]), points[at], np.asarray(tree.data)[np.asarray(nearest)[at]]
 
 
 def _box_distance(a: TrueEntity, b: TrueEntity) -> float:
