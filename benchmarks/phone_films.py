@@ -160,7 +160,7 @@ def shoot(film: PhoneFilm, seed: int) -> Truth:
 
 
 def _upright_from_stored(rotation: int) -> np.ndarray:
-    """Return the rotation (4, 4) from the axes of the frames as stored, whose rows are read from the top, to upright."""
+    """Return upright_from_stored (4, 4); the rows of the frames as stored are read from the top."""
     c, s = round(np.cos(np.radians(rotation))), round(np.sin(np.radians(rotation)))
     out = np.eye(4)
     out[:2, :2] = [[c, s], [-s, c]]

@@ -4,12 +4,12 @@
     python -m benchmarks.phones OUT --seed 3      another room, hand and noise
     python -m benchmarks.phones OUT --only zoom   films whose name has that in it
 
-Stages frames and poses (preset fast) run on every film of `benchmarks.phone_films.FILMS`, depth where people walk
-through. What is there is kept: the same command goes on from there. A film is
-`right` where 90 % of its keyframes have poses, cameras are within 3 % of the extent of the path (RMSE after
-alignment; both limits are those of `benchmarks.check`), the focal length is within 3 % and keyframes have the film's
-colors within 8 of 255 levels (mean absolute difference; codecs make up to 5); `part` where that holds for a part of
-the film and a note says so; `refused` where it ends with an error of one line; else `wrong` or `crashed`.
+Stages frames and poses (preset fast) run on every film of `benchmarks.phone_films.FILMS`, depth only with --depth.
+What is there is kept: the same command goes on from there. A film is `right` where 90 % of its keyframes have poses,
+cameras are within 3 % of the extent of the path (RMSE after alignment; both limits are those of `benchmarks.check`),
+the focal length is within 3 % and keyframes have the film's colors within 8 of 255 levels (mean absolute difference;
+codecs make up to 5); `part` where that holds for a part of the film and a note says so; `refused` where it ends with
+an error of one line; else `wrong` or `crashed`.
 """
 
 import argparse
@@ -167,6 +167,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--seed", type=int, default=1, help="of room, hand and noise (default 1)")
     parser.add_argument("--only", default="", help="films whose name has this in it")
+    parser.add_argument("--depth", action="store_true", help="also depth, of films with passers-by")
     parser.add_argument("--results", default="results", help="folder of the results, beside the films")
     return parser
 
@@ -187,7 +188,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if not kept.exists():
             video = make_film(film, arguments.seed, folder / "films" / film.name)
             truth = Truth.load(video.parent)
-            outcome = judge(film, video, truth, with_depth=film.passers > 0)
+            outcome = judge(film, video, truth, with_depth=arguments.depth and film.passers > 0)
             kept.write_text(json.dumps(asdict(outcome), indent=1) + "\n")
         outcomes.append(Outcome(**json.loads(kept.read_text())))
         last = outcomes[-1]

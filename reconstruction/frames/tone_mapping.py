@@ -1,8 +1,8 @@
 """Convert video of high dynamic range (HLG, PQ) to the sRGB picture that a standard display shows.
 
-Transfer functions of ITU-R BT.2100 give displayed light; 203 cd/m2, the white of standard video (BT.2408), becomes white.
-Whatever is brighter is clipped, as in a standard film. libswscale does the same (the tests compare), but spends five
-seconds on a table for every size of picture.
+Transfer functions of ITU-R BT.2100 give displayed light; 203 cd/m2, the white of standard video (BT.2408), becomes
+white. Whatever is brighter is clipped, as in a standard film. libswscale does the same (the tests compare), but spends
+five seconds on a table for every size of picture.
 """
 
 from functools import lru_cache

@@ -109,7 +109,7 @@ def initial_camera(frames: FrameSet, config: PosesConfig) -> ColmapCamera:
 def _reconstruct(
     frames: FrameSet, features: list[Features], config: PosesConfig, work_dir: Path, progress: Progress
 ) -> tuple[FrameSet, list[Features], Reconstruction]:
-    """Run structure from motion; return the frames with one focal length, their features, and the largest refined model."""
+    """Run structure from motion; return the frames with one focal length, their features, and the refined model."""
     camera = initial_camera(frames, config)
     database = work_dir / "database.db"
     pairs = consistent_pairs(frames, features, camera, config, progress)

@@ -1,8 +1,8 @@
 """Rolling shutter: rows are taken one after the other, so a moving camera has another pose at every row.
 
-Each frame moves evenly during its readout, as between its neighbors in time. Observed points are moved to where a camera
-with the pose of the middle row would see them, and the bundle is adjusted anew (Hedborg et al. 2012, with fixed motion).
-The readout time is the one with the least reprojection error.
+Each frame moves evenly during its readout, as between its neighbors in time. Observed points are moved to where a
+camera with the pose of the middle row would see them, and the bundle is adjusted anew. The readout time is the one with
+the least reprojection error.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Find where a film changes its focal length: zoom, or another lens.
 
-Structure from motion with one camera explains a zoom as motion, and registers every frame at a wrong place. A change of scale
-between neighbors in time raises suspicion; then some frames are mapped with a focal length of their own each.
+Structure from motion with one camera explains a zoom as motion, and registers every frame at a wrong place. A change of
+scale between neighbors in time raises suspicion; then the frames are mapped with a focal length of their own each.
 """
 
 from dataclasses import dataclass, replace
@@ -72,7 +72,7 @@ def without_zoom(
 
 
 def _scale_changes(times_s: np.ndarray, features: list[Features], pairs: list[VerifiedPair]) -> bool:
-    """Tell whether the sizes of matched features change by `_SUSPICIOUS_SCALE` within `_ZOOM_S`, or between neighbors."""
+    """Tell whether matched features grow or shrink by `_SUSPICIOUS_SCALE` within `_ZOOM_S` or between neighbors."""
     step = np.zeros(len(features))
     for pair in pairs:
         i, j = pair.rows
@@ -125,7 +125,7 @@ def _longest_part(
 
 
 def longest_run(values: np.ndarray, ratio: float) -> tuple[int, int]:
-    """Return the first and last index of the longest run of values (n,) whose largest is at most `ratio` times the least."""
+    """Return first and last index of the longest run of values (n,) that differ by at most a factor of `ratio`."""
     best, start = (0, 0), 0
     for end in range(len(values)):
         while values[start : end + 1].max() > ratio * values[start : end + 1].min():
