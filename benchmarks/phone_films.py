@@ -255,12 +255,13 @@ def _people(scene: Scene, count: int, seed: int) -> list[_Person]:
     ahead = forward * [1, 1, 0] / np.linalg.norm(forward[:2])
     out = []
     for number in range(count):
-        mesh = trimesh.creation.capsule(height=1.3, radius=0.2, count=[20, 20]).subdivide_to_size(0.06)
-        vertices = np.asarray(mesh.vertices) - [0, 0, mesh.vertices[:, 2].min()]
+        body = trimesh.creation.capsule(height=1.3, radius=0.2, count=[20, 20])
+        vertices, faces = trimesh.remesh.subdivide_to_size(body.vertices, body.faces, 0.06)[:2]
+        vertices = vertices - [0, 0, vertices[:, 2].min()]
         # Trousers and a shirt, each of one color with a pattern.
-        shirt = vertices[mesh.faces].mean(1)[:, 2] > 0.9
+        shirt = vertices[faces].mean(1)[:, 2] > 0.9
         plain = np.where(shirt[:, None], *rng.uniform(50, 200, (2, 3)))
-        colors = (plain + rng.normal(0, 22, (len(mesh.faces), 1))).astype(np.float32)
+        colors = (plain + rng.normal(0, 22, (len(faces), 1))).astype(np.float32)
         start, end = (0.35, 0.65) if number == 0 else (0.25, 0.85)
         reach, far = (1.6, 1.3) if number == 0 else (0.5, 1.6)
 
@@ -271,7 +272,7 @@ def _people(scene: Scene, count: int, seed: int) -> list[_Person]:
             at = middle[:3, 3] + far * ahead + along * right
             return np.array([at[0], at[1], 0.0])
 
-        out.append(_Person(vertices, np.asarray(mesh.faces, np.int32), colors, place))
+        out.append(_Person(vertices, np.asarray(faces, np.int32), colors, place))
     return out
 
 
