@@ -186,6 +186,11 @@ class SceneBundle:
             for b in self.scene["base"]
         )
 
+    @property
+    def backdrop(self) -> str | None:
+        """Path of the mesh behind everything, in world space, drawn and never in contact; None: there is none."""
+        return self.scene["backdrop"]["mesh"] if "backdrop" in self.scene else None
+
     @cached_property
     def objects(self) -> tuple[BundleObject, ...]:
         """Placed objects."""

@@ -68,6 +68,10 @@ def validate_scene(scene: Any) -> None:
     _report(_mapping(_get(scene, "report", ""), "report"))
     if "gaussians" in scene:
         _path(_mapping(scene["gaussians"], "gaussians"), "file", "gaussians", ".ply")
+    if "backdrop" in scene:
+        backdrop = _mapping(scene["backdrop"], "backdrop")
+        _path(backdrop, "mesh", "backdrop", ".glb")
+        _number(backdrop, "observed_fraction", "backdrop", low=0, high=1)
     if "instances" in scene:
         _instance_views(_mapping(scene["instances"], "instances"))
 
@@ -83,6 +87,8 @@ def referenced_files(scene: JsonObject) -> dict[str, str]:
         found.update({path: f"objects[{i}].collision[{k}]" for k, path in enumerate(item["collision"])})
     if "gaussians" in scene:
         found[scene["gaussians"]["file"]] = "gaussians.file"
+    if "backdrop" in scene:
+        found[scene["backdrop"]["mesh"]] = "backdrop.mesh"
     for i, step in enumerate(scene["graph"].get("steps", [])):
         if "picture" in step:
             found[step["picture"]] = f"graph.steps[{i}].picture"
@@ -167,6 +173,8 @@ def _base(items: list[Any]) -> set[int]:
         if abs(np.linalg.norm(plane[:3]) - 1) > 1e-3:
             _fail(f"{where}.plane", "a unit normal in the first three places", item["plane"])
         _boolean(item, "observed", where)
+        if "observed_fraction" in item:  # absent from older bundles
+            _number(item, "observed_fraction", where, low=0, high=1)
         if "collision" in item:
             _paths(item, "collision", where, ".obj")
     return seen

@@ -84,6 +84,8 @@ class SceneBuilder:
         self.movable_ids = {body.root for body in self.bodies if body.dynamic}
         self.objects: dict[int, PlacedObject] = {}
         self._base_actors: dict[int, list[Actor]] = {}
+        self.backdrop: Actor | None = None
+        """Actor behind everything, drawn and never in contact; None: the bundle has none, or nothing is rendered."""
 
     def carrying_actors(self, key: int) -> list[Actor]:
         """Return the actors of an object or base entity; a floor includes the ground plane."""
@@ -103,6 +105,7 @@ class SceneBuilder:
         """
         self.objects = {}
         self._build_base(scene)
+        self._build_backdrop(scene)
         for body in self.bodies:
             actor = _BodyBuilder(scene, body).build(name=body.name)
             for spec in body.specs:
@@ -189,6 +192,19 @@ class SceneBuilder:
         for actor in drivable:
             for bit in (_WHEEL_BIT, _BASE_BIT):
                 actor.set_collision_group_bit(group=2, bit_idx=bit, bit=1)
+
+    def _build_backdrop(self, scene: Any) -> None:
+        """Build the bundle's backdrop without a collision shape; it shows its texture as filmed, without light."""
+        if self.bundle.backdrop is None or not scene.can_render():
+            return
+        builder = scene.create_actor_builder()
+        builder.add_visual_from_file(
+            str(self.bundle.resolve(self.bundle.backdrop)), pose=_pose(WORLD_FROM_GLTF)
+        )
+        builder.initial_pose = sapien.Pose()
+        self.backdrop = builder.build_static(name="backdrop")
+        for entity in self.backdrop._objs:
+            show_unlit(entity)
 
 
 class _BodyBuilder(ActorBuilder):
@@ -309,6 +325,20 @@ def _build_pedestal(scene: Any, top: np.ndarray, height: float, radius: float) -
         builder.add_box_visual(half_size=half, material=_matte([0.22, 0.23, 0.25, 1.0]))
     builder.initial_pose = sapien.Pose([top[0], top[1], top[2] - height / 2])
     builder.build_static(name="pedestal")
+
+
+def show_unlit(entity: sapien.Entity) -> None:
+    """Let an actor show its texture unchanged: textures from a video have the room's light in them."""
+    body: Any = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+    for shape in body.render_shapes if body is not None else ():
+        for part in shape.parts:
+            material = part.material
+            if material.base_color_texture is not None:
+                material.emission_texture, material.base_color_texture = material.base_color_texture, None
+            else:
+                material.emission = material.base_color
+            material.base_color = [0, 0, 0, 1]
+            material.specular = 0.0
 
 
 def _matte(color: list[float]) -> "sapien.render.RenderMaterial":

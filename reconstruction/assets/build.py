@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from reconstruction.assets import completion, solid, texture
-from reconstruction.assets.base import build_base
 from reconstruction.assets.collision import collision_parts, end_decomposer, kept_parts
 from reconstruction.assets.config import LEAST_HULLS, AssetsConfig
 from reconstruction.assets.cuboids import fit_cuboid, unfreed_cuboid
@@ -21,6 +20,7 @@ from reconstruction.assets.physics.base import choice_for
 from reconstruction.assets.physics.load import load_physicist
 from reconstruction.assets.physics.mass import physical_attributes
 from reconstruction.assets.physics.materials import MaterialChoice
+from reconstruction.assets.room import build_room
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
@@ -93,7 +93,7 @@ def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
     views: SceneViews | None = None, keep: Path | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
-    """Build a complete asset for every object, and textured rectangles for floor and walls.
+    """Build a complete asset for every object, textured rectangles for floor and walls, and the backdrop around them.
 
     An object that cannot be completed becomes a box, with a note and in its provenance; the others go on.
 
@@ -120,9 +120,9 @@ def build_assets(
         hulls += len(objects[-1].collision)
         progress.advance()
     end_decomposer()
-    base = build_base(posed, depth, instances, tuple(objects), scene.pixels, config)
+    base, backdrop = build_room(posed, depth, instances, objects, scene.pixels, surface.space, config)
     progress.advance(len(instances.base))
-    return AssetSet(base, tuple(objects))
+    return AssetSet(base, tuple(objects), backdrop)
 
 
 def gather_evidence(

@@ -353,6 +353,17 @@ class BaseAsset(CheckedArrays):
     plane: Annotated[np.ndarray, "float64 4"]  # n . x + d = 0 in metres, n unit and into the room
     visual: TexturedMesh
     observed: bool
+    observed_fraction: float = (
+        1.0  # of its texels that a keyframe shows; the rest of the rectangle is completed
+    )
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """Stage 7: a shell around the scene that shows what was filmed beyond its meshes; drawn, never in contact."""
+
+    visual: TexturedMesh  # in world space, faces inward
+    observed_fraction: float  # of its texels that a keyframe shows
 
 
 @dataclass(frozen=True)
@@ -361,6 +372,7 @@ class AssetSet:
 
     base: tuple[BaseAsset, ...]
     objects: tuple[ObjectAsset, ...]
+    backdrop: Backdrop | None = None  # None: the scene has no mesh, or was not made from a video
 
 
 @dataclass(frozen=True)

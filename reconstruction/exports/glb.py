@@ -71,7 +71,8 @@ def _add_nodes(document: dict, part: dict, first: dict, body: ExportBody) -> Non
 
 
 def _facts(body: ExportBody) -> dict:
-    facts = {"id": body.id, "label": body.label, "kind": "base" if body.base else "object"}
+    kind = "object" if not body.base else "base" if body.parts else "backdrop"
+    facts = {"id": body.id, "label": body.label, "kind": kind}
     if not body.base:
         facts |= {"mass_kg": body.mass_kg, "friction": body.friction, "dynamic": body.moves}
     if body.relation is not None:

@@ -47,7 +47,7 @@ class ExportBody:
 
 @dataclass(frozen=True)
 class ExportScene:
-    """All bodies of a scene, base surfaces first."""
+    """All bodies of a scene: base surfaces, the backdrop if there is one, objects."""
 
     id: str
     revision: str
@@ -100,7 +100,18 @@ def read_scene(bundle: SceneBundle) -> ExportScene:
                 restitution=spec.restitution,
             )
         )
+    if bundle.backdrop is not None:
+        bodies.insert(len(bundle.base), _backdrop_body(bundle.resolve(bundle.backdrop)))
     return ExportScene(scene["id"], bundle.revision, tuple(bodies), tuple(notes))
+
+
+def _backdrop_body(visual: Path) -> ExportBody:
+    """Return the backdrop as a fixed body without collision shape; its id 0 is no entity's."""
+    return ExportBody(
+        id=0, label="backdrop", name="backdrop_0", base=True, moves=False, weld=None, relation=None,
+        world_from_object=np.eye(4), visual=visual, parts=(), primitives=(), mass_kg=0.0, center_of_mass=np.zeros(3),
+        inertia=np.zeros((3, 3)), friction=0.0, restitution=0.0,
+    )  # fmt: skip
 
 
 def safe_name(label: str, key: int) -> str:

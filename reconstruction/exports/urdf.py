@@ -60,9 +60,10 @@ def _link(body: ExportBody) -> ET.Element:
             inertial, "inertia", {name: text_of([body.inertia[place]]) for name, place in names.items()}
         )
     # URDF has no friction and restitution; these are PyBullet's extension.
-    contact = ET.SubElement(link, "contact")
-    ET.SubElement(contact, "lateral_friction", value=text_of([body.friction]))
-    ET.SubElement(contact, "restitution", value=text_of([body.restitution]))
+    if body.parts:
+        contact = ET.SubElement(link, "contact")
+        ET.SubElement(contact, "lateral_friction", value=text_of([body.friction]))
+        ET.SubElement(contact, "restitution", value=text_of([body.restitution]))
     _mesh(link, "visual", visual_obj(body))
     for number, primitive in enumerate(body.primitives):
         if primitive is None:

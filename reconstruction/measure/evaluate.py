@@ -18,8 +18,15 @@ from reconstruction.measure.object_scores import score_graph, score_objects
 from reconstruction.measure.outlines import measure_outlines
 from reconstruction.measure.perceptual import perceptual_scores
 from reconstruction.measure.planes import planes_figures
-from reconstruction.measure.rendering import render_views, score_pictures, video_frames
-from reconstruction.measure.scene import PlacedMesh, bundle_camera, bundle_poses, joined, placed_meshes
+from reconstruction.measure.rendering import before_backdrop, render_views, score_pictures, video_frames
+from reconstruction.measure.scene import (
+    PlacedMesh,
+    backdrop_mesh,
+    bundle_camera,
+    bundle_poses,
+    joined,
+    placed_meshes,
+)
 from reconstruction.measure.stage_results import StageResults
 from reconstruction.measure.surfaces import COMPOSITION_POINTS, OBJECT_POINTS, compare, sample_seen
 from reconstruction.measure.visibility import spread_poses
@@ -100,6 +107,7 @@ def evaluate_scene(
         lambda: _add_cost(bundle, out),
         lambda: _add_physics(bundle, out),
         lambda: _add_rendering(bundle, scene, stages, _video_of(video, ground_truth), out),
+        lambda: _add_holes(bundle, scene, out),
     ]
     alignment = None
     if truth is not None:
@@ -209,16 +217,42 @@ def _add_rendering(
         [(m.visual, m.world_from_mesh) for m in scene], camera, [poses[i] for i in indices]
     )
     true = [frames[i] for i in indices]
+    shown, _ = before_backdrop(pictures, covered, backdrop_mesh(bundle), camera, [poses[i] for i in indices])
+    whole = score_pictures(shown, [np.ones_like(mask) for mask in covered], true)
+    if whole is not None:
+        out.metrics["psnr_whole_db"] = whole.psnr_db
     score = score_pictures(pictures, covered, true)
     if score is None:
         out.leave_out("the scene covers no pixel of the held-out frames", "psnr_db", "ssim")
         out.metrics["coverage"] = 0.0
         return
     out.metrics.update(psnr_db=score.psnr_db, ssim=score.ssim, coverage=score.coverage)
-    out.stages["rendering"] = {"frames": score.frames, "frames_from": source}
+    out.stages.setdefault("rendering", {}).update(frames=score.frames, frames_from=source)
     perceptual, missing = perceptual_scores(pictures, true)
     out.metrics.update(perceptual)
     out.left_out.update(missing)
+
+
+def _add_holes(bundle: SceneBundle, scene: list[PlacedMesh], out: Evaluation) -> None:
+    """Measure the share of pixels that show neither a mesh nor the backdrop; of keyframes if no frame was kept out."""
+    poses = bundle_poses(bundle)
+    kept_out = sorted(_held_out(bundle) & set(poses))
+    frames = [poses[i] for i in kept_out or sorted(poses)]
+    if not frames:
+        out.leave_out("the scene has no cameras", "holes")
+        return
+    camera = bundle_camera(bundle)
+    camera = camera.resized(camera.width // 2, camera.height // 2)
+    meshes = [(m.visual, m.world_from_mesh) for m in scene]
+    pictures, covered = render_views(meshes, camera, frames)
+    _, covered = before_backdrop(pictures, covered, backdrop_mesh(bundle), camera, frames)
+    out.metrics["holes"] = 1 - float(np.mean(covered))
+    out.stages.setdefault("rendering", {})["holes_of"] = "held-out frames" if kept_out else "keyframes"
+
+
+def _held_out(bundle: SceneBundle) -> set[int]:
+    """Return the numbers of the frames that were kept out of fitting."""
+    return {int(f["index"]) for f in bundle.scene["cameras"]["frames"] if f.get("held_out", False)}
 
 
 def _add_cameras(alignment: Alignment, out: Evaluation) -> None:

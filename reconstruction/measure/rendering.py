@@ -68,6 +68,21 @@ def render_views(
     return pictures, covered
 
 
+def before_backdrop(
+    pictures: list[np.ndarray],
+    covered: list[np.ndarray],
+    backdrop: TexturedMesh | None,
+    camera: Camera,
+    poses: list[np.ndarray],
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Fill the uncovered pixels of images with a backdrop; return images and masks of covered pixels."""
+    if backdrop is None:
+        return pictures, covered
+    behind, shown = render_views([(backdrop, np.eye(4))], camera, poses)
+    filled = [np.where(mask[..., None], near, far) for near, mask, far in zip(pictures, covered, behind)]
+    return filled, [near | far for near, far in zip(covered, shown)]
+
+
 def video_frames(video: Path, indices: list[int], camera: Camera) -> dict[int, np.ndarray]:
     """Decode frames of a video, or read images of a folder, by index; resized to the camera, not undistorted."""
     import cv2

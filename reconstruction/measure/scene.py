@@ -50,6 +50,11 @@ def placed_meshes(bundle: SceneBundle) -> list[PlacedMesh]:
     return out
 
 
+def backdrop_mesh(bundle: SceneBundle) -> TexturedMesh | None:
+    """Read the backdrop of a bundle, in its world; None for a bundle without one. It is no surface of the scene."""
+    return None if bundle.backdrop is None else read_glb(bundle.resolve(bundle.backdrop))
+
+
 def joined(meshes: Sequence) -> tuple[np.ndarray, np.ndarray]:
     """Concatenate meshes with `vertices` and `faces`: float64 (v, 3) and int32 (f, 3)."""
     if not meshes:

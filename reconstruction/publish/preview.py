@@ -44,11 +44,11 @@ def render_textured(
 
 
 def scene_meshes(assets: AssetSet, assembled: AssembledScene) -> list[tuple[TexturedMesh, np.ndarray]]:
-    """Return all visual meshes of the assembled scene with their `world_from_mesh`, base first."""
+    """Return all visual meshes of the assembled scene with their `world_from_mesh`: backdrop, base, objects."""
     pose = {item.id: item.world_from_object for item in assembled.placed}
-    return [(item.visual, np.eye(4)) for item in assets.base] + [
-        (o.visual, pose[o.id]) for o in assets.objects
-    ]
+    behind = [] if assets.backdrop is None else [assets.backdrop.visual]
+    still = [*behind, *(item.visual for item in assets.base)]
+    return [(visual, np.eye(4)) for visual in still] + [(o.visual, pose[o.id]) for o in assets.objects]
 
 
 def render_preview(assets: AssetSet, assembled: AssembledScene, posed: PosedFrames) -> np.ndarray:

@@ -104,6 +104,12 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "gaussians": _gaussians(run, folder),
         "report": _report(run),
     }
+    if assets.backdrop is not None:
+        write_glb(assets.backdrop.visual, folder / "backdrop.glb")
+        scene["backdrop"] = {
+            "mesh": "backdrop.glb",
+            "observed_fraction": float(assets.backdrop.observed_fraction),
+        }
     ids = [o["id"] for o in scene["objects"]]
     scene["instances"], anchors = write_views(
         run.results["instances"], ids, run.results["frames"], posed, run.lens(), folder
@@ -176,6 +182,7 @@ def _base(item: BaseAsset, folder: Path) -> dict:
         "mesh": mesh,
         "plane": [float(x) for x in item.plane],
         "observed": item.observed,
+        "observed_fraction": float(item.observed_fraction),
         "collision": collision,
     }
 

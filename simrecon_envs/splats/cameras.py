@@ -9,6 +9,7 @@ from mani_skill.sensors.camera import Camera
 
 from registry import UsageError
 from registry.geometry import invert_rigid
+from simrecon_envs.scene_builder import show_unlit
 from simrecon_envs.splats.compositing import Actors, Picture, composite, limits_of
 from simrecon_envs.splats.rasterizer import Rasterizer
 from simrecon_envs.splats.scene import SplatScene
@@ -39,8 +40,10 @@ class SplatLayer:
             actor._objs[0] for base in env.bundle.base for actor in env.builder.carrying_actors(base.id)[1:]
         ]
         for entity in (*self._entities, *grounds):
-            _unlit(entity)
-        self._actors = self._table(len(env.bundle.base), grounds)
+            show_unlit(entity)
+        behind = env.builder.backdrop
+        backdrops = [] if behind is None else [behind._objs[0]]
+        self._actors = self._table(len(env.bundle.base), [*grounds, *backdrops])
         self._moving = {row: Caster(self._entities[row - 1]) for row in np.flatnonzero(self._movable)}
         self._added = [
             Caster(entity)
@@ -48,7 +51,8 @@ class SplatLayer:
             if self._actors.body[entity.per_scene_id] < 0
         ]
 
-    def _table(self, bases: int, grounds: list[sapien.Entity]) -> Actors:
+    def _table(self, bases: int, behind: list[sapien.Entity]) -> Actors:
+        """Describe all actors; those of `bases`, and the entities `behind`, hide no Gaussian."""
         ids = [entity.per_scene_id for entity in self._entities]
         size = 1 + max(entity.per_scene_id for entity in self._env.scene.sub_scenes[0].entities)
         actors = Actors(
@@ -59,7 +63,7 @@ class SplatLayer:
         )
         for row, key in enumerate(ids, 1):
             actors.body[key], actors.margin_m[key] = row, _STATIC_MARGIN_M
-        for key in (0, *ids[:bases], *(entity.per_scene_id for entity in grounds)):
+        for key in (0, *ids[:bases], *(entity.per_scene_id for entity in behind)):
             actors.body[key], actors.margin_m[key] = max(int(actors.body[key]), 0), _BASE_MARGIN_M
         return actors
 
@@ -178,17 +182,3 @@ def attach(env: Any, scene: SplatScene) -> SplatLayer:
                 )
             cameras[name] = SplatCamera(camera, layer)
     return layer
-
-
-def _unlit(entity: sapien.Entity) -> None:
-    """Let an actor show its texture unchanged: textures from a video have the room's light in them."""
-    body: Any = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-    for shape in body.render_shapes if body is not None else ():
-        for part in shape.parts:
-            material = part.material
-            if material.base_color_texture is not None:
-                material.emission_texture, material.base_color_texture = material.base_color_texture, None
-            else:
-                material.emission = material.base_color
-            material.base_color = [0, 0, 0, 1]
-            material.specular = 0.0
