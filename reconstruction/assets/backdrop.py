@@ -24,7 +24,9 @@ _USUAL_HEIGHT_M = 2.5  # of rooms without a seen ceiling; building codes ask for
 _MEASURED = 2  # confidence of a measured depth
 _PIXEL_STEP = 3  # of the depth pixels that shape the shell
 _ERODE_PX = 1  # open pixels this close to a mesh may show its outline
-_BORDER_PX = 8.0  # up to this distance from the outline, weights grow
+_RAMP_PX = (
+    40.0  # weights grow up to this distance from outlines and the image's edge, so that frames blend smoothly
+)
 _THING_WEIGHT = 0.02  # of open pixels that show a segmented thing, whose mesh ends too early
 _TOLERANCE_M = 0.1  # between a texel and the shell's depth at its pixel; the shell is smooth
 
@@ -114,7 +116,8 @@ def _bake(
 def _mask(opened: np.ndarray, ids: np.ndarray) -> np.ndarray:
     """Return the weight (h, w) of a frame's open pixels, 0 for all others."""
     mask = cv2.erode(opened.astype(np.uint8), np.ones((2 * _ERODE_PX + 1,) * 2, np.uint8))
-    weight = np.minimum(cv2.distanceTransform(mask, cv2.DIST_L2, 3), _BORDER_PX) / _BORDER_PX
+    inside = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    weight = np.minimum(inside, _RAMP_PX) / _RAMP_PX
     return np.where(ids == 0, weight, _THING_WEIGHT * weight).astype(np.float32)
 
 

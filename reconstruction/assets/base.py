@@ -24,20 +24,23 @@ _TOLERANCE_M = 0.02  # between a texel and the depth of its plane at a pixel
 
 
 def bake_base(
-    rectangles: Sequence[Rectangle], hits: np.ndarray, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels,
-    config: AssetsConfig,
+    rectangles: Sequence[Rectangle], hits: np.ndarray, fixed: np.ndarray, posed: PosedFrames, depth: DepthMaps,
+    pixels: ScenePixels, config: AssetsConfig,
 ) -> tuple[BaseAsset, ...]:  # fmt: skip
     """Make textured meshes of the rectangles of floor, walls and ceiling.
 
     Args:
         rectangles: extents on their planes.
         hits: uint16 (n, h, w) id of the nearest mesh of the scene at each pixel of the keyframes, 0 = none.
+        fixed: bool (n, h, w) pixels that show no base entity and nothing that may move.
         posed: keyframes in world space.
         depth: their depth maps, metres.
         pixels: their ids.
         config: texel size and budget.
     """
-    return tuple(_bake_rectangle(r, hits, posed, depth, pixels, config) for r in rectangles)
+    return tuple(
+        _bake_rectangle(r, (hits == r.entity.id) & fixed, posed, depth, pixels, config) for r in rectangles
+    )
 
 
 def rectangle_mesh(rectangle: Rectangle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -47,7 +50,7 @@ def rectangle_mesh(rectangle: Rectangle) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _bake_rectangle(
-    rectangle: Rectangle, hits: np.ndarray, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels,
+    rectangle: Rectangle, spare: np.ndarray, posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels,
     config: AssetsConfig,
 ) -> BaseAsset:  # fmt: skip
     entity, low, size = rectangle.entity, rectangle.low, rectangle.high - rectangle.low
@@ -61,7 +64,7 @@ def _bake_rectangle(
     texels = Texels(rows, columns, rectangle.world(flat), normal)
     color, seen = _collect(texels, entity, posed, depth, pixels, config)
     share = float(seen.mean())
-    _fill_unlabeled(texels, color, seen, entity, hits, posed, depth, pixels, config)
+    _fill(texels, color, seen, entity, spare, posed, depth, config)
     picture = np.zeros((side, side, 3), np.float32)
     filled = seen.reshape(side, side)
     picture[filled] = color[seen]
@@ -71,20 +74,19 @@ def _bake_rectangle(
     return BaseAsset(entity.id, entity.label, np.asarray(plane, np.float64), mesh, entity.observed, share)
 
 
-def _fill_unlabeled(
-    texels: Texels, color: np.ndarray, seen: np.ndarray, entity: BaseEntity, hits: np.ndarray, posed: PosedFrames,
-    depth: DepthMaps, pixels: ScenePixels, config: AssetsConfig,
+def _fill(
+    texels: Texels, color: np.ndarray, seen: np.ndarray, entity: BaseEntity, spare: np.ndarray, posed: PosedFrames,
+    depth: DepthMaps, config: AssetsConfig,
 ) -> None:  # fmt: skip
-    """Color texels that no frame shows for certain from pixels without an instance that hit the surface, in place.
+    """Color texels that no frame shows for certain from the pixels `spare` (n, h, w) that hit the surface, in place.
 
-    Such pixels have no depth (textureless or dark surface) or show what has no mesh (a curtain).
+    Such pixels have no depth (textureless or dark surface), or show a thing whose mesh ends too early (a curtain).
     """
-    usable = (hits == entity.id) & (pixels.ids == 0)
-    frames = _spread_frames(usable.reshape(len(usable), -1).sum(axis=1), usable[0].size, config)
+    frames = _spread_frames(spare.reshape(len(spare), -1).sum(axis=1), spare[0].size, config)
     if seen.all() or not len(frames):
         return
     planes = [_plane_depth(entity, int(f), posed, depth.camera) for f in frames]
-    masks = [_inner_weight(usable[f]) for f in frames]
+    masks = [_inner_weight(spare[f]) for f in frames]
     depths = [np.where(mask > 0, plane, 0).astype(np.float32) for mask, plane in zip(masks, planes)]
     index = np.flatnonzero(~seen)
     rest = Texels(texels.rows[index], texels.columns[index], texels.points[index], texels.normals[index])

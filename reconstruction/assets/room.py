@@ -48,7 +48,13 @@ def build_room(
     if not meshes:
         return (), None
     hits = nearest_meshes(meshes, depth.camera, posed.world_from_camera)
-    base = bake_base(rectangles, hits, posed, depth, pixels, config)
+    moves = [
+        o.id
+        for o in objects
+        if not o.attached_hint and np.ptp(o.visual.vertices, axis=0).max() < config.furniture_m
+    ]
+    fixed = ~np.isin(pixels.ids, [*moves, *(r.entity.id for r in rectangles)])
+    base = bake_base(rectangles, hits, fixed, posed, depth, pixels, config)
     return base, build_backdrop(
         posed, depth, pixels.ids, np.concatenate([m[1] for m in meshes]), hits == 0, config
     )
