@@ -55,6 +55,7 @@ class BundleWriter:
         self.base, self.objects, self.edges = [], [], []
         self.surfaces: list[tuple[int, trimesh.Trimesh]] = []  # id and mesh, world space
         self.gaussians: dict | None = None
+        self.backdrop: dict | None = None
 
     def add_base(
         self, key: int, label: str, mesh: trimesh.Trimesh, plane: list, *, collision: bool = True
@@ -149,6 +150,13 @@ class BundleWriter:
         )
         self.gaussians = {"file": "gaussians.ply", "count": len(points)}
 
+    def add_backdrop(self, color: tuple[int, int, int] = (250, 20, 240)) -> None:
+        """Write backdrop.glb: a box of one color around the room, faces inward."""
+        mesh = box((8, 8, 5), -0.5)
+        mesh.invert()
+        _glb(mesh, self.folder / "backdrop.glb", color)
+        self.backdrop = {"mesh": "backdrop.glb", "observed_fraction": 0.5}
+
     def seal(self, scene_id: str) -> None:
         """Write scene.json and the manifest."""
         # A camera in a corner of the room that looks at its middle, OpenCV axes.
@@ -185,6 +193,7 @@ class BundleWriter:
                 "objects": self.objects,
                 "graph": {"edges": self.edges},
                 **({} if self.gaussians is None else {"gaussians": self.gaussians}),
+                **({} if self.backdrop is None else {"backdrop": self.backdrop}),
                 "report": {
                     "physics": {},
                     "timings_s": {},
