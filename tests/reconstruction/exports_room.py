@@ -87,8 +87,8 @@ class _Writer:
         )
 
 
-def make_room(folder: Path, scene_id: str = "room") -> SceneBundle:
-    """Write and open a room: a table with a mug and a book on it, a fixed cabinet, things that hang."""
+def make_room(folder: Path, scene_id: str = "room", *, backdrop: bool = False) -> SceneBundle:
+    """Write and open a room: a table with a mug and a book on it, a fixed cabinet, things that hang, a backdrop."""
     writer = _Writer(folder)
     writer.add_base(FLOOR, "floor", box((4, 3, 0.1), (0, 0, -0.05)), [0, 0, 1, 0])
     writer.add_base(WALL, "wall", box((4, 0.1, 2.4), (0, 1.55, 1.2)), [0, -1, 0, 1.5])
@@ -119,7 +119,13 @@ def make_room(folder: Path, scene_id: str = "room") -> SceneBundle:
     handle = _about_z(4, (-1.386, 1.0, 0.6))
     handle_part = box((0.1, 0.02, 0.02), (0, -0.01, 0.01))
     writer.add(HANDLE, "handle", [handle_part], handle, ("attached_to", CABINET), mass=0.1)
-    seal_bundle(folder, _scene(scene_id, writer))
+    scene = _scene(scene_id, writer)
+    if backdrop:
+        around = box((8, 8, 5), (0, 0, 2))
+        around.invert()
+        write_glb(_textured(around), folder / "backdrop.glb")
+        scene["backdrop"] = {"mesh": "backdrop.glb", "observed_fraction": 0.5}
+    seal_bundle(folder, scene)
     return SceneBundle.open(folder)
 
 

@@ -136,3 +136,15 @@ def test_an_unknown_scene_or_format_is_wrong_use(registry, tmp_path, capsys):
         main(["export", "room", "--to", "fbx", *out])
     assert error.value.code == 2
     assert "fbx" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("format_", ["mjcf", "urdf", "glb"])
+def test_a_backdrop_is_exported_without_a_collision_shape(tmp_path, format_):
+    bundle = make_room(tmp_path / "bundle", backdrop=True)
+    done = export_scene(bundle, [format_], tmp_path / "out")
+    text = done.main[format_].read_text(errors="replace")
+    assert "backdrop_0" in text
+    assert "backdrop_0_000" not in text
+    assert not list((tmp_path / "out").glob("meshes/*backdrop*collision*"))
+    if format_ == "glb":
+        assert '"kind":"backdrop"' in text.replace(" ", "")

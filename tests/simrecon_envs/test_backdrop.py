@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_scenes import BundleWriter, add_furniture, add_room, box
+from made_scenes import BundleWriter, add_furniture, add_room
 from sapien.physx import PhysxRigidBaseComponent
 
 import simrecon_envs
-from reconstruction.exports import export_scene
-from registry import SceneBundle, SceneRegistry
+from registry import SceneRegistry
 
 PINK = np.array([253, 80, 248])  # sRGB of the linear color that `add_backdrop` writes
 
@@ -26,18 +25,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer.seal("room")
     SceneRegistry(root, create=True).publish(writer.folder, "room")
     return root
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> SceneBundle:
-    """Return a scene whose base surfaces all have collision shapes, with a backdrop."""
-    writer = BundleWriter(tmp_path_factory.mktemp("closed"))
-    writer.add_base(1, "floor", box((4, 3, 0.1), -0.1), [0, 0, 1, 0])
-    writer.add_base(2, "wall", box((4, 0.1, 2), at=(0, 1.55)), [0, -1, 0, 1.5])
-    add_furniture(writer)
-    writer.add_backdrop()
-    writer.seal("room")
-    return SceneBundle.open(writer.folder)
 
 
 def _pink(image: np.ndarray) -> np.ndarray:
@@ -62,16 +49,3 @@ def test_the_backdrop_is_seen_where_nothing_else_is(root: Path, renderer: str) -
     assert not _pink(rgb)[~shown].any()
     assert (camera["depth"][0, ..., 0].numpy()[shown] > 0).all()
     env.close()
-
-
-@pytest.mark.parametrize("format_", ["mjcf", "urdf", "glb"])
-def test_exports_show_the_backdrop_without_a_collision_shape(
-    bundle: SceneBundle, tmp_path: Path, format_: str
-) -> None:
-    done = export_scene(bundle, [format_], tmp_path / "out")
-    text = done.main[format_].read_bytes()
-    assert b"backdrop_0" in text
-    assert b"backdrop_0_000" not in text
-    assert not list((tmp_path / "out").glob("meshes/*backdrop*collision*"))
-    if format_ == "glb":
-        assert b'"kind": "backdrop"' in text or b'"kind":"backdrop"' in text
