@@ -37,6 +37,7 @@ PSNR = Column("psnr_db", "psnr dB ", 2, "↑")
 SSIM = Column("ssim", "ssim ", 3, "↑")
 LPIPS = Column("lpips", "lpips ", 3, "↓")
 COVERAGE = Column("coverage", "coverage ", 2, "↑")
+HOLES = Column("holes", "holes ", 4, "↓")
 STABLE = Column("stable_rate", "stable ", 2, "↑")
 STABLE_10CM = Column("stable_rate_10cm_0.1rad", "stable 10cm/0.1rad ", 2, "↑")
 STABLE_DROP = Column("stable_rate_5cm_drop_5deg", "stable 5cm/5° ", 2, "↑")
@@ -52,7 +53,7 @@ REGISTERED = Column("registered_share", "frames registered ", 2, "↑")
 # Deleting what is hard must not pay: recall and precision stand in every table.
 FOUND = (RECALL_25, PRECISION_25)
 GEOMETRY = (*FOUND, RECALL_50, PRECISION_50, CD, F_5CM, NC, OBJECT_CD, OBJECT_F, GRAPH_F1)
-LOOKS_AND_COST = (*FOUND, PSNR, SSIM, COVERAGE, ATE, SCALE, TIME, MEMORY)
+LOOKS_AND_COST = (*FOUND, PSNR, SSIM, COVERAGE, HOLES, ATE, SCALE, TIME, MEMORY)
 PHYSICS = (*FOUND, STABLE, STABLE_10CM, STABLE_DROP, PENETRATION, FLOATING)
 # Figures of single stages, so that a bad end result can be traced to where it began.
 STAGES = (
@@ -83,6 +84,7 @@ REAL = (
     PSNR,
     SSIM,
     COVERAGE,
+    HOLES,
     STABLE,
     STABLE_10CM,
     STABLE_DROP,

@@ -31,7 +31,7 @@ _ROWS: tuple[tuple[str, str, str], ...] = (
     ("lpips", "{:.3f}", "the same, lower is better"),
     ("musiq", "{:.1f}", "image quality without reference"),
     ("coverage", "{:.1%}", "share of those frames that the scene covers"),
-    ("psnr_whole_db", "{:.2f}", "over all pixels, with the backdrop"),
+    ("psnr_whole_db", "{:.2f} dB", "over all pixels, with the backdrop"),
     ("holes", "{:.2%}", "share of pixels that show nothing, backdrop included"),
     ("stable_rate", "{:.0%}", "stable movable objects: < 2 cm and < 5 deg in 10 s"),
     ("stable_rate_10cm_0.1rad", "{:.0%}", "... < 0.1 m and < 0.1 rad"),
