@@ -202,9 +202,10 @@ class SceneBuilder:
             str(self.bundle.resolve(self.bundle.backdrop)), pose=_pose(WORLD_FROM_GLTF)
         )
         builder.initial_pose = sapien.Pose()
-        self.backdrop = builder.build_static(name="backdrop")
-        for entity in self.backdrop._objs:
+        actor = builder.build_static(name="backdrop")
+        for entity in actor._objs:
             show_unlit(entity)
+        self.backdrop = actor
 
 
 class _BodyBuilder(ActorBuilder):
