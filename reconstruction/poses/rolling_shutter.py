@@ -18,14 +18,12 @@ from reconstruction.poses.mapping import poses_of
 from reconstruction.poses.refine import bundle_adjust
 
 _STEP_S = 0.016  # between readout times that are tried; phones have 5 to 35 ms
-_LONGEST_S = 0.048
-_MATTERS_PX = (
-    0.5  # shift of the outer tenth of the points, in a quarter of the frames; that is the error of SIFT
-)
+_MATTERS_PX = 0.5  # shift of the outer tenth of the points, in a quarter of the frames: the error of SIFT
 _TYPICAL_S = 0.02  # readout time that the shift is judged by
 _LEAST_S = 0.004  # shorter readouts move points by less than they are off
 _LEAST_GAIN = 0.01  # of the cost; films without rolling shutter gain nothing
 _LONGEST_S = 0.04
+_TRIAL_POINTS = 1500  # with the longest tracks, that the readout time is found on
 _MAX_GAP_S = 1.0  # between the neighbors in time that the motion of a frame comes from
 _LOSS_SCALE_PX = 0.5  # as of the bundle adjustment
 
@@ -209,6 +207,12 @@ def _least_cost(model: Reconstruction, frames: FrameSet, folder: Path) -> tuple[
 
     folder.mkdir(parents=True, exist_ok=True)
     model.write(folder)
+    thin = pycolmap.Reconstruction(folder)
+    for point_id in sorted(thin.point3D_ids(), key=lambda i: (-thin.point3D(i).track.length(), i))[
+        _TRIAL_POINTS:
+    ]:
+        thin.delete_point3D(point_id)
+    thin.write(folder)
     costs: dict[int, float] = {}
 
     def cost(step: int) -> float:
