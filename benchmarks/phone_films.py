@@ -91,7 +91,7 @@ FILMS: tuple[PhoneFilm, ...] = (
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known about a film, as watched."""
+    """Ground truth of a film, in upright frames."""
 
     times_s: np.ndarray  # float64 (n,)
     world_from_camera: np.ndarray  # float64 (n, 4, 4) of the middle row

@@ -5,7 +5,9 @@
     python -m benchmarks.phones OUT --only zoom   films whose name has that in it
 
 Stages frames and poses (preset fast) run on every film of `benchmarks.phone_films.FILMS`, depth only with --depth.
-What is there is kept: the same command goes on from there. A film is `right` where 90 % of its keyframes have poses,
+Films and results in OUT are kept: the same command continues an interrupted run.
+
+A film is `right` where 90 % of its keyframes have poses,
 cameras are within 3 % of the extent of the path (RMSE after alignment; both limits are those of `benchmarks.check`),
 the focal length is within 3 % and keyframes have the film's colors within 8 of 255 levels (mean absolute difference;
 codecs make up to 5); `part` where that holds for a part of the film and a note says so; `refused` where it ends with
@@ -41,7 +43,7 @@ _DEPTH_OFF = 0.1  # relative; depth of a passer-by instead of the room is off by
 
 @dataclass
 class Outcome:
-    """What came of a film."""
+    """Verdict and measured errors of one film."""
 
     film: str
     verdict: str = "crashed"

@@ -6,17 +6,14 @@ pixels where that is farther: no part of it stands within the scene. Open pixels
 It is drawn and never collides.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.assets.shell import Shell, box_distance, room_shell
 from reconstruction.assets.texture import Texels, collect_colors, push_pull, texture_views, textured
-from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.assets.views import rasterize_frames
 from reconstruction.core.types import Backdrop, Camera, DepthMaps, PosedFrames
-from reconstruction.core.workers import Workers
 
 _MARGIN_M = 0.1  # of the box around meshes; chords of the shell's grid stay outside of them
 _CAMERA_MARGIN_M = 0.3  # of the box around cameras
@@ -61,14 +58,6 @@ def room_box(vertices: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.nd
     return low, high
 
 
-def _depths(vertices: np.ndarray, faces: np.ndarray, camera: Camera, poses: np.ndarray) -> np.ndarray:
-    """Return z-depths float32 (n, h, w) of a mesh in all frames, 0 = nothing."""
-    with ThreadPoolExecutor(Workers(0).threads) as pool:
-        return np.array(
-            list(pool.map(lambda pose: rasterize_mesh(vertices, faces, camera, pose).depth, poses))
-        )
-
-
 def _open_points(
     opened: np.ndarray, posed: PosedFrames, depth: DepthMaps, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +81,7 @@ def _bake(
     vertices, faces, uvs = shell.mesh()
     height, width = config.texture_max_px, 2 * config.texture_max_px
     frames = np.flatnonzero(opened.any(axis=(1, 2)))
-    depths = _depths(vertices, faces, camera, posed.world_from_camera[frames])
+    depths = rasterize_frames(vertices, faces, camera, posed.world_from_camera[frames], lambda r: r.depth)
     masks = [_mask(opened[f], np.asarray(id_maps[f])) for f in frames]
     views = texture_views(
         posed, camera, frames, [np.where(m > 0, d, 0) for m, d in zip(masks, depths)], masks

@@ -1,7 +1,6 @@
 """The room around the objects: floor, walls and ceiling, and the backdrop behind them."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -9,8 +8,7 @@ from reconstruction.assets.backdrop import build_backdrop
 from reconstruction.assets.base import bake_base, rectangle_mesh
 from reconstruction.assets.base_rectangles import base_rectangles
 from reconstruction.assets.config import AssetsConfig
-from reconstruction.assets.views import ScenePixels
-from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.assets.views import ScenePixels, rasterize_frames
 from reconstruction.core.types import (
     Backdrop,
     BaseAsset,
@@ -21,7 +19,6 @@ from reconstruction.core.types import (
     PosedFrames,
     SpaceGrid,
 )
-from reconstruction.core.workers import Workers
 from registry.geometry import transform_points
 
 
@@ -77,6 +74,4 @@ def nearest_meshes(
     owner = np.append(np.repeat([key for key, _, _ in meshes], [len(f) for _, _, f in meshes]), 0).astype(
         np.uint16
     )
-    with ThreadPoolExecutor(Workers(0).threads) as pool:
-        shown = pool.map(lambda pose: owner[rasterize_mesh(vertices, faces, camera, pose).face], poses)
-        return np.array(list(shown))
+    return rasterize_frames(vertices, faces, camera, poses, lambda raster: owner[raster.face])

@@ -1,11 +1,15 @@
 """Depth pixels of all frames with viewing angles and noise, computed once per scene, and the points of one object."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from reconstruction.core.rasterize import Raster, rasterize_mesh
 from reconstruction.core.types import Camera, DepthMaps, PosedFrames
+from reconstruction.core.workers import Workers
 from registry.geometry import invert_rigid, transform_points
 
 _OUTLINE_PX = 3  # depth and ids are unreliable this close to an instance's outline
@@ -49,6 +53,24 @@ def inner_pixels(ids: np.ndarray) -> np.ndarray:
     """Return which pixels (n, h, w) of id images have the same id everywhere within `_OUTLINE_PX`."""
     kernel = np.ones((2 * _OUTLINE_PX + 1,) * 2, np.uint8)
     return np.stack([cv2.erode(image, kernel) == cv2.dilate(image, kernel) for image in ids])
+
+
+def rasterize_frames(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, poses: np.ndarray, take: Callable[[Raster], np.ndarray]
+) -> np.ndarray:  # fmt: skip
+    """Rasterize a mesh in all frames, on several threads; return what `take` keeps of each raster (n, ...).
+
+    Args:
+        vertices: (v, 3) in world space.
+        faces: (f, 3).
+        camera: of all frames.
+        poses: world_from_camera (n, 4, 4).
+        take: of a raster, e.g. its depth.
+    """
+    with ThreadPoolExecutor(Workers(0).threads) as pool:
+        return np.array(
+            list(pool.map(lambda pose: take(rasterize_mesh(vertices, faces, camera, pose)), poses))
+        )
 
 
 def pixels_of(

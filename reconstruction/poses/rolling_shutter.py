@@ -180,9 +180,11 @@ def correct_rolling_shutter(
     model: Reconstruction, frames: FrameSet, work_dir: Path, progress: Progress
 ) -> Shutter | None:
     """Estimate the readout time and adjust the model to it, in place; None where it does not matter or is not found."""
+    if not frames.ordered:
+        return None
     observations = Observations(model, frames.times_s, frames.quarter_turns)
     largest = [np.quantile(np.hypot(*s.T), 0.9) for s in observations.shifts(_TYPICAL_S) if len(s)]
-    if not frames.ordered or np.quantile(largest, 0.75) < _MATTERS_PX:
+    if np.quantile(largest, 0.75) < _MATTERS_PX:
         return None
     readout_s, gain = _least_cost(model, frames, work_dir / "rolling_shutter")
     if readout_s < _LEAST_S or gain < _LEAST_GAIN:

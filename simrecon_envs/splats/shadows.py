@@ -19,15 +19,13 @@ _CELL_M = 0.015
 _BLUR_M = 0.03  # standard deviation of the shadow's outline; chosen by eye, as are the next two
 _REACH_M = 0.12  # height above a surface at which a caster's shadow ends
 _DARKEST = 0.6  # share of the light that a large caster keeps away where it touches
-_INSIDE_M = (
-    0.01  # a surface this far above a caster's lowest points still counts as below: depths are that accurate
-)
+_INSIDE_M = 0.01  # above a caster's lowest points its shadow fades over this height: accuracy of depth
 _AROUND_M = 2.5  # what is farther from the first caster casts none: bounds the map
 
 
 @dataclass(frozen=True)
 class ShadowMap:
-    """What casters cover, seen from above. Rows run along world y, columns along world x."""
+    """Coverage and lowest height of casters, seen from above. Rows run along world y, columns along world x."""
 
     origin: np.ndarray  # float64 (2,) world x and y of the first cell's corner, metres
     cover: np.ndarray  # float32 (ny, nx) covered share, 0 to 1
