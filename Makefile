@@ -3,7 +3,8 @@
 VENV ?= .venv
 # Test files are spread over two processes; JOBS=0 runs them in one, in order.
 JOBS ?= 2
-SPREAD = -n $(JOBS) --dist loadfile
+# In the order of tests/conftest.py, long files first: xdist's own order puts files with few tests last.
+SPREAD = -n $(JOBS) --dist loadfile --no-loadscope-reorder
 PYTHON_IN_VENV = $(VENV)/bin/python
 
 .PHONY: setup demo test test-unit test-all lint format build clean

@@ -133,6 +133,8 @@ class PosedFrames(CheckedArrays):
     reprojection_error_px: float  # mean
     metric: bool = False  # `sfm` is in metres: poses were imported from a metric tracker (ARKit)
     distorted: DistortedCamera | None = None  # of the recorded frames, at this size; None: `camera` is theirs
+    # pixels, of the recorded frames' principal points, keyframes first, then held-out ones; None: a crop does not move
+    principal_offsets: Annotated[np.ndarray | None, "float64 q 2"] = None
 
 
 @dataclass(frozen=True)

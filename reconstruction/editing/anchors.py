@@ -70,7 +70,7 @@ class Footage:
         filmed, camera = self.lens.camera, self.depth.camera
         working = np.array([[x / width * filmed.width, y / height * filmed.height]])
         scale = np.array([camera.width / filmed.width, camera.height / filmed.height])
-        pixel = self.lens.straightened(working)[0] * scale
+        pixel = self.lens.at(address.frame).straightened(working)[0] * scale
         if not ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all():
             raise UsageError(f"overrides: {address} lies in the margin that lens undistortion cuts off")
         return np.minimum(pixel, [camera.width - 1e-6, camera.height - 1e-6])

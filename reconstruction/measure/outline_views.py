@@ -61,7 +61,14 @@ def draw_views(
     ids = np.repeat([0 if m.base else m.id for m in meshes], [len(m.faces) for m in meshes]).astype(np.int32)
     views = []
     for frame in with_camera:
-        face = _faces_seen(vertices, faces, camera, poses[frame.index], (frame.width, frame.height), lens)
+        face = _faces_seen(
+            vertices,
+            faces,
+            camera,
+            poses[frame.index],
+            (frame.width, frame.height),
+            lens and lens.at(frame.index),
+        )
         views.append(OutlineView(frame, np.where(face >= 0, ids[face], 0) if len(ids) else face * 0))
     return tuple(views), tuple(f.index for f in labels.frames if f.index not in poses)
 

@@ -20,6 +20,7 @@ from reconstruction.poses.features import Features, extract_features, match
 from reconstruction.poses.held_out import candidates_in_time, locate_frames
 from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
+from reconstruction.poses.moving_crop import correct_moving_crop
 from reconstruction.poses.refine import refine_model
 from reconstruction.poses.rolling_shutter import Shutter, correct_rolling_shutter
 from reconstruction.poses.undistort import undistort
@@ -75,9 +76,12 @@ def estimate_poses(
         else:
             frames, features, model = _reconstruct(frames, features, config, work_dir, progress)
         registered = sorted(i - 1 for i in model.reg_image_ids())
-        shutter = correct_rolling_shutter(model, frames, work_dir, progress) if not known else None
-        held_out = _locate_held_out(frames, features, model, registered, known, config, progress)
-    return replace(_package(frames, model, registered, held_out, shutter), metric=metric)
+        offsets = shutter = None
+        if not known and frames.ordered:
+            offsets = correct_moving_crop(model, work_dir, progress)
+            shutter = correct_rolling_shutter(model, frames, work_dir, progress)
+        held_out = _locate_held_out(frames, features, model, registered, known, offsets, config, progress)
+    return replace(_package(frames, model, registered, held_out, offsets, shutter), metric=metric)
 
 
 def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> importers.ImportedPoses:
@@ -144,29 +148,39 @@ def _locate_held_out(
     model: Reconstruction,
     registered: list[int],
     known: dict[int, np.ndarray],
+    offsets: dict[int, np.ndarray] | None,
     config: PosesConfig,
     progress: Progress,
-) -> list[tuple[int, np.ndarray]]:
-    """Localize held-out frames whose pose is not `known`: (held-out row, world_from_camera) of all with a pose."""
+) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Localize held-out frames whose pose is not `known`.
+
+    Returns:
+        Held-out row, world_from_camera (4, 4) and the principal point's offset (2,) of all with a pose.
+    """
     total = len(frames.held_out_images)
     rows = [row for row in range(total) if int(frames.held_out_indices[row]) not in known]
     progress.start(len(rows), "held-out frames")
     images = frames.held_out_images[rows]
     queries = extract_features(images, config.max_features, config.contrast_threshold, NO_PROGRESS)
+    rough = None
     if frames.ordered:
         times_s = frames.held_out_times_s[rows]
+        if offsets is not None:
+            known_s, at = frames.times_s[list(offsets)], np.array(list(offsets.values()))
+            rough = np.stack([np.interp(times_s, known_s, axis) for axis in at.T], axis=1)
         candidates = [candidates_in_time(frames.times_s, registered, time_s) for time_s in times_s]
     else:
         candidates = [_most_alike(query, features, registered) for query in queries]
-    located = dict(zip(rows, locate_frames(queries, candidates, features, model, config, progress)))
-    located |= {row: known[int(frames.held_out_indices[row])] for row in range(total) if row not in located}
+    located = dict(zip(rows, locate_frames(queries, candidates, features, model, config, progress, rough)))
+    for row in set(range(total)) - set(rows):
+        located[row] = known[int(frames.held_out_indices[row])], np.zeros(2)
     failed = [row for row in range(total) if located[row] is None]
     if failed:
         progress.note(
             f"poses: {len(failed)} of {total} held-out frames could not be located and are not evaluated: "
             f"frames {diagnose.describe_frames(frames.held_out_indices[failed])}"
         )
-    return [(row, pose) for row in range(total) if (pose := located[row]) is not None]
+    return [(row, *found) for row in range(total) if (found := located[row]) is not None]
 
 
 def _most_alike(query: Features, features: list[Features], registered: list[int]) -> list[int]:
@@ -180,10 +194,11 @@ def _package(
     frames: FrameSet,
     model: Reconstruction,
     registered: list[int],
-    held_out: list[tuple[int, np.ndarray]],
+    held_out: list[tuple[int, np.ndarray, np.ndarray]],
+    offsets: dict[int, np.ndarray] | None,
     shutter: Shutter | None,
 ) -> PosedFrames:
-    """Undo rolling shutter and distortion of the images; collect poses, points and observations."""
+    """Undo rolling shutter, moving crop and distortion of the images; collect poses, points and observations."""
     poses = mapping.poses_of(model)
     point_ids = sorted(model.point3D_ids())
     frame_row = {row + 1: new for new, row in enumerate(registered)}
@@ -197,12 +212,18 @@ def _package(
     points = np.array([model.point3D(i).xyz for i in point_ids], np.float64).reshape(-1, 3)
     errors = np.array([model.point3D(i).error for i in point_ids], np.float32)
     colors = _point_colors(model, point_ids, frames.images)
-    held_rows = [row for row, _ in held_out]
+    held_rows = [row for row, _, _ in held_out]
     recorded = [frames.images[registered], frames.held_out_images[held_rows]]
     if shutter is not None:
         times = frames.times_s[registered], frames.held_out_times_s[held_rows]
         recorded = [shutter.straightened(images, at) for images, at in zip(recorded, times)]
-    camera, (images, held_out_images), distorted = undistort(model.cameras[min(model.cameras)], recorded)
+    moved = None
+    if offsets is not None:
+        moved = [np.stack([offsets[row] for row in registered])]
+        moved.append(np.array([offset for _, _, offset in held_out]).reshape(-1, 2))
+    camera, (images, held_out_images), distorted = undistort(
+        model.cameras[min(model.cameras)], recorded, moved
+    )
     return PosedFrames(
         source=frames.source,
         camera=camera,
@@ -214,7 +235,7 @@ def _package(
         held_out_images=held_out_images,
         held_out_indices=frames.held_out_indices[held_rows],
         held_out_times_s=frames.held_out_times_s[held_rows],
-        held_out_world_from_camera=np.array([pose for _, pose in held_out], np.float64).reshape(-1, 4, 4),
+        held_out_world_from_camera=np.array([pose for _, pose, _ in held_out], np.float64).reshape(-1, 4, 4),
         points=points,
         point_colors=colors,
         point_errors_px=errors,
@@ -223,6 +244,7 @@ def _package(
         ordered=frames.ordered,
         reprojection_error_px=float(model.compute_mean_reprojection_error()),
         distorted=distorted,
+        principal_offsets=None if moved is None else np.concatenate(moved),
     )
 
 

@@ -6,10 +6,12 @@ from reconstruction.core.progress import Progress
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
+from reconstruction.poses.moving_crop import resect
 from reconstruction.poses.parallel import ordered_map
 
 _NEIGHBORS = 8  # keyframes that each query is matched to
 _MAX_ERROR_PX = 3.0  # inlier threshold of RANSAC
+_ROUGH_ERROR_PX = 12.0  # the same with a principal point interpolated in time
 
 
 def locate_frames(
@@ -19,8 +21,11 @@ def locate_frames(
     model: Reconstruction,
     config: PosesConfig,
     progress: Progress,
-) -> list[np.ndarray | None]:
-    """Return the pose world_from_camera (4, 4) of each query frame; None where inliers are too few.
+    offsets: np.ndarray | None = None,
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """Return the pose world_from_camera (4, 4) of each query frame, and its principal point's offset (2,) in pixels.
+
+    None stands where inliers are too few.
 
     Args:
         queries: features of the frames to localize.
@@ -29,23 +34,31 @@ def locate_frames(
         model: stays unchanged.
         config: seed and thresholds.
         progress: advanced by one per query.
+        offsets: (queries, 2) of the principal points, roughly; None: they do not move.
     """
     tracked = {row: _tracked_features(model, row) for row in sorted({r for rows in candidates for r in rows})}
     positions = {i: model.point3D(i).xyz for i in sorted(model.point3D_ids())}
     camera = model.cameras[min(model.cameras)]
 
-    def locate(task: tuple[Features, list[int]]) -> np.ndarray | None:
-        query, rows = task
+    def locate(number: int) -> tuple[np.ndarray, np.ndarray] | None:
+        query, rows = queries[number], candidates[number]
         votes: dict[tuple[int, int], int] = {}
         for row in rows[:_NEIGHBORS]:
             feature_rows, point_ids = tracked[row]
             for a, b in match(query.descriptors, features[row].descriptors[feature_rows]):
                 key = (int(a), int(point_ids[b]))
                 votes[key] = votes.get(key, 0) + 1
-        return _solve(query, votes, positions, camera, config)
+        points_2d, points_3d = _correspondences(query, votes, positions)
+        if len(points_2d) < config.min_held_out_inliers:
+            return None
+        offset = np.zeros(2)
+        if offsets is not None:
+            offset = _offset(points_2d, points_3d, camera, config, offsets[number])
+        pose, inliers = _absolute_pose(points_2d - offset, points_3d, camera, config, _MAX_ERROR_PX)
+        return None if pose is None or inliers.sum() < config.min_held_out_inliers else (pose, offset)
 
     out = []
-    for pose in ordered_map(locate, list(zip(queries, candidates))):
+    for pose in ordered_map(locate, list(range(len(queries)))):
         out.append(pose)
         progress.advance()
     return out
@@ -63,32 +76,43 @@ def _tracked_features(model: Reconstruction, row: int) -> tuple[np.ndarray, np.n
     return np.array([f[0] for f in found], np.int64), np.array([f[1] for f in found], np.int64)
 
 
-def _solve(
-    query: Features,
-    votes: dict[tuple[int, int], int],
-    positions: dict[int, np.ndarray],
-    camera: ColmapCamera,
-    config: PosesConfig,
-) -> np.ndarray | None:
-    """Estimate the absolute pose by RANSAC, each feature matched to the 3D point with most votes."""
-    import pycolmap
-
+def _correspondences(
+    query: Features, votes: dict[tuple[int, int], int], positions: dict[int, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels (k, 2) and 3D points (k, 3): each feature matched to the point with most votes."""
     best: dict[int, tuple[int, int]] = {}
     for (feature, point), count in sorted(votes.items()):
         if feature not in best or count > best[feature][0]:
             best[feature] = (count, point)
-    if len(best) < config.min_held_out_inliers:
-        return None
-    points_2d = query.keypoints[list(best)].astype(np.float64)
-    points_3d = np.stack([positions[point] for _, point in best.values()])
+    points = np.array([positions[point] for _, point in best.values()]).reshape(-1, 3)
+    return query.keypoints[list(best)].astype(np.float64).reshape(-1, 2), points
+
+
+def _offset(
+    pixels: np.ndarray, points: np.ndarray, camera: ColmapCamera, config: PosesConfig, offset: np.ndarray
+) -> np.ndarray:
+    """Estimate the principal point's offset (2,) of a frame, from a rough one."""
+    pose, inliers = _absolute_pose(pixels - offset, points, camera, config, _ROUGH_ERROR_PX)
+    if pose is None or inliers.sum() < config.min_held_out_inliers:
+        return offset
+    local = (points[inliers] - pose[:3, 3]) @ pose[:3, :3]
+    return resect(camera, local, pixels[inliers], offset)
+
+
+def _absolute_pose(
+    pixels: np.ndarray, points: np.ndarray, camera: ColmapCamera, config: PosesConfig, max_error_px: float
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Estimate world_from_camera (4, 4) by RANSAC from 2D-3D correspondences; return it and the inliers, bool (k,)."""
+    import pycolmap
+
     estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.ransac.max_error = _MAX_ERROR_PX
+    estimation.ransac.max_error = max_error_px
     estimation.ransac.random_seed = config.seed
     refinement = pycolmap.AbsolutePoseRefinementOptions()
     refinement.loss_function_scale = 0.5
-    answer = pycolmap.estimate_and_refine_absolute_pose(points_2d, points_3d, camera, estimation, refinement)
-    if answer is None or answer["num_inliers"] < config.min_held_out_inliers:
-        return None
+    answer = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, estimation, refinement)
+    if answer is None:
+        return None, np.zeros(len(pixels), bool)
     camera_from_world = np.eye(4)
     camera_from_world[:3] = answer["cam_from_world"].matrix()
-    return np.linalg.inv(camera_from_world)
+    return np.linalg.inv(camera_from_world), np.asarray(answer["inlier_mask"], bool)

@@ -7,7 +7,7 @@ from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.mapping import MAPPER_THREADS
 
 # of the Cauchy loss: SIFT errors in compressed video have heavy tails (measured: halves the camera error)
-_LOSS_SCALE_PX = 0.5
+LOSS_SCALE_PX = 0.5
 _MIN_OBSERVATIONS = 15  # points that a frame must observe for a reliable pose
 _RICH_MODEL_FROM_FRAMES = 30  # with fewer frames a second distortion term overfits
 
@@ -26,7 +26,7 @@ def refine_model(model: Reconstruction, config: PosesConfig) -> Reconstruction:
     return model
 
 
-def bundle_adjust(model: Reconstruction, loss_scale_px: float = _LOSS_SCALE_PX) -> None:
+def bundle_adjust(model: Reconstruction, loss_scale_px: float = LOSS_SCALE_PX) -> None:
     """Adjust poses, points and intrinsics (without the principal point) under a Cauchy loss, in place."""
     import pycolmap
 

@@ -15,6 +15,7 @@ from reconstruction.core.progress import Progress
 from reconstruction.core.types import FrameSet
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.mapping import poses_of
+from reconstruction.poses.observations import Observations, project, thinned
 from reconstruction.poses.refine import bundle_adjust
 
 _STEP_S = 0.016  # between readout times that are tried; phones have 5 to 35 ms
@@ -23,9 +24,7 @@ _TYPICAL_S = 0.02  # readout time that the shift is judged by
 _LEAST_S = 0.004  # shorter readouts move points by less than they are off
 _LEAST_GAIN = 0.01  # of the cost; films without rolling shutter gain nothing
 _LONGEST_S = 0.04
-_TRIAL_POINTS = 1500  # with the longest tracks, that the readout time is found on
 _MAX_GAP_S = 1.0  # between the neighbors in time that the motion of a frame comes from
-_LOSS_SCALE_PX = 0.5  # as of the bundle adjustment
 
 
 @dataclass(frozen=True)
@@ -72,24 +71,13 @@ def row_times(pixels: np.ndarray, size: tuple[int, int], readout_s: float, quart
     return readout_s * (y, x, -y, -x)[quarter_turns % 4]
 
 
-def project(camera: ColmapCamera, points: np.ndarray) -> np.ndarray:
-    """Project points (k, 3) of camera space to pixels (k, 2); points behind the camera become NaN."""
-    return np.asarray(camera.img_from_cam(points))
-
-
-class Observations:
+class ShutterObservations(Observations):
     """The observed points of a model, to be moved to the middle row and back."""
 
     def __init__(self, model: Reconstruction, times_s: np.ndarray, quarter_turns: int) -> None:
         """Keep the pixels as observed."""
-        self.model, self.times_s, self.quarter_turns = model, times_s, quarter_turns
-        self.rows = sorted(i - 1 for i in model.reg_image_ids())
-        self.camera = model.cameras[min(model.cameras)]
-        self.indices, self.pixels = {}, {}
-        for row in self.rows:
-            points = model.image(row + 1).points2D
-            self.indices[row] = [k for k, p in enumerate(points) if p.has_point3D()]
-            self.pixels[row] = np.array([points[k].xy for k in self.indices[row]]).reshape(-1, 2)
+        super().__init__(model)
+        self.times_s, self.quarter_turns = times_s, quarter_turns
 
     def shifts(self, readout_s: float) -> list[np.ndarray]:
         """Return for each frame how far each point (k, 2) is from where the camera of the middle row sees it."""
@@ -106,30 +94,7 @@ class Observations:
 
     def move(self, readout_s: float) -> None:
         """Put the observed points where the camera of the middle row sees them, for a readout time."""
-        for row, shift in zip(self.rows, self.shifts(readout_s)):
-            image = self.model.image(row + 1)
-            for index, pixel in zip(self.indices[row], self.pixels[row] + shift):
-                image.point2D(index).xy = pixel
-
-    def points_in_camera(self, row: int, world_from_camera: np.ndarray) -> np.ndarray:
-        """Return the observed points (k, 3) of a frame in its camera space."""
-        image = self.model.image(row + 1)
-        points = np.array(
-            [self.model.point3D(image.point2D(k).point3D_id).xyz for k in self.indices[row]]
-        ).reshape(-1, 3)
-        return (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
-
-    def cost(self) -> float:
-        """Return the mean Cauchy loss of the reprojection errors, relative to its scale."""
-        poses, total, count = poses_of(self.model), 0.0, 0
-        for row in self.rows:
-            image = self.model.image(row + 1)
-            seen = project(self.camera, self.points_in_camera(row, poses[row]))
-            given = np.array([image.point2D(k).xy for k in self.indices[row]]).reshape(-1, 2)
-            error = ((seen - given) ** 2).sum(1)
-            total += float(np.nansum(np.log1p(error / _LOSS_SCALE_PX**2)))
-            count += len(error)
-        return total / max(count, 1)
+        self.place({row: -shift for row, shift in zip(self.rows, self.shifts(readout_s))})
 
 
 @dataclass(frozen=True)
@@ -180,9 +145,7 @@ def correct_rolling_shutter(
     model: Reconstruction, frames: FrameSet, work_dir: Path, progress: Progress
 ) -> Shutter | None:
     """Estimate the readout time and adjust the model to it, in place; None where it does not matter or is not found."""
-    if not frames.ordered:
-        return None
-    observations = Observations(model, frames.times_s, frames.quarter_turns)
+    observations = ShutterObservations(model, frames.times_s, frames.quarter_turns)
     largest = [np.quantile(np.hypot(*s.T), 0.9) for s in observations.shifts(_TYPICAL_S) if len(s)]
     if np.quantile(largest, 0.75) < _MATTERS_PX:
         return None
@@ -207,20 +170,14 @@ def _least_cost(model: Reconstruction, frames: FrameSet, folder: Path) -> tuple[
     """Return the readout time with the least cost, by a parabola, and what it gains relative to none."""
     import pycolmap
 
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write(folder)
-    thin = pycolmap.Reconstruction(folder)
-    for point_id in sorted(thin.point3D_ids(), key=lambda i: (-thin.point3D(i).track.length(), i))[
-        _TRIAL_POINTS:
-    ]:
-        thin.delete_point3D(point_id)
+    thin = thinned(model, folder)
     thin.write(folder)
     costs: dict[int, float] = {}
 
     def cost(step: int) -> float:
         if step not in costs:
             trial = pycolmap.Reconstruction(folder)
-            observations = Observations(trial, frames.times_s, frames.quarter_turns)
+            observations = ShutterObservations(trial, frames.times_s, frames.quarter_turns)
             observations.move(step * _STEP_S)
             bundle_adjust(trial)
             observations.move(step * _STEP_S)

@@ -10,13 +10,14 @@ _NEGLIGIBLE_PX = 0.3  # displacement up to which images are left as they are, as
 
 
 def undistort(
-    camera: ColmapCamera, image_sets: list[np.ndarray]
+    camera: ColmapCamera, image_sets: list[np.ndarray], offset_sets: list[np.ndarray] | None = None
 ) -> tuple[Camera, list[np.ndarray], DistortedCamera | None]:
     """Return a pinhole camera of the same size whose view the images cover, and the images resampled to it.
 
     Args:
         camera: distorted camera of the images.
         image_sets: uint8 arrays (n, h, w, 3); returned as they are where the distortion is negligible.
+        offset_sets: (n, 2) in pixels for each set, of the principal point of each image; None: there are none.
 
     Returns:
         The pinhole camera, its images, and the distorted camera; None where the distortion is negligible.
@@ -25,20 +26,23 @@ def undistort(
     fx, fy = camera.focal_length_x, camera.focal_length_y
     pinhole = Camera(width, height, fx, fy, camera.principal_point_x, camera.principal_point_y)
     pixels = _pixel_grid(width, height)
-    if np.abs(_source_pixels(camera, pinhole, pixels) - pixels).max() <= _NEGLIGIBLE_PX:
+    negligible = np.abs(_source_pixels(camera, pinhole, pixels) - pixels).max() <= _NEGLIGIBLE_PX
+    if negligible and offset_sets is None:
         return pinhole, image_sets, None
-    pinhole = _covering_pinhole(camera)
+    offset_sets = offset_sets or [np.zeros((len(images), 2)) for images in image_sets]
+    pinhole = _covering_pinhole(camera, np.concatenate([np.zeros((1, 2)), *offset_sets]))
     source = _source_pixels(camera, pinhole, pixels).reshape(height, width, 2).astype(np.float32)
     source -= np.float32(0.5)
     distorted = DistortedCamera(camera.model_name, width, height, np.array(camera.params, np.float64))
-    return pinhole, [_resample(images, source) for images in image_sets], distorted
+    return pinhole, [_resample(*pair, source) for pair in zip(image_sets, offset_sets)], distorted
 
 
-def _resample(images: np.ndarray, source: np.ndarray) -> np.ndarray:
+def _resample(images: np.ndarray, offsets: np.ndarray, source: np.ndarray) -> np.ndarray:
     out = np.empty_like(images)
     for row, image in enumerate(images):
         pixels, mode = np.ascontiguousarray(image), cv2.BORDER_REPLICATE
-        out[row] = cv2.remap(pixels, source, None, cv2.INTER_LANCZOS4, borderMode=mode)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        at = source + offsets[row].astype(np.float32)
+        out[row] = cv2.remap(pixels, at, None, cv2.INTER_LANCZOS4, borderMode=mode)  # pyright: ignore[reportCallIssue, reportArgumentType]
     return out
 
 
@@ -53,8 +57,11 @@ def _source_pixels(camera: ColmapCamera, pinhole: Camera, pixels: np.ndarray) ->
     return np.asarray(camera.img_from_cam(rays))
 
 
-def _covering_pinhole(camera: ColmapCamera) -> Camera:
-    """Find the widest centered pinhole camera of the same size whose view the distorted image covers, by bisection."""
+def _covering_pinhole(camera: ColmapCamera, offsets: np.ndarray) -> Camera:
+    """Find the widest centered pinhole camera of the same size whose view the distorted images cover, by bisection.
+
+    `offsets`: (n, 2) of the principal points of the images.
+    """
     width, height = camera.width, camera.height
     u, v = (np.linspace(0.5, side - 0.5, 100) for side in (width, height))
     first, last_u, last_v = np.full(100, 0.5), np.full(100, width - 0.5), np.full(100, height - 0.5)
@@ -66,7 +73,8 @@ def _covering_pinhole(camera: ColmapCamera) -> Camera:
 
     def covered(zoom: float) -> bool:
         source = _source_pixels(camera, at_zoom(zoom), border)
-        inside = (source >= 0.5) & (source <= np.array([width, height]) - 0.5)
+        low, high = source + offsets.min(0), source + offsets.max(0)
+        inside = (low >= 0.5) & (high <= np.array([width, height]) - 0.5)
         return bool(np.isfinite(source).all() and inside.all())
 
     low, high = 0.5, 3.0

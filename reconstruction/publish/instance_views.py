@@ -3,6 +3,7 @@
 `simrecon show SCENE --instances` draws its contact sheets from these files alone.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,13 +28,13 @@ class InstanceViews:
     anchors: dict[int, tuple[int, float, float]]
 
 
-def choose_views(id_maps: np.ndarray, ids: list[int], lens: Lens) -> InstanceViews:
+def choose_views(id_maps: np.ndarray, ids: list[int], lenses: Sequence[Lens]) -> InstanceViews:
     """Select few keyframes that cover every visible object, by greedy set cover.
 
     Args:
         id_maps: uint16 (n, h, w) instance ids per undistorted keyframe.
         ids: objects to cover.
-        lens: distortion between the video and the undistorted frames.
+        lenses: distortion between the video and the undistorted frames, of each keyframe.
 
     Returns:
         The views; objects that no keyframe shows have no anchor.
@@ -54,7 +55,7 @@ def choose_views(id_maps: np.ndarray, ids: list[int], lens: Lens) -> InstanceVie
     for k, number in enumerate(ids):
         if visible[k]:
             row = max(chosen, key=lambda r: (quality[r, k], -r))
-            anchors[number] = (row, *_innermost_pixel(lens.as_filmed(id_maps[row]) == number))
+            anchors[number] = (row, *_innermost_pixel(lenses[row].as_filmed(id_maps[row]) == number))
     return InstanceViews(tuple(sorted(chosen)), anchors)
 
 
@@ -95,7 +96,8 @@ def write_views(
         The `instances` section of scene.json, and the `anchor` of each visible object: video frame and pixel, in
         pixels of the video.
     """
-    views = choose_views(found.id_maps, ids, lens)
+    lenses = [lens.at(int(index)) for index in posed.indices]
+    views = choose_views(found.id_maps, ids, lenses)
     row_of = {int(index): row for row, index in enumerate(frames.indices)}
     (folder / "instances").mkdir(exist_ok=True)
     entries = []
@@ -105,7 +107,7 @@ def write_views(
         picture = _downscaled(np.asarray(frames.images[row_of[index]]))
         flags = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
         cv2.imwrite(str(folder / f"{name}.jpg"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), flags)
-        shown = lens.as_filmed(found.id_maps[row])
+        shown = lenses[row].as_filmed(found.id_maps[row])
         kept = np.where(np.isin(shown, ids), shown, 0).astype(np.uint16)
         cv2.imwrite(str(folder / f"{name}.png"), kept, [cv2.IMWRITE_PNG_COMPRESSION, 9])
         entries.append({"index": index, "image": f"{name}.jpg", "ids": f"{name}.png"})

@@ -43,7 +43,7 @@ def clicks(pointer: Pointer) -> dict[int, Address]:
     """Return the anchor that a user is given for each thing."""
     source = pointer.footage.posed.source
     ids = [o.id for o in pointer.found.objects]
-    views = choose_views(pointer.found.id_maps, ids, pointer.footage.lens)
+    views = choose_views(pointer.found.id_maps, ids, [pointer.footage.lens] * len(pointer.found.id_maps))
     out = {}
     for number, (row, x, y) in views.anchors.items():
         frame = int(pointer.footage.posed.indices[row])

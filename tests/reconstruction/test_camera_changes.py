@@ -10,7 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from reconstruction.frames import FRAMES_PRESETS, load_frames
 from reconstruction.poses import POSES_PRESETS, estimate_poses
+from reconstruction.poses.lens import Lens
+from reconstruction.poses.moving_crop import resect
 from reconstruction.poses.rolling_shutter import Motion, Shutter, moved, row_times
+from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import _scale_changes, longest_run
 from synthetic.camera_paths import handheld_path, pan_path, phone_camera
 from synthetic.film import film_room, prepare
@@ -78,6 +81,45 @@ def test_a_straightened_frame_is_that_of_one_pose(film_set):
         for x in (bent[row], straight)
     )
     assert after < 0.6 * before, (after, before)
+
+
+@pytest.mark.unit
+def test_resection_finds_the_principal_point_beside_the_pose():
+    import pycolmap
+
+    camera = pycolmap.Camera.create_from_model_name(1, "RADIAL", 400.0, 480, 360)
+    camera.params = [400.0, 240.0, 180.0, -0.05, 0.01]
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-1.5, -1.0, 2.0], [1.5, 1.0, 5.0], (200, 3))
+    true = np.array([9.0, -6.0])
+    pixels = np.asarray(camera.img_from_cam(points)) + true + rng.normal(0, 0.3, (200, 2))
+    pixels[:20] += rng.uniform(20, 60, (20, 2))  # wrong matches
+    from_wrong_pose = Rotation.from_rotvec([0.01, 0.02, -0.01]).apply(points) + [0.02, -0.01, 0.03]
+    assert np.abs(resect(camera, from_wrong_pose, pixels, np.zeros(2)) - true).max() < 1.5
+
+
+@pytest.mark.unit
+def test_images_of_a_moving_crop_become_those_of_one_camera():
+    import pycolmap
+
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 150.0, 160, 120)
+    u, v = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
+    offsets = np.array([[6.0, -4.0], [0.0, 0.0], [-5.0, 3.5]])
+
+    def picture(offset: np.ndarray) -> np.ndarray:
+        gray = 128 + 60 * np.sin((u - offset[0]) / 9) * np.cos((v - offset[1]) / 7)
+        return np.repeat(gray[..., None], 3, axis=2).round().astype(np.uint8)
+
+    images = np.stack([picture(offset) for offset in offsets])
+    pinhole, (straight,), distorted = undistort(camera, [images], [offsets])
+    assert 150 < pinhole.fx < 180
+    assert np.abs(straight.astype(int) - straight[1]).max() <= 3
+    lens = Lens(pinhole, distorted, (np.array([10, 20, 30]), offsets))
+    seen = [
+        lens.at(frame).straightened(np.array([[80.0, 60.0]]) + o)[0]
+        for frame, o in zip((10, 20, 33), offsets)
+    ]
+    assert np.allclose(seen, [80.0, 60.0])
 
 
 @pytest.mark.unit

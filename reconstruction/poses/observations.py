@@ -1,0 +1,72 @@
+"""The observed points of a model: where each frame shows them, to be moved and compared with their projections."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
+from reconstruction.poses.mapping import poses_of
+from reconstruction.poses.refine import LOSS_SCALE_PX
+
+_TRIAL_POINTS = 1500  # with the longest tracks, that trials of a model keep
+
+
+def project(camera: ColmapCamera, points: np.ndarray) -> np.ndarray:
+    """Project points (k, 3) of camera space to pixels (k, 2); points behind the camera become NaN."""
+    return np.asarray(camera.img_from_cam(points))
+
+
+class Observations:
+    """The observed points of a model, by frame row."""
+
+    def __init__(self, model: Reconstruction) -> None:
+        """Keep the pixels as observed."""
+        self.model = model
+        self.rows = sorted(i - 1 for i in model.reg_image_ids())
+        self.camera = model.cameras[min(model.cameras)]
+        self.indices, self.pixels = {}, {}
+        for row in self.rows:
+            points = model.image(row + 1).points2D
+            self.indices[row] = [k for k, p in enumerate(points) if p.has_point3D()]
+            self.pixels[row] = np.array([points[k].xy for k in self.indices[row]]).reshape(-1, 2)
+
+    def place(self, offsets: Mapping[int, np.ndarray]) -> None:
+        """Put the observed points of each frame at their pixels less an offset, (2,) or (k, 2)."""
+        for row in self.rows:
+            image = self.model.image(row + 1)
+            for index, pixel in zip(self.indices[row], self.pixels[row] - offsets[row]):
+                image.point2D(index).xy = pixel
+
+    def points_in_camera(self, row: int, world_from_camera: np.ndarray) -> np.ndarray:
+        """Return the observed points (k, 3) of a frame in its camera space."""
+        image = self.model.image(row + 1)
+        points = np.array(
+            [self.model.point3D(image.point2D(k).point3D_id).xyz for k in self.indices[row]]
+        ).reshape(-1, 3)
+        return (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+
+    def cost(self) -> float:
+        """Return the mean Cauchy loss of the reprojection errors, relative to its scale."""
+        poses, total, count = poses_of(self.model), 0.0, 0
+        for row in self.rows:
+            image = self.model.image(row + 1)
+            seen = project(self.camera, self.points_in_camera(row, poses[row]))
+            given = np.array([image.point2D(k).xy for k in self.indices[row]]).reshape(-1, 2)
+            error = ((seen - given) ** 2).sum(1)
+            total += float(np.nansum(np.log1p(error / LOSS_SCALE_PX**2)))
+            count += len(error)
+        return total / max(count, 1)
+
+
+def thinned(model: Reconstruction, folder: Path) -> Reconstruction:
+    """Return a copy of a model with its points of the longest tracks; `folder` receives the model."""
+    import pycolmap
+
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)
+    thin = pycolmap.Reconstruction(folder)
+    by_length = sorted(thin.point3D_ids(), key=lambda i: (-thin.point3D(i).track.length(), i))
+    for point_id in by_length[_TRIAL_POINTS:]:
+        thin.delete_point3D(point_id)
+    return thin
