@@ -94,7 +94,7 @@ def test_resection_finds_the_principal_point_beside_the_pose():
     true = np.array([9.0, -6.0])
     pixels = np.asarray(camera.img_from_cam(points)) + true + rng.normal(0, 0.3, (200, 2))
     pixels[:20] += rng.uniform(20, 60, (20, 2))  # wrong matches
-    from_wrong_pose = Rotation.from_rotvec([0.01, 0.02, -0.01]).apply(points) + [0.02, -0.01, 0.03]
+    from_wrong_pose = Rotation.from_rotvec([0.01, 0.02, -0.01]).apply(points) + np.array([0.02, -0.01, 0.03])
     assert np.abs(resect(camera, from_wrong_pose, pixels, np.zeros(2)) - true).max() < 1.5
 
 
