@@ -18,8 +18,9 @@ from reconstruction.core.compiling import compilation_shown
 from reconstruction.core.plugins import plugins_of
 from reconstruction.core.profiling import Usage, UsageMeter
 from reconstruction.core.progress import NO_PROGRESS, Progress, StageListener
-from reconstruction.core.types import DepthMaps, InstanceSet, PosedFrames
+from reconstruction.core.types import DepthMaps, InstanceSet, PosedFrames, WorldFrame
 from reconstruction.editing.anchors import Footage, Pointer
+from reconstruction.editing.film import Film
 from reconstruction.editing.overrides import Overrides
 from reconstruction.pipeline import STAGE_NAMES, STAGES, Call, Stage, in_world, view_scene
 from reconstruction.poses.lens import Lens
@@ -31,6 +32,13 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 _PIPELINE = Path(__file__).with_name("pipeline.py")
 _EDITING = "reconstruction.editing.corrections"
+_EDITING_WORLD = (
+    "reconstruction.editing.world_frame"  # apart, so that the code of later stages is no part of its key
+)
+_REDONE = (
+    "world",
+    "assembly",
+)  # corrections run these again, which repeats their notes; the others change a result
 
 
 @dataclass
@@ -53,7 +61,12 @@ class Run:
     after_stage: "Callable[[Run, str], None] | None" = None  # called with the name of each computed stage
 
     def __post_init__(self) -> None:
-        """Compute the digest of the input."""
+        """Compute the digest of the input.
+
+        Raises:
+            UsageError: overrides and config contradict each other.
+        """
+        self.overrides.check_lengths(self.config)
         self.input_digest = self.input_digest or digest_input(self.video)
 
     def execute(self, until: str = STAGE_NAMES[-1]) -> None:
@@ -103,7 +116,7 @@ class Run:
         """Return the lookup of things and places that overrides refer to."""
         posed, depth = self.in_world()
         surface = self.results["surface"]
-        return Pointer(found, surface, Footage(posed, depth, surface, self.lens()))
+        return Pointer(found, surface, Footage(posed, depth, self.lens(), surface))
 
     def _execute_stage(self, stage: Stage, wanted: tuple[str, ...]) -> None:
         number = STAGE_NAMES.index(stage.name) + 1  # prefix of its folder
@@ -126,6 +139,8 @@ class Run:
             note if note.startswith(f"{stage.name}:") else f"{stage.name}: {note}"
             for note in manifest["notes"]
         )
+        if stage.name == "world":
+            self._note_coordinates()
         self.listener.end_stage(stage.name, None if kept else self.usage[stage.name])
         if self.after_stage is not None and not kept:
             self.after_stage(self, stage.name)
@@ -141,7 +156,7 @@ class Run:
             code_digest("reconstruction.core.artifacts"),
         ]
         if corrections:
-            code.append(code_digest(_EDITING))
+            code.append(code_digest(_EDITING_WORLD if stage.name == "world" else _EDITING))
         plugins = [(str(plugin), plugin.digest()) for plugin in plugins_of(stage.option_group, options)]
         inputs = (options, corrections, stage.outside(options), plugins, said_by_truth)
         return fingerprint(stage.name, code, inputs, upstream)
@@ -156,7 +171,7 @@ class Run:
         before: dict | None = None,
     ) -> None:
         """Compute and save a result; `before`: manifest of the uncorrected result that it is computed from."""
-        notes = list(before["notes"]) if before else []
+        notes = list(before["notes"]) if before and stage.name not in _REDONE else []
         with UsageMeter() as meter:
             result = make(_NoteTaker(shown, notes))
         usage = meter.usage if before is None else Usage(**before["usage"]).followed_by(meter.usage)
@@ -173,15 +188,35 @@ class Run:
             self._keep(number, stage, plain_key, lambda noted: self._compute(stage, noted), shown)
         plain = self.store.load(stage.produces, number, stage.name, plain_key)
         before = self.store.manifest(number, stage.name, plain_key)
-        pointer = self.pointer(plain if stage.name == "instances" else self.results["instances"])
 
         def make(progress: Progress) -> Any:
+            if stage.name == "world":
+                return self._corrected_world(plain, progress)
+            pointer = self.pointer(plain if stage.name == "instances" else self.results["instances"])
             done = {name: self.results[name] for name in self.needs_of(stage)}
             return corrected(
                 stage.name, plain, done, self.options_of(stage), self.overrides, pointer, progress
             )
 
         self._keep(number, stage, key, make, shown, before)
+
+    def _corrected_world(self, plain: WorldFrame, progress: Progress) -> WorldFrame:
+        """Return the world frame with the user's scale, up direction and floor."""
+        from reconstruction.editing.world_frame import corrected_world
+
+        film = Film(self.results["poses"], self.results["depth"], self.lens())
+        return corrected_world(plain, self.overrides.scene_entries(), film, self.config.world, progress)
+
+    def _note_coordinates(self) -> None:
+        """Note the entries whose coordinates count in the world frame that other entries make."""
+        moved = self.overrides.entries_in_metres()
+        if moved and self.overrides.of_stage("world"):
+            note = (
+                f"world: coordinates in entries {', '.join(map(str, moved))} of the overrides file count in the world "
+                "frame that the file makes; check them if its scale, up or floor is new"
+            )
+            self.notes.append(note)
+            self.listener.note(note)
 
     def _compute(self, stage: Stage, progress: Progress) -> Any:
         scratch = self.store.scratch(stage.name)

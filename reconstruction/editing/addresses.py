@@ -98,17 +98,19 @@ def vector(value: Any, where: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _click(value: Any, where: str) -> Address:
-    def number(x: Any) -> bool:
-        return isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x)
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
 
+
+def _click(value: Any, where: str) -> Address:
     size = value.get("size") if isinstance(value, dict) else None
     if (
         not isinstance(value, dict)
         or not {"frame", "x", "y"} <= set(value) <= {"frame", "x", "y", "size"}
-        or not all(number(value[k]) for k in ("frame", "x", "y"))
+        or not all(is_number(value[k]) for k in ("frame", "x", "y"))
         or value["frame"] != int(value["frame"])
-        or not (size is None or (isinstance(size, list) and len(size) == 2 and all(map(number, size))))
+        or not (size is None or (isinstance(size, list) and len(size) == 2 and all(map(is_number, size))))
     ):
         raise UsageError(
             f"{where}: pixel needs {{frame: N, x: X, y: Y}}, the video's frame number and a pixel in it "

@@ -4,89 +4,27 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
-from reconstruction.core.types import BaseEntity, DepthMaps, Instance, InstanceSet, PosedFrames, Surface
+from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Surface
 from reconstruction.editing.addresses import Address
+from reconstruction.editing.film import Film
 from reconstruction.instances.id_maps import seen_vertices
-from reconstruction.poses.lens import Lens
 from registry.errors import UsageError
 
 NEAR_M = 0.3  # largest distance of `near` to the object's box
 AT_M = 0.05  # largest distance of `at` to the object's surface
 _REACH_PX = 2.0  # a click may miss the object by this many pixels at depth resolution
-_GAP_S = 1.0  # cameras are interpolated between posed frames at most this far apart
 
 
 @dataclass(frozen=True)
-class Footage:
-    """The film as clicks need it: frames with cameras, the surface, and the lens distortion."""
+class Footage(Film):
+    """The film in world space with the surface that was reconstructed from it."""
 
-    posed: PosedFrames  # world space
-    depth: DepthMaps  # only its camera is used, at the resolution of the id maps
     surface: Surface
-    lens: Lens
-
-    def camera_of(self, frame: int) -> tuple[int | None, np.ndarray]:
-        """Return the row (None if it is no keyframe) and world_from_camera of a video frame.
-
-        Between posed frames less than a second apart the pose is interpolated.
-
-        Raises:
-            UsageError: the camera of that frame is not known.
-        """
-        posed = self.posed
-        row = np.flatnonzero(np.asarray(posed.indices) == frame)
-        if len(row):
-            return int(row[0]), np.asarray(posed.world_from_camera[row[0]])
-        known = np.concatenate([posed.indices, posed.held_out_indices])
-        poses = np.concatenate([posed.world_from_camera, posed.held_out_world_from_camera.reshape(-1, 4, 4)])
-        exact = np.flatnonzero(known == frame)
-        if len(exact):
-            return None, poses[exact[0]]
-        order = np.argsort(known, kind="stable")
-        after = int(np.searchsorted(known[order], frame))
-        if posed.ordered and 0 < after < len(known):
-            a, b = order[after - 1], order[after]
-            if known[b] - known[a] <= _GAP_S * posed.source.fps:
-                share = float((frame - known[a]) / (known[b] - known[a]))
-                return None, _between(poses[a], poses[b], share)
-        nearest = sorted(sorted(known.tolist(), key=lambda k: abs(k - frame))[:6])
-        raise UsageError(
-            f"overrides: no camera is known of frame {frame} (the film has {posed.source.frame_count}); "
-            f"the nearest with one are {', '.join(map(str, nearest))}"
-        )
-
-    def depth_pixel(self, address: Address) -> np.ndarray:
-        """Return the pixel x, y (2,) of a click in the undistorted frame at depth resolution.
-
-        Raises:
-            UsageError: it lies outside of the frame, or in the margin that undistortion cuts off.
-        """
-        width, height = address.size or (self.posed.source.width, self.posed.source.height)
-        x, y = address.pixel
-        if not (0 <= x <= width and 0 <= y <= height):
-            raise UsageError(f"overrides: {address} lies outside the frame of {width} x {height} pixels")
-        filmed, camera = self.lens.camera, self.depth.camera
-        working = np.array([[x / width * filmed.width, y / height * filmed.height]])
-        scale = np.array([camera.width / filmed.width, camera.height / filmed.height])
-        pixel = self.lens.at(address.frame).straightened(working)[0] * scale
-        if not ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all():
-            raise UsageError(f"overrides: {address} lies in the margin that lens undistortion cuts off")
-        return np.minimum(pixel, [camera.width - 1e-6, camera.height - 1e-6])
 
     def seen_vertices(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Return the surface vertex int32 (h, w) at each pixel at depth resolution, -1 = none."""
         return seen_vertices(self.surface, self.depth.camera, world_from_camera)[0]
-
-
-def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
-    """Interpolate two poses (4, 4)."""
-    out = np.eye(4)
-    turns = Rotation.from_matrix(np.stack([a[:3, :3], b[:3, :3]]))
-    out[:3, :3] = Slerp([0, 1], turns)([share]).as_matrix()[0]
-    out[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
-    return out
 
 
 @dataclass(frozen=True)

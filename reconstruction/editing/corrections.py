@@ -16,7 +16,7 @@ def corrected(
     """Return the result of a stage with the user's corrections.
 
     Args:
-        stage: name of the stage, a key of `overrides.ACTIONS`.
+        stage: name of the stage, a key of `entries.ACTIONS` after `world` (see `world_frame.corrected_world`).
         plain: its result without corrections.
         results: results of the stages that it reads.
         options: its config.
@@ -30,7 +30,7 @@ def corrected(
     if stage == "instances":
         return overrides.apply_to_instances(pointer)
     if stage == "assets":
-        return overrides.apply_to_assets(plain, pointer)
+        return overrides.apply_to_assets(plain, pointer, progress)
     if stage == "scene_graph":
         return overrides.apply_to_graph(plain, results["assets"], pointer)
     assets, graph = results["assets"], results["scene_graph"].plain()

@@ -1,6 +1,6 @@
 """The world stage: compose gravity, yaw, floor and scale into one similarity transform."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,7 +8,8 @@ from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.core.types import DepthMaps, PosedFrames, ScaleEstimate, WorldFrame
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.floor import Floor, find_floor, lowest_height
-from reconstruction.world.gravity import find_gravity
+from reconstruction.world.gravity import Gravity, find_gravity
+from reconstruction.world.planes import fit_planes
 from reconstruction.world.request import parse_scale
 from reconstruction.world.samples import SurfaceSamples, sample_surface
 from reconstruction.world.scale import Metres, camera_heights, find_scale
@@ -19,15 +20,31 @@ _USER_OBJECT_SIGMA = 0.03  # relative standard deviation of a scale from `--scal
 _CLEARANCE_M = 0.05  # an unseen floor is assumed at least this far below all seen surface
 
 
+@dataclass(frozen=True)
+class Known:
+    """Parts of the world frame that the user said, in `sfm` space; None: they are estimated."""
+
+    up: np.ndarray | None = None  # float64 (3,) unit
+    up_method: str = ""  # as `WorldFrame.gravity_method`
+    up_sigma_deg: float = 0.0  # standard deviation
+    floor: np.ndarray | None = None  # float64 (3,), a point of the floor
+    metres: Metres | None = None
+
+
+NOTHING_KNOWN = Known()
+
+
 def find_world(
-    posed: PosedFrames, depth: DepthMaps, config: WorldConfig, *, progress: Progress = NO_PROGRESS
-) -> WorldFrame:
+    posed: PosedFrames, depth: DepthMaps, config: WorldConfig, *, known: Known = NOTHING_KNOWN,
+    progress: Progress = NO_PROGRESS,
+) -> WorldFrame:  # fmt: skip
     """Estimate the similarity from `sfm` to `world`: metres, +z up, walls along x and y, floor at z = 0.
 
     Args:
         posed: keyframes with cameras in `sfm` space.
         depth: their depth maps in `sfm` units.
         config: settings.
+        known: parts of the result that are taken as given.
         progress: receives steps, decisions and fallbacks.
 
     Raises:
@@ -37,7 +54,7 @@ def find_world(
     progress.start(4, "world frame")
     samples = sample_surface(posed, depth, config)
     progress.advance()
-    gravity = find_gravity(posed, samples)
+    gravity = find_gravity(posed, samples) if known.up is None else _given_gravity(known, known.up, samples)
     progress.advance()
     rotation = level_rotation(gravity.up)
     upright = rotate_samples(samples, rotation)
@@ -45,9 +62,11 @@ def find_world(
     yaw_rad, snapped = find_yaw(upright, posed.world_from_camera[:, :3, 2] @ rotation.T, walls)
     turn = turn_about_z(yaw_rad)
     upright, rotation = rotate_samples(upright, turn), turn @ rotation
-    floor = find_floor(upright)
+    floor = (
+        find_floor(upright) if known.floor is None else Floor(float(rotation[2] @ known.floor), True, False)
+    )
     progress.advance()
-    metres = find_scale(posed, depth, upright, floor, config, progress)
+    metres = known.metres or find_scale(posed, depth, upright, floor, config, progress)
     world_from_sfm = np.eye(4)
     world_from_sfm[:3, :3] = metres.per_unit * rotation
     middle = np.median(upright.points[:, :2], axis=0)
@@ -71,6 +90,11 @@ def find_world(
     )
     progress.advance()
     return _apply_object_request(world, config, progress)
+
+
+def _given_gravity(known: Known, up: np.ndarray, samples: SurfaceSamples) -> Gravity:
+    """Return gravity as the user said it, with the planes that are level and plumb under it."""
+    return Gravity(up, known.up_method, known.up_sigma_deg, fit_planes(samples, up))
 
 
 def floor_height(upright: SurfaceSamples, floor: Floor, metres: Metres, config: WorldConfig) -> float:

@@ -14,6 +14,8 @@ _CELL_SHARE = 0.04  # side of the cells that measure area, as a share of the med
 _MIN_CELLS = 40  # smallest area of a plane
 _NORMAL_DEG = 15.0  # largest angle between normals and the plane's expected direction
 _MAX_PLANES = 6  # per direction
+_PATCH_SHARES = (0.05, 0.08, 0.12, 0.2, 0.3, 0.5)  # radii of a growing patch, as shares of the median depth
+_MIN_PATCH = 30  # samples of a patch; a plane fitted to fewer follows the noise of single windows
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,41 @@ def fit_planes(samples: SurfaceSamples, up: np.ndarray) -> tuple[FittedPlane, ..
         near = np.abs(samples.normals @ direction) > np.cos(tolerance)
         found += _peel(samples, near, direction, False, depth)
     return tuple(found)
+
+
+def plane_around(samples: SurfaceSamples, point: np.ndarray) -> FittedPlane | None:
+    """Fit a plane of any direction to the surface samples around a point, by growing a patch and fitting again.
+
+    Args:
+        samples: the sampled surface.
+        point: (3,) on the surface, `sfm` space.
+
+    Returns:
+        The plane, its normal towards the cameras, `level` without meaning; None where too little flat surface was seen.
+    """
+    depth = float(np.median(samples.depths))
+    away = np.linalg.norm(samples.points - point, axis=1)
+    nearest = np.argsort(away, kind="stable")[:_MIN_PATCH]
+    if len(nearest) < _MIN_PATCH or away[nearest[-1]] > _PATCH_SHARES[1] * depth:
+        return None
+    normal = np.median(samples.normals[nearest], axis=0)
+    normal /= max(float(np.linalg.norm(normal)), 1e-12)
+    through, rows = point, nearest
+    for share in _PATCH_SHARES:
+        flat = np.abs((samples.points - through) @ normal) < 2 * _BAND_SHARE * depth
+        facing = samples.normals @ normal > np.cos(np.radians(_NORMAL_DEG))
+        rows = np.flatnonzero(flat & facing & (away < share * depth))
+        if len(rows) < _MIN_PATCH:
+            if share > _PATCH_SHARES[1]:
+                return None
+            continue
+        normal, offset = _weighted_plane(samples.points[rows], samples.weights[rows], normal)
+        through = point + (offset - normal @ point) * normal
+    if len(rows) < _MIN_PATCH:
+        return None
+    area = covered_area(samples.points[rows], normal, _CELL_SHARE * depth)
+    sigma = _scatter_deg(samples, rows, normal, normal)
+    return FittedPlane(normal, float(normal @ through), True, area, sigma)
 
 
 def _peel(

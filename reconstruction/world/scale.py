@@ -209,17 +209,30 @@ def distance_between_pixels(
             raise UsageError(
                 f"--scale distance: pixel ({x:g}, {y:g}) lies outside the video, which is {width} x {height}"
             )
-        z, spread = _depth_at(x, y, view, poses[hit[0]], request.frame, posed, depth)
-        ends.append((view.unproject(x, y, z), spread))
-    length = float(np.linalg.norm(ends[0][0] - ends[1][0]))
-    noise = np.hypot(ends[0][1], ends[1][1]) / max(length, 1e-12)
+        found = depth_at(x, y, view, poses[hit[0]], request.frame, posed, depth)
+        if found is None:
+            raise InputError(
+                f"--scale distance: there is no depth at pixel ({x:g}, {y:g}) of frame {request.frame}; "
+                "choose a textured point"
+            )
+        ends.append((view.unproject(x, y, found[0]), found[1]))
+    return measured_length(*ends)
+
+
+def measured_length(a: tuple[np.ndarray, float], b: tuple[np.ndarray, float]) -> tuple[float, float]:
+    """Return the distance of two measured points (3,), given with standard errors, and its relative sigma."""
+    length = float(np.linalg.norm(a[0] - b[0]))
+    noise = np.hypot(a[1], b[1]) / max(length, 1e-12)
     return length, float(np.hypot(_USER_DISTANCE_SIGMA, noise))
 
 
-def _depth_at(
+def depth_at(
     x: float, y: float, view: Camera, world_from_view: np.ndarray, frame: int, posed: PosedFrames, depth: DepthMaps
-) -> tuple[float, float]:  # fmt: skip
-    """Return the z-depth at a pixel of `view` and its standard error, from points of nearby keyframes reprojected."""
+) -> tuple[float, float] | None:  # fmt: skip
+    """Return the z-depth at a pixel of `view` and its standard error, from points of nearby keyframes reprojected.
+
+    None: there is no depth near this pixel.
+    """
     view_from_world = invert_rigid(world_from_view)
     rows = np.argsort(np.abs(posed.indices - frame), kind="stable")[:_NEIGHBOURS]
     radius = _SEARCH_PX * max(view.width / depth.camera.width, 1.0)
@@ -239,10 +252,7 @@ def _depth_at(
             break
     near = np.concatenate(found)
     if len(near) == 0:
-        raise InputError(
-            f"--scale distance: there is no depth at pixel ({x:g}, {y:g}) of frame {frame}; "
-            "choose a textured point"
-        )
+        return None
     # Points behind the nearest surface are occluded.
     front = near[near < 1.05 * np.quantile(near, 0.1)]
     z = float(np.median(front))

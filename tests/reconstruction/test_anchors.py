@@ -31,7 +31,7 @@ def cut(posed, depth, voxel_size_m: float) -> Pointer:
     surface = fuse_surface(posed, depth, config, progress=NO_PROGRESS)
     found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
     lens = Lens.of(posed)
-    return Pointer(found, surface, Footage(posed, depth, surface, lens))
+    return Pointer(found, surface, Footage(posed, depth, lens, surface))
 
 
 @pytest.fixture(scope="module")

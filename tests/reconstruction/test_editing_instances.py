@@ -29,7 +29,7 @@ def scene():
     posed, depth = frames_of(surface, 320, 240)
     found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
     assert len(found.objects) == 3
-    return surface, posed, Footage(posed, depth, surface, Lens.of(posed)), found
+    return surface, posed, Footage(posed, depth, Lens.of(posed), surface), found
 
 
 def consistent(found) -> bool:

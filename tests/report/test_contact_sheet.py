@@ -52,7 +52,7 @@ def pointer_into(stages) -> Pointer:
     posed, depth = stages.in_world()
     surface = stages.get("surface")
     lens = Lens.of(stages.get("poses"))
-    return Pointer(stages.get("instances"), surface, Footage(posed, depth, surface, lens))
+    return Pointer(stages.get("instances"), surface, Footage(posed, depth, lens, surface))
 
 
 def test_later_stages_take_clicks_too(sheet, reconstructed):
