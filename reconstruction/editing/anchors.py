@@ -95,6 +95,9 @@ class Pointer:
             return self._guarded(address)
         if address.kind == "at":
             return self._at(np.asarray(address.at), base_too)
+        bare = self._bare(address)
+        if bare:
+            return bare
         ids, pixel = self._ids(address.frame), self._film.depth_pixel(address)
         hit = int(ids[int(pixel[1]), int(pixel[0])])
         if hit in self._things or (base_too and hit):
@@ -103,6 +106,23 @@ class Pointer:
         disk = np.hypot(columns - pixel[0], rows - pixel[1]) <= _REACH_PX
         near = ids[disk & np.isin(ids, list(self._things))]
         return int(np.bincount(near).argmax()) if len(near) else hit
+
+    def _bare(self, address: Address) -> int:
+        """Return the id of the nearest box without surface and pixels (`add` of a glass) at a click, 0 without any.
+
+        It counts before the surface behind it, which shows through.
+        """
+        drawn = {*np.unique(self.found.vertex_instance).tolist(), *np.unique(self.found.id_maps).tolist()}
+        bare = [item for item in self.found.objects if item.id not in drawn]
+        if not bare:
+            return 0
+        pixel, pose = self._film.depth_pixel(address), self._film.camera_of(address.frame)[1]
+        ray = pose[:3, :3] @ self._film.depth.camera.unproject(pixel[0], pixel[1], 1.0)
+        vertex = self._film.seen_vertices(pose)[int(pixel[1]), int(pixel[0])]
+        wall = np.inf if vertex < 0 else float((self.surface.vertices[vertex] - pose[:3, 3]) @ pose[:3, 2])
+        entered = {item.id: _entry(item, pose[:3, 3], ray) for item in bare}
+        number = min(entered, key=entered.__getitem__)
+        return number if entered[number] < wall else 0
 
     def _guarded(self, address: Address) -> int:
         """Return the id of an address after a check of its guard `near`."""
@@ -196,7 +216,20 @@ def _nearest_pixel(mask: np.ndarray, pixel: np.ndarray) -> tuple[int, int, float
 
 
 def _in_box(item: Instance, point: np.ndarray) -> bool:
+    return bool((np.abs(_to_box(item) @ (point - item.center)) <= 0.5 * np.asarray(item.extents_m)).all())
+
+
+def _to_box(item: Instance) -> np.ndarray:
+    """Return the rotation (3, 3) from the world to the axes of an object's box."""
     c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
-    offset = point - item.center
-    local = np.array([c * offset[0] + s * offset[1], -s * offset[0] + c * offset[1], offset[2]])
-    return bool((np.abs(local) <= 0.5 * np.asarray(item.extents_m)).all())
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0, 0, 1.0]])
+
+
+def _entry(item: Instance, eye: np.ndarray, ray: np.ndarray) -> float:
+    """Return how far along a ray (3,), in lengths of it, it enters an object's box; infinity if it misses."""
+    start, along = _to_box(item) @ (eye - item.center), _to_box(item) @ ray
+    along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    half = 0.5 * np.asarray(item.extents_m)
+    ends = np.sort(np.stack([(-half - start) / along, (half - start) / along]), axis=0)
+    near, far = float(ends[0].max()), float(ends[1].min())
+    return near if 0 < near <= far else np.inf

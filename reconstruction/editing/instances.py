@@ -1,4 +1,4 @@
-"""Corrections of the instances: relabel, drop, merge, split, make base."""
+"""Corrections of the instances: add, relabel, drop, merge, split, make base."""
 
 from dataclasses import replace
 
@@ -6,9 +6,11 @@ import numpy as np
 
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, Surface
+from reconstruction.editing.adding import add_thing
 from reconstruction.editing.addresses import KINDS, parse_address, parse_addresses, parse_parts, vector
 from reconstruction.editing.anchors import Footage, Pointer
 from reconstruction.editing.clicked_split import grown_parts, split_maps
+from reconstruction.editing.outlines import parse_add
 from reconstruction.instances.base import BASE_LABELS
 from reconstruction.instances.boxes import UprightBox, upright_box
 from reconstruction.instances.labels import coarse_label, shape_facts
@@ -29,13 +31,18 @@ def apply_overrides(
         found: the instances to correct.
         surface: the surface that was segmented.
         overrides: the entries; those of other stages are ignored.
-        footage: frames and cameras; needed by clicks and by `split`, which also changes the id maps.
+        footage: frames and cameras; needed by clicks, and by `split` and `add`, which also change the id maps.
 
     Raises:
         UsageError: an entry addresses a missing object, or its change is impossible.
     """
     for entry in overrides:
         pointer = Pointer(found, surface, footage)
+        if "add" in entry:
+            if footage is None:
+                raise ValueError("`add` needs the footage that the outlines were drawn in")
+            found = add_thing(found, surface, footage, parse_add(entry["add"], "overrides: add"))
+            continue
         if "merge" in entry:
             found = _merge(found, surface, _merged_things(pointer, entry["merge"]))
             continue

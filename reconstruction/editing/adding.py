@@ -1,0 +1,194 @@
+"""Add an object that the segmentation missed, from outlines that the user drew: `add` of an overrides file."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from reconstruction.core.mesh_graph import MeshGraph
+from reconstruction.core.rasterize import rasterize_mesh
+from reconstruction.core.types import Camera, Instance, InstanceSet, Surface
+from reconstruction.editing.anchors import Footage
+from reconstruction.editing.outlined_hull import Cone, box_between
+from reconstruction.editing.outlines import Added, Outline
+from reconstruction.instances.contacts import carriers
+from reconstruction.instances.cut import Thing
+from reconstruction.instances.describe import describe
+from registry.errors import UsageError
+from registry.geometry import invert_rigid, transform_points
+
+_FINE = 4  # outlines are filled at this multiple of depth resolution
+_COVERED = 0.25  # least share of an outline that its own surface fills; with less, its size says little of the thing's
+_GOES_ON = (
+    0.5  # a plane of which more than this share of the seen part is outside of an outline is background
+)
+_DEEPER = 1.5  # largest depth behind the front, relative to the size across
+_SAME_THING = 0.5  # an existing object with more than this share of its surface inside is the outlined thing
+_PIECE = 0.1  # least size of a connected piece, relative to the largest
+_HUNG_M, _FOOT_M = (
+    0.05,
+    0.05,
+)  # to a wall: largest distance of what hangs on it; above the floor: of what stands on it
+
+
+@dataclass(frozen=True)
+class _View:
+    """One outline in its frame, and where the surface appears there."""
+
+    outline: Outline
+    world_from_camera: np.ndarray  # (4, 4)
+    polygon: np.ndarray  # (k, 2) pixels at depth resolution
+    area_px: float
+    inside: np.ndarray  # bool (v,) vertices that project into the outline
+    visible: np.ndarray  # bool (v,) vertices in front of the camera, in its image, and not hidden
+    depth: np.ndarray  # (v,) z-depth
+
+
+def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Added) -> InstanceSet:
+    """Return the instances with one more object, which has the next free id.
+
+    Its surface is what lies inside the outlines. Without any, two outlines give it a box and no surface.
+
+    Args:
+        found: the instances.
+        surface: the surface that was segmented.
+        footage: frames and cameras.
+        added: label and outlines.
+
+    Raises:
+        UsageError: the outlines show no surface of their own and give no box, or an object that exists.
+    """
+    graph = MeshGraph.from_surface(surface)
+    views = [_view(outline, surface, footage, graph) for outline in added.outlines]
+    chosen = _own_surface(graph, surface, views)
+    number = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
+    shown = _share_shown(chosen, views, surface, footage)
+    if shown < _COVERED:
+        cones = [Cone(view.world_from_camera, view.polygon, view.outline) for view in views]
+        box = box_between(cones, footage.depth.camera, surface, found, added.label, shown)
+        item = Instance(number, added.label, 1.0, box.center, box.yaw_rad, box.extents_m, 0, False)
+        return replace(found, objects=(*found.objects, item))
+    _refuse_known(found, chosen, added)
+    item = _described(found, graph, chosen, number, added.label)
+    labels = np.array(found.vertex_instance)
+    labels[chosen] = number
+    maps = _drawn_into(found.id_maps, chosen, np.asarray(found.vertex_instance), number, footage)
+    return replace(found, vertex_instance=labels, id_maps=maps, objects=(*found.objects, item))
+
+
+def _view(outline: Outline, surface: Surface, footage: Footage, graph: MeshGraph) -> _View:
+    """Project the surface into the frame of an outline."""
+    pose = footage.camera_of(outline.frame)[1]
+    polygon = np.array([footage.depth_pixel(corner) for corner in outline.corners])
+    camera = footage.depth.camera
+    mask = _filled(polygon, camera)
+    local = transform_points(invert_rigid(pose), graph.points)
+    z = local[:, 2]
+    u, v = camera.project(np.column_stack([local[:, :2], np.maximum(z, 1e-6)]))
+    seen = (z > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    column, row = np.where(seen, u, 0).astype(int), np.where(seen, v, 0).astype(int)
+    drawn = rasterize_mesh(surface.vertices, surface.faces, camera, pose).depth
+    # The farthest of the neighboring pixels: vertices on silhouettes fall beside the pixels of their triangles.
+    far = cv2.dilate(drawn.astype(np.float32), np.ones((3, 3), np.uint8))[row, column]
+    visible = seen & ((far <= 0) | (z < far + 2 * graph.spacing_m))
+    fine = mask[(np.where(seen, v, 0) * _FINE).astype(int), (np.where(seen, u, 0) * _FINE).astype(int)] > 0
+    return _View(outline, pose, polygon, float(mask.sum()) / _FINE**2, seen & fine, visible, z)
+
+
+def _filled(polygon: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the mask uint8 (h * _FINE, w * _FINE) of a polygon."""
+    mask = np.zeros((camera.height * _FINE, camera.width * _FINE), np.uint8)
+    cv2.fillPoly(mask, [np.round(polygon * _FINE).astype(np.int32)], 1)
+    return mask
+
+
+def _own_surface(graph: MeshGraph, surface: Surface, views: list[_View]) -> np.ndarray:
+    """Return the vertices int (k,) inside all outlines, without planes that go on beyond one and what is far behind."""
+    inside = np.all([view.inside for view in views], axis=0)
+    front = inside & np.any([view.visible for view in views], axis=0)
+    background = np.zeros(len(inside), bool)
+    for plane in surface.planes:
+        if any(_goes_on(plane.vertices, view) for view in views):
+            background[plane.vertices] = True
+    front &= ~background
+    allowed = inside & ~background
+    for view in views:
+        if front.any():
+            across = np.ptp(graph.points[front], axis=0).max()
+            allowed &= view.depth < np.quantile(view.depth[front], 0.1) + _DEEPER * across
+    front &= allowed
+    edges = graph.edges_within(allowed)
+    count = len(inside)
+    links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    piece = connected_components(links, directed=False)[1]
+    sizes = np.bincount(piece[front], minlength=count)
+    large = sizes >= max(_PIECE * sizes.max(initial=0), 1)
+    return np.flatnonzero(allowed & large[piece])
+
+
+def _goes_on(members: np.ndarray, view: _View) -> bool:
+    seen = view.visible[members]
+    return bool(seen.any()) and (seen & ~view.inside[members]).sum() > _GOES_ON * seen.sum()
+
+
+def _share_shown(chosen: np.ndarray, views: list[_View], surface: Surface, footage: Footage) -> float:
+    """Return the share of the outlines' area in which the chosen surface is seen."""
+    mine = np.zeros(len(surface.vertices), bool)
+    mine[chosen] = True
+    shown = 0.0
+    for view in views:
+        seen = footage.seen_vertices(view.world_from_camera)
+        shown += float(((seen >= 0) & mine[seen]).sum())
+    return shown / max(sum(view.area_px for view in views), 1.0)
+
+
+def _refuse_known(found: InstanceSet, chosen: np.ndarray, added: Added) -> None:
+    """Raise UsageError if the outlines show an object that exists."""
+    owner = np.asarray(found.vertex_instance)
+    for item in found.objects:
+        whole = int((owner == item.id).sum())
+        if whole and (owner[chosen] == item.id).sum() > _SAME_THING * whole:
+            where = " and ".join(map(str, added.outlines))
+            raise UsageError(
+                f"overrides: add {added.label}: {where} shows {item.label} {item.id}, which is a thing already; "
+                "relabel that one, or split it"
+            )
+
+
+def _described(found: InstanceSet, graph: MeshGraph, chosen: np.ndarray, number: int, label: str) -> Instance:
+    """Return the object of these vertices with its box and its support."""
+    owner = np.asarray(found.vertex_instance).copy()
+    owner[chosen] = number
+    others = [o for o in found.objects if (owner == o.id).any()]
+    surfaces = [np.flatnonzero(owner == o.id) for o in others]
+    row = carriers(graph, [*surfaces, chosen])[-1]
+    under = Thing(surfaces[row]) if row >= 0 else None
+    thing = Thing(np.sort(chosen), under, attached=under is None and _hangs(found, graph, chosen))
+    numbers = np.zeros(len(owner), np.int32)
+    items = describe(graph, [thing] if under is None else [under, thing], found.base, numbers)
+    made = next(item for item in items if item.id == numbers[chosen[0]])
+    hint = others[row].id if row >= 0 else made.support_hint
+    return replace(made, id=number, label=label, label_confidence=1.0, support_hint=hint)
+
+
+def _hangs(found: InstanceSet, graph: MeshGraph, chosen: np.ndarray) -> bool:
+    """Return whether an object that nothing carries touches a wall and is above the floor."""
+    points = graph.points[chosen]
+    gaps = [points @ b.surface.plane[:3] + b.surface.plane[3] for b in found.base if b.label == "wall"]
+    return bool(points[:, 2].min() > _FOOT_M and any(np.percentile(gap, 5) < _HUNG_M for gap in gaps))
+
+
+def _drawn_into(
+    id_maps: np.ndarray, chosen: np.ndarray, before: np.ndarray, number: int, footage: Footage
+) -> np.ndarray:
+    """Return the id maps (n, h, w) with the pixels of the chosen surface set to `number`."""
+    maps = np.array(id_maps)
+    mine = np.zeros(len(before), bool)
+    mine[chosen] = True
+    replaced = {0, *np.unique(before[chosen]).tolist()}
+    for row, ids in enumerate(maps):
+        seen = footage.seen_vertices(np.asarray(footage.posed.world_from_camera[row]))
+        ids[(seen >= 0) & mine[seen] & np.isin(ids, list(replaced))] = number
+    return maps
