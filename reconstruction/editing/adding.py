@@ -21,9 +21,11 @@ from registry.geometry import invert_rigid, transform_points
 
 _FINE = 4  # outlines are filled at this multiple of depth resolution
 _COVERED = 0.25  # least share of an outline that its own surface fills; with less, its size says little of the thing's
-_GOES_ON = (
-    0.5  # a plane of which more than this share of the seen part is outside of an outline is background
-)
+_RING = 0.25  # width of the ring around an outline, relative to the root of its area
+_RING_PLANE = 0.1  # least share of the ring of a plane that goes on beyond the outline
+_PLANES, _TRIES = 4, 200  # most planes of a ring, and the vertices that propose them
+_FACES_ALIKE = 0.9  # least cosine between the normals of a plane and of vertices on it
+_LEAST_BAND_M = 0.008  # half thickness of a plane, unless the surface is sampled more coarsely
 _DEEPER = 1.5  # largest depth behind the front, relative to the size across
 _SAME_THING = 0.5  # an existing object with more than this share of its surface inside is the outlined thing
 _PIECE = 0.1  # least size of a connected piece, relative to the largest
@@ -42,6 +44,7 @@ class _View:
     polygon: np.ndarray  # (k, 2) pixels at depth resolution
     area_px: float
     inside: np.ndarray  # bool (v,) vertices that project into the outline
+    ring: np.ndarray  # bool (v,) vertices that are seen around the outline
     visible: np.ndarray  # bool (v,) vertices in front of the camera, in its image, and not hidden
     depth: np.ndarray  # (v,) z-depth
 
@@ -62,7 +65,7 @@ def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Add
     """
     graph = MeshGraph.from_surface(surface)
     views = [_view(outline, surface, footage, graph) for outline in added.outlines]
-    chosen = _own_surface(graph, surface, views)
+    chosen = _own_surface(graph, views)
     number = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
     shown = _share_shown(chosen, views, surface, footage)
     if shown < _COVERED:
@@ -93,8 +96,12 @@ def _view(outline: Outline, surface: Surface, footage: Footage, graph: MeshGraph
     # The farthest of the neighboring pixels: vertices on silhouettes fall beside the pixels of their triangles.
     far = cv2.dilate(drawn.astype(np.float32), np.ones((3, 3), np.uint8))[row, column]
     visible = seen & ((far <= 0) | (z < far + 2 * graph.spacing_m))
-    fine = mask[(np.where(seen, v, 0) * _FINE).astype(int), (np.where(seen, u, 0) * _FINE).astype(int)] > 0
-    return _View(outline, pose, polygon, float(mask.sum()) / _FINE**2, seen & fine, visible, z)
+    width = 2 * round(_RING * float(np.sqrt(mask.sum()))) + 1
+    around = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)))
+    fine = (np.where(seen, v, 0) * _FINE).astype(int), (np.where(seen, u, 0) * _FINE).astype(int)
+    inside = seen & (mask[fine] > 0)
+    ring = visible & (around[fine] > 0) & ~inside
+    return _View(outline, pose, polygon, float(mask.sum()) / _FINE**2, inside, ring, visible, z)
 
 
 def _filled(polygon: np.ndarray, camera: Camera) -> np.ndarray:
@@ -104,14 +111,13 @@ def _filled(polygon: np.ndarray, camera: Camera) -> np.ndarray:
     return mask
 
 
-def _own_surface(graph: MeshGraph, surface: Surface, views: list[_View]) -> np.ndarray:
+def _own_surface(graph: MeshGraph, views: list[_View]) -> np.ndarray:
     """Return the vertices int (k,) inside all outlines, without planes that go on beyond one and what is far behind."""
     inside = np.all([view.inside for view in views], axis=0)
     front = inside & np.any([view.visible for view in views], axis=0)
     background = np.zeros(len(inside), bool)
-    for plane in surface.planes:
-        if any(_goes_on(plane.vertices, view) for view in views):
-            background[plane.vertices] = True
+    for view in views:
+        background |= _on_planes_of(graph, view.ring)
     front &= ~background
     allowed = inside & ~background
     for view in views:
@@ -128,9 +134,34 @@ def _own_surface(graph: MeshGraph, surface: Surface, views: list[_View]) -> np.n
     return np.flatnonzero(allowed & large[piece])
 
 
-def _goes_on(members: np.ndarray, view: _View) -> bool:
-    seen = view.visible[members]
-    return bool(seen.any()) and (seen & ~view.inside[members]).sum() > _GOES_ON * seen.sum()
+def _on_planes_of(graph: MeshGraph, ring: np.ndarray) -> np.ndarray:
+    """Return the mask (v,) of the vertices that lie on planes of the ring around an outline.
+
+    Each plane is the best of those through single vertices of the ring along their normals; its vertices are removed
+    before the next is sought.
+    """
+    band = max(graph.spacing_m, _LEAST_BAND_M)
+    rest = np.flatnonzero(ring)
+    fewest = _RING_PLANE * len(rest)
+    out = np.zeros(len(ring), bool)
+    for _ in range(_PLANES):
+        if len(rest) < max(fewest, 3):
+            break
+        points, normals = graph.points[rest], graph.normals[rest]
+        tried = np.unique(np.linspace(0, len(rest) - 1, _TRIES).astype(int))
+        off = np.abs(points @ normals[tried].T - (points[tried] * normals[tried]).sum(axis=1))
+        on = (off < band) & (normals @ normals[tried].T > _FACES_ALIKE)
+        best = int(on.sum(axis=0).argmax())
+        members = on[:, best]
+        if members.sum() < fewest:
+            break
+        middle = points[members].mean(axis=0)
+        normal = np.linalg.svd(points[members] - middle, full_matrices=False)[2][2]
+        away = np.abs((graph.points - middle) @ normal)
+        alike = np.abs(graph.normals @ normal) > _FACES_ALIKE
+        out |= (away < 0.5 * band) | ((away < band) & alike)
+        rest = rest[~members]
+    return out
 
 
 def _share_shown(chosen: np.ndarray, views: list[_View], surface: Surface, footage: Footage) -> float:
