@@ -1,17 +1,22 @@
 """Scale, up direction and floor by the user: clicks on a generated room lead to its true world frame."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from reconstruction.cache import StageStore
+from reconstruction.config import PipelineConfig
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.core.types import DistortedCamera, WorldFrame
 from reconstruction.editing.film import Film
 from reconstruction.editing.overrides import Overrides
 from reconstruction.editing.world_frame import corrected_world
+from reconstruction.pipeline import STAGES
 from reconstruction.poses.lens import Lens
+from reconstruction.runner import Run
 from reconstruction.world import WorldConfig, find_world
 from reconstruction.world.samples import window_normals
 from registry.errors import UsageError
@@ -178,3 +183,33 @@ def test_upright_surface_is_not_level(scene):
     _, row, u, v = best
     with pytest.raises(UsageError, match=r"the surface at pixel .* is (8|9)\d degrees off level"):
         scene.corrected({"up": {"level": scene.click(row, u + 0.5, v + 0.5)}})
+
+
+def test_only_what_depends_on_the_world_frame_runs_again(scene, tmp_path):
+    posed, depth = scene.film.posed, scene.film.depth
+    done = {"frames": scene.capture.frame_set(), "poses": posed, "depth": depth}
+    store, digest, film = StageStore(tmp_path), posed.source.sha256, Path("film.mp4")
+    seed = Run(film, PipelineConfig(), store, input_digest=digest)
+    for number, stage in enumerate(STAGES[:3], start=1):
+        key = seed.keys[stage.name] = seed.key_of(stage, [])
+        record = {"usage": {"wall_s": 1.0, "cpu_s": 1.0, "peak_memory_mb": 1.0}, "notes": []}
+        store.save(done[stage.name], number, stage.name, key, record)
+    (click,), _ = scene.seen(0.0, 1)
+
+    def run_with(*entries: dict) -> Run:
+        run = Run(film, PipelineConfig(), store, Overrides(list(entries)), input_digest=digest)
+        run.execute(until="world")
+        return run
+
+    plain, floor = run_with(), run_with({"floor": click}, {"at": [0, 0, 1], "drop": True})
+    assert (plain.computed, floor.computed) == ({"world"}, {"world"})
+    assert {name for name in plain.keys if plain.keys[name] != floor.keys[name]} == {"world"}
+    gaussians = next(stage for stage in STAGES if stage.name == "gaussians")
+    assert plain.key_of(gaussians, []) == floor.key_of(gaussians, [])
+    assert not any("entries" in note for note in plain.notes)
+    assert any(
+        "coordinates in entries 2 of the overrides file count in the world frame" in n for n in floor.notes
+    )
+    again = run_with({"floor": click}, {"id": 3, "relabel": "mug"})
+    assert again.computed == set()  # entries of other stages are no part of it
+    assert not any("coordinates" in note for note in again.notes)
