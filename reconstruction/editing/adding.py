@@ -12,6 +12,7 @@ from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera, Instance, InstanceSet, Surface
 from reconstruction.editing.anchors import Footage
 from reconstruction.editing.outlined_hull import Cone, box_between
+from reconstruction.editing.outlined_wall import hung_on, wall_around
 from reconstruction.editing.outlines import Added, Outline
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Thing
@@ -52,7 +53,8 @@ class _View:
 def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Added) -> InstanceSet:
     """Return the instances with one more object, which has the next free id.
 
-    Its surface is what lies inside the outlines. Without any, two outlines give it a box and no surface.
+    Its surface is what lies inside the outlines. Without any, it is flat on the wall around the outlines; elsewhere two
+    outlines give it a box and no surface.
 
     Args:
         found: the instances.
@@ -69,6 +71,11 @@ def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Add
     number = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
     shown = _share_shown(chosen, views, surface, footage)
     if shown < _COVERED:
+        wall = wall_around(found, [view.ring for view in views])
+        drawn = [(view.polygon, view.world_from_camera) for view in views]
+        hung = wall and hung_on(found, wall, drawn, number, added.label, footage.posed, footage.depth)
+        if hung is not None:
+            return hung
         cones = [Cone(view.world_from_camera, view.polygon, view.outline) for view in views]
         box = box_between(cones, footage.depth.camera, surface, found, added.label, shown)
         item = Instance(number, added.label, 1.0, box.center, box.yaw_rad, box.extents_m, 0, False)

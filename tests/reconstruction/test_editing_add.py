@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from surfaces import floor_sheet, frames_of, merged, solid_box, surface_from
+from surfaces import floor_sheet, frames_of, merged, sheet, solid_box, surface_from
 
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.core.types import Instance, InstanceSet, Surface
@@ -20,6 +20,22 @@ from registry.geometry import invert_rigid, transform_points
 pytestmark = pytest.mark.stage
 LOW, HIGH = np.array([-0.3, 0.0, 0.5]), np.array([-0.18, 0.1, 0.65])
 GLASS_LOW, GLASS_HIGH = np.array([0.1, -0.3, 0.5]), np.array([0.18, -0.22, 0.62])
+
+
+def outline_of(
+    footage: Footage, frame: int, low: np.ndarray, high: np.ndarray, margin_px: float = 2.0
+) -> dict:
+    """Return the outline of a box in a frame, drawn just outside of it."""
+    corners = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
+    local = transform_points(invert_rigid(footage.posed.world_from_camera[frame]), corners)
+    u, v = footage.depth.camera.project(local)
+    hull = cv2.convexHull(np.column_stack([u, v]).astype(np.float32))[:, 0].astype(float)
+    middle = hull.mean(axis=0)
+    away = hull - middle
+    hull = middle + away * (1 + margin_px / np.linalg.norm(away, axis=1, keepdims=True))
+    return {"frame": frame, "points": hull.round(1).tolist()}
 
 
 class Scene:
@@ -42,17 +58,8 @@ class Scene:
         self.missed = merged_into_table(self.whole, self.red, self.table)
 
     def outline(self, frame: int, low: np.ndarray, high: np.ndarray, margin_px: float = 2.0) -> dict:
-        """Return the outline of a box in a frame, drawn just outside of it."""
-        corners = np.array(
-            [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-        )
-        local = transform_points(invert_rigid(self.footage.posed.world_from_camera[frame]), corners)
-        u, v = self.footage.depth.camera.project(local)
-        hull = cv2.convexHull(np.column_stack([u, v]).astype(np.float32))[:, 0].astype(float)
-        middle = hull.mean(axis=0)
-        away = hull - middle
-        hull = middle + away * (1 + margin_px / np.linalg.norm(away, axis=1, keepdims=True))
-        return {"frame": frame, "points": hull.round(1).tolist()}
+        """See `outline_of`."""
+        return outline_of(self.footage, frame, low, high, margin_px)
 
     def added(self, *outlines: dict, found: InstanceSet | None = None) -> InstanceSet:
         entry = {"add": {"label": "mug", "outline": list(outlines)}}
@@ -138,3 +145,29 @@ def test_outlines_of_different_places_do_not_meet(scene):
     elsewhere = scene.outline(1, GLASS_LOW + away, GLASS_HIGH + away)
     with pytest.raises(UsageError, match=r"frame 0 and frame 1 .* do not meet in space"):
         scene.added(scene.outline(0, GLASS_LOW, GLASS_HIGH), elsewhere)
+
+
+def test_a_picture_flat_on_a_wall_needs_one_outline():
+    low, high = np.array([-0.2, 1.2, 0.7]), np.array([0.3, 1.2, 1.1])
+    surface = surface_from(
+        merged(
+            floor_sheet((200, 200, 190)),
+            sheet((-1.2, 1.2, 0), (2.4, 0, 0), (0, 0, 1.5), (150, 170, 160)),
+            solid_box((-0.5, -0.4, 0.0), (0.5, 0.4, 0.5), (120, 80, 50)),
+        )
+    )
+    posed, depth = frames_of(surface, 480, 360)
+    footage = Footage(posed, depth, Lens.of(posed), surface)
+    found = find_instances(posed, depth, surface, InstancesConfig(), progress=NO_PROGRESS)
+    wall = next(b for b in found.base if b.label == "wall")
+    entry = {"add": {"label": "picture", "outline": outline_of(footage, 0, low, high, 0.5)}}
+    out = apply_overrides(found, surface, [entry], footage)
+    picture = out.objects[-1]
+    assert (picture.support_hint, picture.attached_hint) == (wall.id, True)
+    np.testing.assert_allclose(picture.center, 0.5 * (low + high), atol=0.03)
+    np.testing.assert_allclose(picture.extents_m, [0.025, 0.5, 0.4], atol=0.02)
+    x, y = np.mean(entry["add"]["outline"]["points"], axis=0)
+    pointer = Pointer(out, surface, footage)
+    assert pointer.thing(Address("pixel", frame=0, pixel=(float(x), float(y)))).id == picture.id
+    assert (out.id_maps[1] == picture.id).any()
+    assert not (out.id_maps[2] == picture.id).any()  # from behind
