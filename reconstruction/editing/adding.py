@@ -24,6 +24,7 @@ _FINE = 4  # outlines are filled at this multiple of depth resolution
 _COVERED = 0.25  # least share of an outline that its own surface fills; with less, its size says little of the thing's
 _RING = 0.25  # width of the ring around an outline, relative to the root of its area
 _RING_PLANE = 0.1  # least share of the ring of a plane that goes on beyond the outline
+_UNDER = 0.5  # a level plane with more than this share of a ring carries the outlined thing
 _PLANES, _TRIES = 4, 200  # most planes of a ring, and the vertices that propose them
 _FACES_ALIKE = 0.9  # least cosine between the normals of a plane and of vertices on it
 _LEAST_BAND_M = 0.008  # half thickness of a plane, unless the surface is sampled more coarsely
@@ -37,6 +38,14 @@ _HUNG_M, _FOOT_M = (
 
 
 @dataclass(frozen=True)
+class _RingPlane:
+    """A plane that goes on beyond an outline."""
+
+    plane: np.ndarray  # (4,), its normal into free space
+    share: float  # of the ring
+
+
+@dataclass(frozen=True)
 class _View:
     """One outline in its frame, and where the surface appears there."""
 
@@ -46,6 +55,7 @@ class _View:
     area_px: float
     inside: np.ndarray  # bool (v,) vertices that project into the outline
     ring: np.ndarray  # bool (v,) vertices that are seen around the outline
+    planes: list[_RingPlane]
     visible: np.ndarray  # bool (v,) vertices in front of the camera, in its image, and not hidden
     depth: np.ndarray  # (v,) z-depth
 
@@ -77,7 +87,10 @@ def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Add
         if hung is not None:
             return hung
         cones = [Cone(view.world_from_camera, view.polygon, view.outline) for view in views]
-        box = box_between(cones, footage.depth.camera, surface, found, added.label, shown)
+        under = [
+            p.plane for view in views for p in view.planes if p.share > _UNDER and p.plane[2] > _FACES_ALIKE
+        ]
+        box = box_between(cones, footage.depth.camera, surface, found, under, added.label, shown)
         item = Instance(number, added.label, 1.0, box.center, box.yaw_rad, box.extents_m, 0, False)
         return replace(found, objects=(*found.objects, item))
     _refuse_known(found, chosen, added)
@@ -108,7 +121,17 @@ def _view(outline: Outline, surface: Surface, footage: Footage, graph: MeshGraph
     fine = (np.where(seen, v, 0) * _FINE).astype(int), (np.where(seen, u, 0) * _FINE).astype(int)
     inside = seen & (mask[fine] > 0)
     ring = visible & (around[fine] > 0) & ~inside
-    return _View(outline, pose, polygon, float(mask.sum()) / _FINE**2, inside, ring, visible, z)
+    return _View(
+        outline,
+        pose,
+        polygon,
+        float(mask.sum()) / _FINE**2,
+        inside,
+        ring,
+        _planes_of(graph, ring),
+        visible,
+        z,
+    )
 
 
 def _filled(polygon: np.ndarray, camera: Camera) -> np.ndarray:
@@ -124,7 +147,8 @@ def _own_surface(graph: MeshGraph, views: list[_View]) -> np.ndarray:
     front = inside & np.any([view.visible for view in views], axis=0)
     background = np.zeros(len(inside), bool)
     for view in views:
-        background |= _on_planes_of(graph, view.ring)
+        for found in view.planes:
+            background |= _on(graph, found.plane)
     front &= ~background
     allowed = inside & ~background
     for view in views:
@@ -141,18 +165,18 @@ def _own_surface(graph: MeshGraph, views: list[_View]) -> np.ndarray:
     return np.flatnonzero(allowed & large[piece])
 
 
-def _on_planes_of(graph: MeshGraph, ring: np.ndarray) -> np.ndarray:
-    """Return the mask (v,) of the vertices that lie on planes of the ring around an outline.
+def _planes_of(graph: MeshGraph, ring: np.ndarray) -> list[_RingPlane]:
+    """Return the planes of the ring around an outline.
 
-    Each plane is the best of those through single vertices of the ring along their normals; its vertices are removed
-    before the next is sought.
+    Each is the best of those through single vertices of the ring along their normals; its vertices are removed before
+    the next is sought.
     """
-    band = max(graph.spacing_m, _LEAST_BAND_M)
+    band = _band_of(graph)
     rest = np.flatnonzero(ring)
-    fewest = _RING_PLANE * len(rest)
-    out = np.zeros(len(ring), bool)
+    count = max(len(rest), 1)
+    out = []
     for _ in range(_PLANES):
-        if len(rest) < max(fewest, 3):
+        if len(rest) < max(_RING_PLANE * count, 3):
             break
         points, normals = graph.points[rest], graph.normals[rest]
         tried = np.unique(np.linspace(0, len(rest) - 1, _TRIES).astype(int))
@@ -160,15 +184,26 @@ def _on_planes_of(graph: MeshGraph, ring: np.ndarray) -> np.ndarray:
         on = (off < band) & (normals @ normals[tried].T > _FACES_ALIKE)
         best = int(on.sum(axis=0).argmax())
         members = on[:, best]
-        if members.sum() < fewest:
+        if members.sum() < _RING_PLANE * count:
             break
         middle = points[members].mean(axis=0)
         normal = np.linalg.svd(points[members] - middle, full_matrices=False)[2][2]
-        away = np.abs((graph.points - middle) @ normal)
-        alike = np.abs(graph.normals @ normal) > _FACES_ALIKE
-        out |= (away < 0.5 * band) | ((away < band) & alike)
+        normal = normal * np.sign(normal @ normals[tried[best]] or 1.0)
+        out.append(_RingPlane(np.append(normal, -normal @ middle), float(members.sum() / count)))
         rest = rest[~members]
     return out
+
+
+def _on(graph: MeshGraph, plane: np.ndarray) -> np.ndarray:
+    """Return the mask (v,) of the vertices that lie on a plane (4,)."""
+    away = np.abs(graph.points @ plane[:3] + plane[3])
+    alike = np.abs(graph.normals @ plane[:3]) > _FACES_ALIKE
+    band = _band_of(graph)
+    return (away < 0.5 * band) | ((away < band) & alike)
+
+
+def _band_of(graph: MeshGraph) -> float:
+    return max(graph.spacing_m, _LEAST_BAND_M)
 
 
 def _share_shown(chosen: np.ndarray, views: list[_View], surface: Surface, footage: Footage) -> float:

@@ -44,8 +44,9 @@ class Cone:
 
 
 def box_between(
-    cones: list[Cone], camera: Camera, surface: Surface, found: InstanceSet, label: str, shown: float
-) -> UprightBox:
+    cones: list[Cone], camera: Camera, surface: Surface, found: InstanceSet, under: list[np.ndarray], label: str,
+    shown: float,
+) -> UprightBox:  # fmt: skip
     """Return the upright box of the space inside both cones, the room, and the seen part of the world.
 
     Args:
@@ -53,6 +54,7 @@ def box_between(
         camera: that the outlines count in.
         surface: the seen surface, which bounds the space.
         found: its base entities bound the space.
+        under: planes (4,) that the object stands on.
         label: of the object, for errors.
         shown: share of the outlines that surface of their own fills, for errors.
 
@@ -80,7 +82,9 @@ def box_between(
         surface.vertices.max(0) + _ROOM_M,
     )
     room = np.concatenate([np.column_stack([-np.eye(3), low]), np.column_stack([np.eye(3), -high])])
-    walls = [-np.asarray(b.surface.plane)[None] for b in found.base if b.observed]
+    walls = [
+        -np.asarray(plane)[None] for plane in (*(b.surface.plane for b in found.base if b.observed), *under)
+    ]
     halfspaces = np.concatenate([*(cone.halfspaces(camera) for cone in cones), room, *walls])
     corners = _corners(halfspaces)
     if corners is None:

@@ -130,8 +130,9 @@ def test_two_outlines_of_a_glass_give_a_box_around_it(scene):
         assert (low < GLASS_LOW + 0.01).all()
         assert (high > GLASS_HIGH - 0.01).all()
     assert np.prod(glass.extents_m) > 0.9 * np.prod(GLASS_HIGH - GLASS_LOW)
-    assert np.prod(glass.extents_m) < 6 * np.prod(GLASS_HIGH - GLASS_LOW)
+    assert np.prod(glass.extents_m) < 3 * np.prod(GLASS_HIGH - GLASS_LOW)
     np.testing.assert_allclose(glass.center, 0.5 * (GLASS_LOW + GLASS_HIGH), atol=0.03)
+    assert low[2] == pytest.approx(0.5, abs=0.01)
     pointer = Pointer(out, scene.surface, scene.footage)
     for frame in (0, 1):
         x, y = np.mean(scene.outline(frame, GLASS_LOW, GLASS_HIGH)["points"], axis=0)
