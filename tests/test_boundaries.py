@@ -39,9 +39,9 @@ def test_import_loads_nothing_heavy(statement, forbidden):
 @pytest.mark.parametrize(
     ("package", "forbidden"),
     [
-        ("registry", {"reconstruction", "simrecon_envs"}),
-        ("simrecon_envs", {"reconstruction"}),
-        ("reconstruction", {"simrecon_envs"}),
+        ("registry", {"reconstruction", "simrecon_envs", "studio"}),
+        ("simrecon_envs", {"reconstruction", "studio"}),
+        ("reconstruction", {"simrecon_envs", "studio"}),
     ],
 )
 def test_no_file_imports_against_the_direction(package, forbidden):

@@ -22,13 +22,14 @@ PACKAGES = (
     "registry",
     "reconstruction",
     "simrecon_envs",
+    "studio",
     "synthetic",
     "priors",
     "benchmarks",
     "examples",
     "tools",
 )
-PRODUCT = ("registry", "reconstruction", "simrecon_envs")
+PRODUCT = ("registry", "reconstruction", "simrecon_envs", "studio")
 _USUAL = (0, 1, 2, 0.5)
 _LONG_FILE = 450
 

@@ -1,0 +1,277 @@
+"""One scene, served as a page: its meshes, the selection, clicks, cameras and tabs that parts fill.
+
+Scene nodes: `/objects/<id>` is the frame of an object (`world_from_object`), `/objects/<id>/mesh` its textured mesh,
+`/room/<id>` a base entity, `/room/backdrop` the backdrop. `/layers/...` belong to the "Scene" tab (`studio.layers`).
+"""
+
+import contextlib
+import io
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from registry import SceneBundle, SceneRegistry
+from registry.geometry import WORLD_FROM_GLTF, quat_from_matrix
+from studio.frames import Frames
+from studio.parts import Part
+from studio.picking import Pickable
+from studio.selection import Click, Listeners, Selection
+from studio.start_view import start_view
+from studio.text import bare
+
+logger = logging.getLogger(__name__)
+
+BRAND_COLOR = (38, 110, 142)
+_AMBIENT, _SUN = 2.4, 0.7  # textures are baked as filmed: mostly ambient light, a little shading of the shape
+_PANEL_WIDTH_PX = 340
+_SWALLOW_S = 0.4  # a click on a node is also reported as a click into the scene, a moment later
+_GLTF_WXYZ = quat_from_matrix(WORLD_FROM_GLTF[:3, :3])
+
+
+class StudioPage:
+    """A served scene. All viewers of the page share selection, layers and poses; each has its own camera."""
+
+    def __init__(
+        self,
+        registry: SceneRegistry,
+        scene_id: str,
+        *,
+        parts: Sequence[type[Part]] = (),
+        host: str = "127.0.0.1",
+        port: int = 0,
+        revision: str | None = None,
+    ) -> None:
+        """Serve a scene.
+
+        Args:
+            registry: the registry that has the scene.
+            scene_id: its id.
+            parts: classes of the parts, in the order of their tabs.
+            host: address to bind.
+            port: 0 takes a free one.
+            revision: another revision than the current one, if it still exists.
+
+        Raises:
+            SceneNotFound: there is no such scene.
+            BundleError: the bundle is damaged.
+        """
+        self.registry, self.scene_id = registry, scene_id
+        self.bundle = self._open(revision)
+        self.selection = Selection()
+        self.pickable = Pickable()
+        self._clicks, self._reloads, self._moves = Listeners(), Listeners(), Listeners()
+        self._grabbed: Callable[[Click], object] | None = None
+        self._swallow_until = 0.0
+        self._nodes: list[viser.SceneNodeHandle] = []
+        self._frames_of: dict[int, viser.FrameHandle] = {}
+        self._meshes: dict[int, viser.GlbHandle] = {}
+        self._poses: dict[int, np.ndarray] = {}
+        self._lock = threading.RLock()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of its own
+            self.server = viser.ViserServer(host=host, port=port, label=scene_id, verbose=False)
+        self._dress()
+        self.frames = Frames(self)
+        self._show_bundle()
+        self.tabs = self.server.gui.add_tab_group()
+        self._listen_to_clicks()
+        self.parts: tuple[Part, ...] = tuple(part(self) for part in parts)
+
+    @property
+    def port(self) -> int:
+        """Port of the page's own server."""
+        return self.server.get_port()
+
+    @property
+    def revision(self) -> str:
+        """Revision shown."""
+        return self.bundle.revision
+
+    # ---- Objects.
+
+    def object_handles(self) -> dict[int, viser.GlbHandle]:
+        """Return the mesh handles by object id; their parents are the frames that `set_pose` moves."""
+        return dict(self._meshes)
+
+    def name_of(self, thing_id: int) -> str:
+        """Return the name of an object or base entity, unescaped (`studio.text` escapes it)."""
+        for item in self.bundle.objects:
+            if item.id == thing_id:
+                return item.name or item.label
+        return next((b.label for b in self.bundle.base if b.id == thing_id), f"id {thing_id}")
+
+    def pose_of(self, object_id: int) -> np.ndarray:
+        """Return `world_from_object` (4, 4) as shown, which may differ from the bundle's."""
+        return self._poses[object_id].copy()
+
+    def set_pose(self, object_id: int, world_from_object: np.ndarray) -> None:
+        """Move an object in the page; the bundle is not changed.
+
+        Args:
+            object_id: the object.
+            world_from_object: rigid (4, 4), metres.
+        """
+        pose = np.asarray(world_from_object, np.float64)
+        self._poses[object_id] = pose
+        self.pickable.move(object_id, pose)
+        frame = self._frames_of[object_id]
+        frame.wxyz, frame.position = quat_from_matrix(pose[:3, :3]), pose[:3, 3]
+        self._moves.call(object_id)
+
+    def on_move(self, callback: Callable[[int], object]) -> Callable[[], None]:
+        """Call `callback(object_id)` after every `set_pose`; return a function that ends it."""
+        return self._moves.add(callback)
+
+    # ---- Clicks.
+
+    def on_click(self, callback: Callable[[Click], object]) -> Callable[[], None]:
+        """Call `callback(click)` for every click into the scene, after it has selected; return a function that ends it."""
+        return self._clicks.add(callback)
+
+    def grab_clicks(self, callback: Callable[[Click], object] | None) -> None:
+        """Give all clicks to one tool, so that they do not select; None gives them back."""
+        self._grabbed = callback
+
+    def swallow_click(self) -> None:
+        """Ignore the click into the scene that accompanies a click on a node with its own callback."""
+        self._swallow_until = time.monotonic() + _SWALLOW_S
+
+    def _listen_to_clicks(self) -> None:
+        for modifier in (None, "shift", "cmd/ctrl"):
+            self.server.scene.on_click(modifier=modifier)(self._clicked)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        if time.monotonic() < self._swallow_until:
+            return
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        hit = self.pickable.cast(origin, direction, self.hidden_ids())
+        frame = self.frames.shown_to(event.client_id)
+        pixel = None if frame is None else self.frames.pixel(frame, origin + direction)
+        click = Click(
+            None if hit is None else hit.owner, None if hit is None else hit.point,
+            None if hit is None else hit.normal, origin, direction / np.linalg.norm(direction), frame, pixel,
+            event.client_id, event.modifier,
+        )  # fmt: skip
+        if self._grabbed is not None:
+            self._grabbed(click)
+            return
+        self._select(click)
+        self._clicks.call(click)
+
+    def _select(self, click: Click) -> None:
+        if click.id not in self._meshes:
+            if click.modifier is None:
+                self.selection.set(())
+        elif click.modifier is None:
+            self.selection.set((click.id,))
+        else:
+            self.selection.toggle(click.id)
+
+    def hidden_ids(self) -> frozenset[int]:
+        """Return the ids of objects and base entities whose meshes are switched off."""
+        shown: dict[int, Any] = {**self._meshes, **self._room}
+        return frozenset(owner for owner, handle in shown.items() if not handle.visible)
+
+    # ---- Frames and messages.
+
+    def show_frame(self, frame: int, client_id: int | None = None) -> None:
+        """Move a viewer (None: all of them) to the camera of a video frame, with its photograph over the scene.
+
+        Raises:
+            UsageError: no camera of that frame is known.
+        """
+        self.frames.show(frame, client_id)
+
+    def say(self, text: str, *, error: bool = False) -> None:
+        """Show a notification to every viewer; errors stay until they are closed."""
+        for client in self.server.get_clients().values():
+            client.add_notification(
+                "Not done" if error else bare(self.scene_id), bare(text, 1000), color="red" if error else None,
+                auto_close_seconds=None if error else 5.0,
+            )  # fmt: skip
+
+    # ---- The bundle.
+
+    def reload(self, revision: str | None = None) -> None:
+        """Show another revision (None: the current one) in the same page; then `on_reload` listeners are called."""
+        with self._lock:
+            self.bundle = self._open(revision)
+            with self.server.atomic():
+                for node in self._nodes:
+                    node.remove()
+                self._show_bundle()
+            self.frames.reload()
+            self.selection.set(i for i in self.selection.ids if i in self._meshes)
+        self._reloads.call()
+
+    def on_reload(self, callback: Callable[[], object]) -> Callable[[], None]:
+        """Call `callback()` after every reload; return a function that ends it."""
+        return self._reloads.add(callback)
+
+    def close(self) -> None:
+        """Close the parts and stop the server."""
+        for part in self.parts:
+            part.close()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _open(self, revision: str | None) -> SceneBundle:
+        if revision is None:
+            return self.registry.load(self.scene_id)
+        return SceneBundle.open(self.registry.scenes_folder / self.scene_id / revision, check_hashes=False)
+
+    def _show_bundle(self) -> None:
+        """Add the meshes of the bundle as they are in its files: glTF with textures."""
+        self._nodes, self._frames_of, self._meshes, self._poses = [], {}, {}, {}
+        self._room: dict[int, viser.GlbHandle] = {}
+        self.pickable = Pickable()
+        self._nodes.append(self.server.scene.add_frame("/objects", show_axes=False))
+        self._nodes.append(self.server.scene.add_frame("/room", show_axes=False))
+        for base in self.bundle.base:
+            self._room[base.id] = self._add_glb(f"/room/{base.id}", base.mesh)
+            self.pickable.add(base.id, self.bundle.resolve(base.mesh), np.eye(4))
+        self.backdrop = (
+            None if self.bundle.backdrop is None else self._add_glb("/room/backdrop", self.bundle.backdrop)
+        )
+        for item in self.bundle.objects:
+            pose = item.world_from_object
+            name = f"/objects/{item.id}"
+            self._frames_of[item.id] = self.server.scene.add_frame(
+                name, show_axes=False, wxyz=quat_from_matrix(pose[:3, :3]), position=pose[:3, 3]
+            )
+            self._poses[item.id] = pose
+            mesh = self._meshes[item.id] = self._add_glb(f"{name}/mesh", item.visual)
+            mesh.on_click(_show_pointer)
+            self.pickable.add(item.id, self.bundle.resolve(item.visual), pose)
+
+    def _add_glb(self, name: str, path: str) -> viser.GlbHandle:
+        data = self.bundle.resolve(path).read_bytes()
+        return self.server.scene.add_glb(name, data, wxyz=_GLTF_WXYZ, cast_shadow=False, receive_shadow=False)
+
+    def _dress(self) -> None:
+        gui, scene = self.server.gui, self.server.scene
+        gui.configure_theme(
+            brand_color=BRAND_COLOR, show_logo=False, show_share_button=False, control_width="medium"
+        )
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(_PANEL_WIDTH_PX)
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient("/lights/ambient", intensity=_AMBIENT)
+        scene.add_light_directional("/lights/sun", intensity=_SUN, position=(1.0, -2.0, 4.0))
+        view = start_view(self.bundle)
+        camera = self.server.initial_camera
+        camera.position, camera.look_at, camera.up, camera.fov = (
+            view.position,
+            view.look_at,
+            (0.0, 0.0, 1.0),
+            view.fov,
+        )
+
+
+async def _show_pointer(_: viser.SceneNodePointerEvent) -> None:
+    """Do nothing: a node with a callback is outlined under the pointer."""
