@@ -1,4 +1,7 @@
-"""Headless Chromium over its DevTools pipe: opens a page from disk and says what went wrong. No packages needed."""
+"""Headless Chromium over its DevTools pipe: opens pages from disk or a server, points, types, and says what went wrong.
+
+No packages needed. `browser_page(executable, profile, webgl=True)` renders WebGL with SwiftShader, in software.
+"""
 
 import base64
 import json
@@ -14,10 +17,20 @@ from typing import Any
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
+    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--hide-scrollbars",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage",
     "--remote-debugging-pipe",
 )  # fmt: skip
+_PLAIN = ("--disable-gpu",)
+_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+_BUTTONS = {"left": 1, "right": 2, "middle": 4}
+_MODIFIERS = {"alt": 1, "ctrl": 2, "meta": 4, "shift": 8}
+# Keys that type no text: name -> (code, Windows virtual key code).
+_KEYS = {
+    "Enter": ("Enter", 13), "Tab": ("Tab", 9), "Escape": ("Escape", 27), "Backspace": ("Backspace", 8),
+    "Delete": ("Delete", 46), "ArrowLeft": ("ArrowLeft", 37), "ArrowUp": ("ArrowUp", 38),
+    "ArrowRight": ("ArrowRight", 39), "ArrowDown": ("ArrowDown", 40), "Home": ("Home", 36), "End": ("End", 35),
+}  # fmt: skip
 
 
 def find_browser() -> str | None:
@@ -55,11 +68,11 @@ class Page:
                 return answer["result"]
             self.events.append(answer)
 
-    def open(self, path: Path, width: int = 1280, height: int = 900, *, phone: bool = False) -> None:
-        """Open a file and wait until it has loaded and all its pictures are decoded."""
+    def open(self, path: Path | str, width: int = 1280, height: int = 900, *, phone: bool = False) -> None:
+        """Open a file or an address and wait until it has loaded and all its pictures are decoded."""
         self.resize(width, height, phone=phone)
         self.events.clear()
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=path if isinstance(path, str) else path.resolve().as_uri())
         limit = time.monotonic() + 60
         while not any(e.get("method") == "Page.loadEventFired" for e in self.events):
             if time.monotonic() > limit:
@@ -68,6 +81,111 @@ class Page:
         self.evaluate(
             "Promise.all([...document.images].map(i => i.decode().catch(() => null))).then(() => true)"
         )
+
+    def wait_for(self, expression: str, timeout_s: float = 20.0) -> Any:
+        """Evaluate JavaScript until its value is true, and return that value.
+
+        Raises:
+            TimeoutError: it stays false; names the expression.
+        """
+        limit = time.monotonic() + timeout_s
+        while True:
+            value = self.evaluate(expression)
+            if value:
+                return value
+            if time.monotonic() > limit:
+                raise TimeoutError(f"still false after {timeout_s:.0f} s: {expression}")
+            time.sleep(0.1)
+
+    def settle(self, seconds: float = 0.5) -> None:
+        """Let the page run for a while; events are kept."""
+        limit = time.monotonic() + seconds
+        while (left := limit - time.monotonic()) > 0:
+            if b"\0" in self._buffer or select.select([self._read], [], [], left)[0]:
+                self.events.append(self._receive(60.0))
+
+    def text(self) -> str:
+        """Return the text that the page shows."""
+        return self.evaluate("document.body.innerText")
+
+    def box_of(self, text: str, selector: str = "button, a, label, input, [role=tab], summary, td, p, span, div") -> Any:
+        """Return x, y, width, height of the smallest visible element with this text, label or placeholder.
+
+        Raises:
+            LookupError: there is none.
+        """
+        box = self.evaluate(
+            f"""(() => {{
+              const wanted = {json.dumps(text)};
+              let best = null;
+              for (const e of document.querySelectorAll({json.dumps(selector)})) {{
+                const said = [e.innerText, e.getAttribute("aria-label"), e.placeholder, e.title];
+                if (!said.some((s) => s && s.trim() === wanted)) continue;
+                e.scrollIntoView({{ block: "nearest" }});
+                const b = e.getBoundingClientRect();
+                if (b.width < 1 || b.height < 1 || getComputedStyle(e).visibility === "hidden") continue;
+                if (!best || b.width * b.height < best.width * best.height) best = b;
+              }}
+              return best && {{ x: best.x, y: best.y, width: best.width, height: best.height }};
+            }})()"""
+        )
+        if box is None:
+            raise LookupError(f"nothing visible says {text!r}; the page says: {self.text()[:2000]!r}")
+        return box
+
+    def press(self, text: str, selector: str | None = None) -> None:
+        """Click the middle of the element with this text."""
+        box = self.box_of(text) if selector is None else self.box_of(text, selector)
+        self.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+
+    def click(self, x: float, y: float, *, button: str = "left", modifiers: tuple[str, ...] = ()) -> None:
+        """Press and release a mouse button at a place of the window, in CSS pixels."""
+        self.move(x, y)
+        for kind in ("mousePressed", "mouseReleased"):
+            self._mouse(kind, x, y, button, 1 if kind == "mousePressed" else 0, modifiers)
+
+    def move(self, x: float, y: float) -> None:
+        """Move the pointer."""
+        self._mouse("mouseMoved", x, y, "none", 0, ())
+
+    def drag(
+        self, start: tuple[float, float], end: tuple[float, float], *, button: str = "left", steps: int = 12,
+        modifiers: tuple[str, ...] = (), pause_s: float = 0.03,
+    ) -> None:  # fmt: skip
+        """Press at `start`, move to `end` in steps, and release."""
+        self.move(*start)
+        self._mouse("mousePressed", *start, button, 1, modifiers)
+        for k in range(1, steps + 1):
+            x, y = (a + (b - a) * k / steps for a, b in zip(start, end, strict=True))
+            self._mouse("mouseMoved", x, y, button, 1, modifiers)
+            time.sleep(pause_s)
+        self._mouse("mouseReleased", *end, button, 0, modifiers)
+
+    def scroll(self, x: float, y: float, down: float) -> None:
+        """Turn the wheel at a place by `down` pixels."""
+        self.call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=down)
+
+    def type(self, text: str) -> None:
+        """Type text into the element that has the focus."""
+        self.call("Input.insertText", text=text)
+
+    def key(self, name: str, *, modifiers: tuple[str, ...] = ()) -> None:
+        """Press and release a key: a letter or digit, or one of `_KEYS`, such as Enter."""
+        code, virtual = _KEYS.get(name, (f"Key{name.upper()}", ord(name.upper()[0])))
+        for kind in ("keyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, key=name, code=code, windowsVirtualKeyCode=virtual,
+                modifiers=sum(_MODIFIERS[m] for m in modifiers),
+                **({"text": "\r"} if name == "Enter" and kind == "keyDown" else {}),
+            )  # fmt: skip
+
+    def _mouse(
+        self, kind: str, x: float, y: float, button: str, held: int, modifiers: tuple[str, ...]
+    ) -> None:
+        self.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=int(kind != "mouseMoved"),
+            buttons=_BUTTONS.get(button, 0) if held else 0, modifiers=sum(_MODIFIERS[m] for m in modifiers),
+        )  # fmt: skip
 
     def resize(self, width: int, height: int, *, phone: bool = False) -> None:
         """Set the window's size in CSS pixels."""
@@ -87,10 +205,11 @@ class Page:
         return answer["result"].get("value")
 
     def screenshot(self, path: Path, *, full: bool = False, quality: int = 80) -> None:
-        """Write what is shown, or the full page, as JPEG."""
+        """Write what is shown, or the full page, as JPEG, or as PNG where the path says so."""
+        png = path.suffix == ".png"
         answer = self.call(
-            "Page.captureScreenshot", format="jpeg", quality=quality, captureBeyondViewport=full,
-            **({"clip": self._whole()} if full else {}),
+            "Page.captureScreenshot", format="png" if png else "jpeg", captureBeyondViewport=full,
+            **({} if png else {"quality": quality}), **({"clip": self._whole()} if full else {}),
         )  # fmt: skip
         path.write_bytes(base64.b64decode(answer["data"]))
 
@@ -125,7 +244,7 @@ class Page:
 
     @property
     def requests(self) -> list[str]:
-        """Addresses that the page asked for, other than what is inside it."""
+        """Addresses that the page asked for, other than what is inside it (web sockets are not among them)."""
         asked = [
             e["params"]["request"]["url"]
             for e in self.events
@@ -147,8 +266,8 @@ class Page:
 
 
 @contextmanager
-def browser_page(executable: str, profile: Path) -> Iterator[Page]:
-    """Start a browser with an empty profile and give a page of it."""
+def browser_page(executable: str, profile: Path, *, webgl: bool = False) -> Iterator[Page]:
+    """Start a browser with an empty profile and give a page of it; `webgl` renders in software."""
     command_read, command_write = os.pipe()
     answer_read, answer_write = os.pipe()
 
@@ -163,7 +282,7 @@ def browser_page(executable: str, profile: Path) -> Iterator[Page]:
         os.dup2(answer, 4)
 
     process = subprocess.Popen(
-        [executable, *_FLAGS, f"--user-data-dir={profile}"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        [executable, *_FLAGS, *(_WEBGL if webgl else _PLAIN), f"--user-data-dir={profile}"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL, close_fds=False, preexec_fn=as_three_and_four,
     )  # fmt: skip
     os.close(command_read)
