@@ -2,33 +2,26 @@
 
 import argparse
 import time
+from pathlib import Path
 
 from registry import SceneRegistry
-from registry.errors import EnvironmentMissing
+from registry.errors import EnvironmentMissing, UsageError
 
 # Parts of a page, `module:class`, in the order of their tabs.
 PARTS = ("studio.looking:LookingPart",)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve pages until interrupted."""
+    """Serve pages until interrupted, or write one page."""
+    if arguments.export is not None and arguments.scene is None:
+        raise UsageError("--export: name the scene, as in `simrecon studio SCENE --export room.html`")
     check_viser()
-    from studio.parts import load_parts
-    from studio.scene_view import StudioPage
-
-    page = StudioPage(
-        SceneRegistry(arguments.registry),
-        arguments.scene,
-        parts=load_parts(PARTS),
-        host=arguments.host,
-        port=arguments.port,
-    )
-    print(f"http://{arguments.host}:{page.port}", flush=True)
-    try:
-        while True:
-            time.sleep(1)
-    finally:
-        page.close()
+    registry = SceneRegistry(arguments.registry)
+    if arguments.scene is not None:
+        registry.get(arguments.scene)
+    if arguments.export is not None:
+        return _export(registry, arguments.scene, arguments.export)
+    return _serve(registry, arguments)
 
 
 def check_viser() -> None:
@@ -37,5 +30,45 @@ def check_viser() -> None:
         import viser  # noqa: F401
     except ImportError as error:
         raise EnvironmentMissing(
-            f"the studio needs viser, which is not installed ({error}); pip install 'simrecon[studio]'"
+            f"the studio needs viser, which cannot be imported ({error}); pip install 'simrecon[studio]'"
         ) from error
+
+
+def _export(registry: SceneRegistry, scene_id: str, path: Path) -> int:
+    from studio.export import MAX_BYTES, write_export
+
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise UsageError(f"--export {path}: give a file name in an existing folder")
+    size = write_export(registry, scene_id, path)
+    print(f"{path} ({size / 1e6:.1f} MB)")
+    if size > MAX_BYTES:
+        print(f"larger than {MAX_BYTES / 1e6:.0f} MB: textures of this scene are large")
+    return 0
+
+
+def _serve(registry: SceneRegistry, arguments: argparse.Namespace) -> int:
+    from studio.parts import load_parts
+    from studio.server import StudioServer, is_loopback
+
+    server = StudioServer(registry, load_parts(PARTS), host=arguments.host, port=arguments.port)
+    server.start()
+    try:
+        if arguments.scene is not None:
+            server.open(arguments.scene)
+        print(server.url(arguments.scene), flush=True)
+        if is_loopback(arguments.host):
+            print(
+                f"on this machine only; from another one: ssh -L {server.port}:127.0.0.1:{server.port} THIS_MACHINE"
+            )
+        else:
+            print(
+                "open to the network: whoever has this address with its token can look at and change your scenes"
+            )
+        print("Ctrl-C ends it", flush=True)
+        while True:
+            time.sleep(1)
+    except KeyboardInterrupt:
+        print()
+        return 0
+    finally:
+        server.stop()

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,13 +15,14 @@ import viser.transforms
 
 from registry.errors import UsageError
 from registry.geometry import invert_rigid, quat_from_matrix
+from studio.selection import Listeners
 
 if TYPE_CHECKING:
     from studio.scene_view import StudioPage
 
 logger = logging.getLogger(__name__)
 
-_DISTANCE_M = 0.15  # of the photograph from its camera; the near plane is at 0.01
+_DISTANCE_M = 0.03  # of the photograph from its camera; the near plane is at 0.01
 _FLY_S, _STEPS = 0.7, 18
 _STAY_M, _STAY_DEG = 0.01, 1.0  # a viewer farther from the camera than this has walked away
 
@@ -42,9 +44,10 @@ class Frames:
     def __init__(self, page: "StudioPage") -> None:
         self._page = page
         self._shown: dict[int, Comparison] = {}
+        self._changes = Listeners()
         self._lock = threading.RLock()
         page.server.on_client_connect(self._watch)
-        page.server.on_client_disconnect(lambda client: self._shown.pop(client.client_id, None) and None)
+        page.server.on_client_disconnect(self._forget)
 
     def reload(self) -> None:
         """Forget the photographs of another revision."""
@@ -107,6 +110,16 @@ class Frames:
             with self._lock:
                 self._shown[client.client_id] = Comparison(frame, opacity, wipe, None, time.monotonic())
                 self._draw(client)
+        self._changes.call()
+
+    def on_change(self, callback: Callable[[], object]) -> Callable[[], None]:
+        """Call `callback()` when a viewer begins or ends to stand at a camera; return a function that ends it."""
+        return self._changes.add(callback)
+
+    @property
+    def somebody_stands(self) -> bool:
+        """Whether any viewer stands at a camera."""
+        return bool(self._shown)
 
     def compare(self, opacity: float, wipe: float, client_id: int | None = None) -> None:
         """Set how much of the photograph viewers see: its opacity, and the share of the width that it covers."""
@@ -124,7 +137,9 @@ class Frames:
                 shown = self._shown.pop(client.client_id, None)
                 if shown is not None and shown.image is not None:
                     shown.image.remove()
-                    client.camera.up_direction = (0.0, 0.0, 1.0)
+            if shown is not None:
+                client.camera.up_direction = (0.0, 0.0, 1.0)
+                self._changes.call()
 
     def _viewers(self, client_id: int | None) -> list[viser.ClientHandle]:
         clients = self._page.server.get_clients()
@@ -138,6 +153,10 @@ class Frames:
 
     def _watch(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._leave_if_gone(client))
+
+    def _forget(self, client: viser.ClientHandle) -> None:
+        if self._shown.pop(client.client_id, None) is not None:
+            self._changes.call()
 
     def _leave_if_gone(self, client: viser.ClientHandle) -> None:
         shown = self._shown.get(client.client_id)

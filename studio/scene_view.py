@@ -10,7 +10,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import viser
@@ -23,12 +22,13 @@ from studio.picking import Pickable
 from studio.selection import Click, Listeners, Selection
 from studio.start_view import start_view
 from studio.text import bare
+from studio.unlit import unlit
 
 logger = logging.getLogger(__name__)
 
 BRAND_COLOR = (38, 110, 142)
-_AMBIENT, _SUN = 2.4, 0.7  # textures are baked as filmed: mostly ambient light, a little shading of the shape
-_PANEL_WIDTH_PX = 340
+_AMBIENT, _SUN = 1.4, 2.2  # of what has no baked texture, such as collision parts
+_PANEL_WIDTH_PX = 360
 _SWALLOW_S = 0.4  # a click on a node is also reported as a click into the scene, a moment later
 _GLTF_WXYZ = quat_from_matrix(WORLD_FROM_GLTF[:3, :3])
 
@@ -67,6 +67,9 @@ class StudioPage:
         self._clicks, self._reloads, self._moves = Listeners(), Listeners(), Listeners()
         self._grabbed: Callable[[Click], object] | None = None
         self._swallow_until = 0.0
+        self.unpickable: frozenset[int] = (
+            frozenset()
+        )  # ids that clicks go through, because they are not shown
         self._nodes: list[viser.SceneNodeHandle] = []
         self._frames_of: dict[int, viser.FrameHandle] = {}
         self._meshes: dict[int, viser.GlbHandle] = {}
@@ -97,6 +100,10 @@ class StudioPage:
         """Return the mesh handles by object id; their parents are the frames that `set_pose` moves."""
         return dict(self._meshes)
 
+    def room_handles(self) -> list[viser.GlbHandle]:
+        """Return the mesh handles of floor, walls, ceiling and backdrop."""
+        return [*self._room.values(), *([self.backdrop] if self.backdrop else [])]
+
     def name_of(self, thing_id: int) -> str:
         """Return the name of an object or base entity, unescaped (`studio.text` escapes it)."""
         for item in self.bundle.objects:
@@ -107,6 +114,15 @@ class StudioPage:
     def pose_of(self, object_id: int) -> np.ndarray:
         """Return `world_from_object` (4, 4) as shown, which may differ from the bundle's."""
         return self._poses[object_id].copy()
+
+    def bundle_pose(self, object_id: int) -> np.ndarray:
+        """Return `world_from_object` (4, 4) of the bundle."""
+        return next(o.world_from_object for o in self.bundle.objects if o.id == object_id).copy()
+
+    def show_object(self, object_id: int, visible: bool) -> None:
+        """Show or hide an object with all that belongs to it."""
+        if self._frames_of[object_id].visible != visible:
+            self._frames_of[object_id].visible = visible
 
     def set_pose(self, object_id: int, world_from_object: np.ndarray) -> None:
         """Move an object in the page; the bundle is not changed.
@@ -129,7 +145,7 @@ class StudioPage:
     # ---- Clicks.
 
     def on_click(self, callback: Callable[[Click], object]) -> Callable[[], None]:
-        """Call `callback(click)` for every click into the scene, after it has selected; return a function that ends it."""
+        """Call `callback(click)` for every click, after it has selected; return a function that ends it."""
         return self._clicks.add(callback)
 
     def grab_clicks(self, callback: Callable[[Click], object] | None) -> None:
@@ -148,7 +164,7 @@ class StudioPage:
         if time.monotonic() < self._swallow_until:
             return
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        hit = self.pickable.cast(origin, direction, self.hidden_ids())
+        hit = self.pickable.cast(origin, direction, self.unpickable)
         frame = self.frames.shown_to(event.client_id)
         pixel = None if frame is None else self.frames.pixel(frame, origin + direction)
         click = Click(
@@ -170,11 +186,6 @@ class StudioPage:
             self.selection.set((click.id,))
         else:
             self.selection.toggle(click.id)
-
-    def hidden_ids(self) -> frozenset[int]:
-        """Return the ids of objects and base entities whose meshes are switched off."""
-        shown: dict[int, Any] = {**self._meshes, **self._room}
-        return frozenset(owner for owner, handle in shown.items() if not handle.visible)
 
     # ---- Frames and messages.
 
@@ -249,7 +260,7 @@ class StudioPage:
             self.pickable.add(item.id, self.bundle.resolve(item.visual), pose)
 
     def _add_glb(self, name: str, path: str) -> viser.GlbHandle:
-        data = self.bundle.resolve(path).read_bytes()
+        data = unlit(self.bundle.resolve(path).read_bytes())
         return self.server.scene.add_glb(name, data, wxyz=_GLTF_WXYZ, cast_shadow=False, receive_shadow=False)
 
     def _dress(self) -> None:

@@ -9,6 +9,7 @@ from registry.geometry import invert_rigid
 
 _FOV_RAD = 1.1  # vertical; wider than most phones, so that the room is seen around the objects
 _FAR_M = 2.0  # of a scene without cameras
+_BACK_M, _UP_M = 0.45, 0.15  # behind the recorded camera, so that the other cameras are in view
 
 
 @dataclass(frozen=True)
@@ -43,4 +44,7 @@ def start_view(bundle: SceneBundle) -> StartView:
         )
         scores.append((int(inside.sum()), float(np.linalg.norm(world_from_camera[:3, 3] - middle))))
     best = cameras.world_from_camera[max(range(len(scores)), key=scores.__getitem__)]
-    return StartView(best[:3, 3], middle, _FOV_RAD)
+    away = best[:3, 3] - middle
+    away[2] = 0.0
+    back = away / max(float(np.linalg.norm(away)), 1e-6) * _BACK_M
+    return StartView(best[:3, 3] + back + np.array([0.0, 0.0, _UP_M]), middle, _FOV_RAD)

@@ -9,9 +9,9 @@ _MARKDOWN = "\\`*_{}[]()#+-.!|~:@$^="
 
 
 def bare(value: object, limit: int = _MAX_CHARACTERS) -> str:
-    """Return one line of printable text, for elements that show text as it is (buttons, labels in the scene).
+    r"""Return one line of printable text, for elements that show text as it is (buttons, labels in the scene).
 
-    Control, format (for example right-to-left override) and private characters are shown as `\\uXXXX`; line breaks
+    Control, format (for example right-to-left override) and private characters are shown as `\uXXXX`; line breaks
     become spaces; text beyond `limit` characters is cut.
     """
     out = []

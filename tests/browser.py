@@ -22,7 +22,12 @@ _FLAGS = (
     "--remote-debugging-pipe",
 )  # fmt: skip
 _PLAIN = ("--disable-gpu",)
-_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+_WEBGL = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
 _BUTTONS = {"left": 1, "right": 2, "middle": 4}
 _MODIFIERS = {"alt": 1, "ctrl": 2, "meta": 4, "shift": 8}
 # Keys that type no text: name -> (code, Windows virtual key code).
@@ -108,7 +113,9 @@ class Page:
         """Return the text that the page shows."""
         return self.evaluate("document.body.innerText")
 
-    def box_of(self, text: str, selector: str = "button, a, label, input, [role=tab], summary, td, p, span, div") -> Any:
+    def box_of(
+        self, text: str, selector: str = "button, a, label, input, [role=tab], summary, td, p, span, div"
+    ) -> Any:
         """Return x, y, width, height of the smallest visible element with this text, label or placeholder.
 
         Raises:
@@ -121,16 +128,43 @@ class Page:
               for (const e of document.querySelectorAll({json.dumps(selector)})) {{
                 const said = [e.innerText, e.getAttribute("aria-label"), e.placeholder, e.title];
                 if (!said.some((s) => s && s.trim() === wanted)) continue;
-                e.scrollIntoView({{ block: "nearest" }});
                 const b = e.getBoundingClientRect();
                 if (b.width < 1 || b.height < 1 || getComputedStyle(e).visibility === "hidden") continue;
-                if (!best || b.width * b.height < best.width * best.height) best = b;
+                if (!best || b.width * b.height < best[1]) best = [e, b.width * b.height];
               }}
-              return best && {{ x: best.x, y: best.y, width: best.width, height: best.height }};
+              if (!best) return null;
+              best[0].scrollIntoView({{ block: "nearest" }});
+              const b = best[0].getBoundingClientRect();
+              return {{ x: b.x, y: b.y, width: b.width, height: b.height }};
             }})()"""
         )
         if box is None:
             raise LookupError(f"nothing visible says {text!r}; the page says: {self.text()[:2000]!r}")
+        return box
+
+    def field(self, label: str) -> Any:
+        """Return x, y, width, height of the input (text, checkbox, slider, dropdown) in the row of a label.
+
+        Raises:
+            LookupError: there is none.
+        """
+        box = self.evaluate(
+            f"""(() => {{
+              for (const e of document.querySelectorAll("label, div, span, p")) {{
+                if (e.children.length || !e.textContent || e.textContent.trim() !== {json.dumps(label)}) continue;
+                for (let row = e, up = 0; row && up < 5; row = row.parentElement, up++) {{
+                  const found = row.querySelector("input, [role=slider], textarea");
+                  if (!found) continue;
+                  found.scrollIntoView({{ block: "nearest" }});
+                  const b = found.getBoundingClientRect();
+                  return {{ x: b.x, y: b.y, width: b.width, height: b.height }};
+                }}
+              }}
+              return null;
+            }})()"""
+        )
+        if box is None:
+            raise LookupError(f"no input with the label {label!r}; the page says: {self.text()[:2000]!r}")
         return box
 
     def press(self, text: str, selector: str | None = None) -> None:

@@ -1,0 +1,86 @@
+"""One self-contained page of a scene: walk around, names of objects, and its assembly as a film."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from registry import SceneBundle, SceneRegistry
+from studio.layers.names import NameLayer
+from studio.scene_view import StudioPage
+from studio.text import plain
+
+MAX_BYTES = 25_000_000
+_FALL_M, _FALL_S, _FPS = 0.35, 0.55, 20  # each thing comes from above
+_START_S, _PAUSE_S, _END_S = 0.8, 0.15, 2.5
+_CAPTION = (
+    "position:fixed;left:14px;bottom:12px;z-index:5;pointer-events:none;font:13px/1.45 system-ui,sans-serif;"
+    "color:#22282e;background:rgba(255,255,255,.82);border-radius:7px;padding:6px 11px"
+)
+
+
+def export_html(registry: SceneRegistry, scene_id: str) -> str:
+    """Return a page that shows a scene without a server: meshes, names, and the assembly replayed."""
+    page = StudioPage(registry, scene_id)
+    try:
+        NameLayer(page).set(True)
+        _lift(page)
+        recording = page.server.get_scene_serializer()
+        recording.insert_sleep(_START_S)
+        for object_id in assembly_order(page.bundle):
+            for offset in _falling():
+                pose = page.bundle_pose(object_id)
+                pose[2, 3] += offset
+                page.set_pose(object_id, pose)
+                page.show_object(object_id, True)
+                recording.insert_sleep(1 / _FPS)
+            recording.insert_sleep(_PAUSE_S)
+        recording.insert_sleep(_END_S)
+        return _dressed(recording.as_html(), page.bundle)
+    finally:
+        page.close()
+
+
+def write_export(registry: SceneRegistry, scene_id: str, path: Path) -> int:
+    """Write the page; return its size in bytes."""
+    data = export_html(registry, scene_id).encode("utf-8")
+    path.write_bytes(data)
+    return len(data)
+
+
+def assembly_order(bundle: SceneBundle) -> list[int]:
+    """Return the ids of all objects, every one after what carries it: breadth first from floor and walls."""
+    children: dict[int, list[int]] = {}
+    for edge in bundle.edges:
+        children.setdefault(edge.parent, []).append(edge.child)
+    order, front = [], [base.id for base in bundle.base]
+    while front:
+        front = [child for parent in front for child in sorted(children.get(parent, ()))]
+        order += front
+    return order
+
+
+def _falling() -> Iterator[float]:
+    """Yield heights above the final pose, metres: a smooth fall that ends at zero."""
+    steps = round(_FALL_S * _FPS)
+    yield from _FALL_M * (1 - np.linspace(0, 1, steps + 1) ** 2)
+
+
+def _lift(page: StudioPage) -> None:
+    for item in page.bundle.objects:
+        page.show_object(item.id, False)
+
+
+def _dressed(html: str, bundle: SceneBundle) -> str:
+    """Put the scene's name in title and caption."""
+    scene_id, count = bundle.scene["id"], len(bundle.objects)
+    things = "1 object" if count == 1 else f"{count} objects"
+    caption = (
+        f'<div style="{_CAPTION}"><b>{plain(scene_id)}</b> &middot; {things} &middot; SimRecon/{plain(scene_id)}<br>'
+        '<span style="opacity:.7">drag to look around, right-drag to move, scroll to come nearer</span></div>'
+    )
+    start, end = html.find("<title>"), html.find("</title>")
+    if 0 <= start < end:
+        html = f"{html[:start]}<title>{plain(scene_id)}{html[end:]}"
+    place = html.rindex("</body>")
+    return html[:place] + caption + html[place:]
