@@ -48,7 +48,8 @@ def _export(registry: SceneRegistry, scene_id: str, path: Path) -> int:
 
 def _serve(registry: SceneRegistry, arguments: argparse.Namespace) -> int:
     from studio.parts import load_parts
-    from studio.server import StudioServer, is_loopback
+    from studio.same_origin import is_loopback
+    from studio.server import StudioServer
 
     server = StudioServer(registry, load_parts(PARTS), host=arguments.host, port=arguments.port)
     server.start()

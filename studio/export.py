@@ -12,11 +12,31 @@ from studio.text import plain
 
 MAX_BYTES = 25_000_000
 _FALL_M, _FALL_S, _FPS = 0.35, 0.55, 20  # each thing comes from above
-_START_S, _PAUSE_S, _END_S = 0.8, 0.15, 2.5
+_START_S, _PAUSE_S, _END_S = 0.8, 0.15, 1.0
 _CAPTION = (
-    "position:fixed;left:14px;bottom:12px;z-index:5;pointer-events:none;font:13px/1.45 system-ui,sans-serif;"
+    "position:fixed;right:14px;top:12px;z-index:5;pointer-events:none;font:13px/1.45 system-ui,sans-serif;"
     "color:#22282e;background:rgba(255,255,255,.82);border-radius:7px;padding:6px 11px"
 )
+# viser's player repeats a recording for ever. This presses its pause key once, half a second before the end, when the
+# player gets there by itself; from then on the scene stays, and the player's bar replays the assembly.
+_STOP = """<script>
+(() => {
+  let before = 0, then = Date.now(), done = false;
+  setInterval(() => {
+    const bar = document.querySelector("[role=slider][aria-valuemax]");
+    const now = bar ? parseFloat(bar.getAttribute("aria-valuenow")) : 0, ms = Date.now();
+    const end = bar ? parseFloat(bar.getAttribute("aria-valuemax")) - 0.5 : Infinity;
+    const plays = now > before && now - before < 0.005 * (ms - then) + 0.1;
+    if (now < 0.5) done = false;
+    if (!done && plays && now >= end) {
+      done = true;
+      window.dispatchEvent(new KeyboardEvent("keydown", { code: "Space" }));
+    }
+    before = now;
+    then = ms;
+  }, 60);
+})();
+</script>"""
 
 
 def export_html(registry: SceneRegistry, scene_id: str) -> str:
@@ -72,7 +92,7 @@ def _lift(page: StudioPage) -> None:
 
 
 def _dressed(html: str, bundle: SceneBundle) -> str:
-    """Put the scene's name in title and caption."""
+    """Put the scene's name in title and caption, and into a mark that `simrecon report` finds."""
     scene_id, count = bundle.scene["id"], len(bundle.objects)
     things = "1 object" if count == 1 else f"{count} objects"
     caption = (
@@ -82,5 +102,7 @@ def _dressed(html: str, bundle: SceneBundle) -> str:
     start, end = html.find("<title>"), html.find("</title>")
     if 0 <= start < end:
         html = f"{html[:start]}<title>{plain(scene_id)}{html[end:]}"
+    head = html.index("<head>") + len("<head>")
+    html = f'{html[:head]}<meta name="simrecon-scene" content="{plain(scene_id)}">{html[head:]}'
     place = html.rindex("</body>")
-    return html[:place] + caption + html[place:]
+    return html[:place] + caption + _STOP + html[place:]

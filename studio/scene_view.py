@@ -19,6 +19,7 @@ from registry.geometry import WORLD_FROM_GLTF, quat_from_matrix
 from studio.frames import Frames
 from studio.parts import Part
 from studio.picking import Pickable
+from studio.same_origin import same_origin_only
 from studio.selection import Click, Listeners, Selection
 from studio.start_view import start_view
 from studio.text import bare
@@ -75,7 +76,10 @@ class StudioPage:
         self._meshes: dict[int, viser.GlbHandle] = {}
         self._poses: dict[int, np.ndarray] = {}
         self._lock = threading.RLock()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of its own
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            same_origin_only(host),
+        ):  # viser prints a table of its own
             self.server = viser.ViserServer(host=host, port=port, label=scene_id, verbose=False)
         self._dress()
         self.frames = Frames(self)

@@ -1,7 +1,7 @@
 """One address for the gallery and all pages: routes, tokens, and the way to each page's own server.
 
-Pages are viser servers on loopback ports. This server stands before them: `/` is the gallery, `/s/<scene>/` a page, which
-is opened when it is first asked for, and its web socket is passed on. It checks the token and where requests come from.
+Pages are viser servers on loopback ports. This server stands before them: `/` is the gallery, `/s/<scene>/` a page that
+is opened when it is first asked for; its web socket is passed on. It checks the token and where requests come from.
 """
 
 import asyncio
@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
@@ -30,6 +29,7 @@ from registry import SceneRegistry
 from registry.errors import EnvironmentMissing, SimReconError
 from studio.gallery import gallery_html, message_html
 from studio.parts import Part
+from studio.same_origin import is_loopback, refusal
 from studio.scene_view import StudioPage
 
 logger = logging.getLogger(__name__)
@@ -39,16 +39,6 @@ _PORTS = 20  # tried in a row where none is asked for
 _COOKIE = "simrecon_studio"
 _MAX_MESSAGE_BYTES = 1 << 28
 _PLAYER = Path(viser.__file__).parent / "client" / "build" / "index.html"
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address is this machine's own."""
-    if host == "localhost":
-        return True
-    try:
-        return ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
 
 
 class StudioServer:
@@ -197,12 +187,9 @@ class StudioServer:
 
     def _refusal(self, request: Request) -> Response | None:
         """Refuse strangers: a wrong token, a name of this machine that others gave it, another site's scripts."""
-        host = request.headers.get("Host", "")
-        if self.token is None and not is_loopback(urlsplit(f"//{host}").hostname or ""):
-            return _page(HTTPStatus.FORBIDDEN, f"This studio answers to this machine only, not to {host!r}.")
-        origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return _page(HTTPStatus.FORBIDDEN, "Another site may not use this studio.")
+        reason = refusal(request, loopback=self.token is None)
+        if reason is not None:
+            return _page(HTTPStatus.FORBIDDEN, reason)
         if self.token is not None and not hmac.compare_digest(
             _token_of(request).encode(), self.token.encode()
         ):

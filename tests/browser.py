@@ -316,9 +316,13 @@ def browser_page(executable: str, profile: Path, *, webgl: bool = False) -> Iter
         os.dup2(answer, 4)
 
     process = subprocess.Popen(
-        [executable, *_FLAGS, *(_WEBGL if webgl else _PLAIN), f"--user-data-dir={profile}"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL, close_fds=False, preexec_fn=as_three_and_four,
-    )  # fmt: skip
+        [executable, *_FLAGS, *(_WEBGL if webgl else _PLAIN), f"--user-data-dir={profile}"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        close_fds=False,
+        preexec_fn=as_three_and_four,
+    )
     os.close(command_read)
     os.close(answer_write)
     try:

@@ -15,7 +15,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         "write an HTML page with the results, costs and errors of every stage",
         "Write one self-contained HTML page about a scene: frames, depth, surface, instances, objects, "
         "scene graph, assembly, physics and timings; with --ground-truth also error maps, or outlines drawn by hand "
-        "over the results.",
+        "over the results. A page of `simrecon studio SCENE --export` in the same folder is linked to.",
     )
     add_scene(parser)
     add = parser.add_argument
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the page."""
     from reconstruction.commands.reporting import make_listener
     from reconstruction.measure.report.collect import by_reason
-    from reconstruction.measure.report.page import build_page, read_evaluation
+    from reconstruction.measure.report.page import build_page, find_room_page, read_evaluation
     from reconstruction.measure.stage_results import StageResults
     from registry import SceneRegistry
     from registry.errors import UsageError
@@ -55,7 +55,10 @@ def run(arguments: argparse.Namespace) -> int:
     listener = make_listener(quiet=arguments.quiet)
     with listener:
         listener.begin_stage("report", 1, 1, False)
-        page = build_page(bundle, stages, ground_truth, evaluation, labels=labels, progress=listener)
+        room_page = find_room_page(out.absolute().parent, arguments.scene)
+        page = build_page(
+            bundle, stages, ground_truth, evaluation, labels=labels, room_page=room_page, progress=listener
+        )
         listener.end_stage("report", None)
     out.write_text(page, encoding="utf-8")
     for reason, names in by_reason(stages.missing).items():

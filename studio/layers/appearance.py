@@ -8,6 +8,7 @@ import numpy as np
 from registry.simulation import read_obj_points
 from studio.coverage import Coverage, measure_coverage
 from studio.gaussians import read_gaussians
+from studio.layers.base import discard
 
 if TYPE_CHECKING:
     from studio.scene_view import StudioPage
@@ -42,10 +43,8 @@ class Appearance:
     def rebuild(self) -> None:
         """Forget the forms of another revision, and show the present one anew."""
         with self._lock:
-            for node in [
-                n for made in (self._made, self._made_room) for nodes in made.values() for n in nodes
-            ]:
-                node.remove()
+            for nodes in (*self._made.values(), *self._made_room.values()):
+                discard(self._page, nodes)
             self._made, self._made_room, self._coverage = {}, {}, None
             self.set(self.mode, self.room)
 

@@ -1,6 +1,7 @@
 """A layer: nodes of the scene that are made when it is first shown."""
 
 import threading
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -51,6 +52,12 @@ class Layer:
     def remove(self) -> None:
         """Remove the layer's nodes."""
         with self._lock:
-            for node in self._nodes or ():
-                node.remove()
+            discard(self.page, self._nodes or ())
             self._nodes = None
+
+
+def discard(page: "StudioPage", nodes: Iterable[Any]) -> None:
+    """Remove nodes of the scene, except those that went with the objects that they belong to."""
+    for node in nodes:
+        if page.server.scene.get_handle_by_name(node.name) is node:
+            node.remove()

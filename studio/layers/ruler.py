@@ -89,12 +89,8 @@ def scale_text(scale: dict) -> str:
     sigma = scale.get("uncertainty")
     if not sigma:
         return f"1 m, uncertainty unknown ({scale['method']})"
-    centimetres = 100 * sigma
-    return (
-        f"1 m ± {centimetres:.0f} cm ({scale['method']})"
-        if centimetres >= 1
-        else f"1 m ± {10 * centimetres:.0f} mm"
-    )
+    length = f"{100 * sigma:.0f} cm" if sigma >= 0.01 else f"{1000 * sigma:.0f} mm"
+    return f"1 m ± {length} ({scale['method']})"
 
 
 def _lines(scene: Any, name: str, lines: list, color: tuple[int, int, int]) -> Any:

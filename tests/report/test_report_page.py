@@ -261,3 +261,17 @@ def test_a_truth_of_cameras_alone_leaves_error_maps_out(reconstructed, tmp_path)
     assert "camera error" in page
     for image in images(page):
         assert image.std() > 3
+
+
+def test_a_page_of_the_studio_beside_the_report_is_linked(reconstructed, tmp_path):
+    from reconstruction.measure.report.page import find_room_page
+
+    bundle, _ = reconstructed.open()
+    mark = '<!doctype html><html><head><meta name="simrecon-scene" content="{}">'
+    (tmp_path / "other.html").write_text(mark.format("another"))
+    assert find_room_page(tmp_path, bundle.scene["id"]) is None
+    (tmp_path / "my room.html").write_text(mark.format(bundle.scene["id"]))
+    found = find_room_page(tmp_path, bundle.scene["id"])
+    assert found == "my room.html"
+    assert 'href="my%20room.html"' in build_page(bundle, StageResults({}, {}), room_page=found)
+    assert "walk around" not in build_page(bundle, StageResults({}, {}))

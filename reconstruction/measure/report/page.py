@@ -4,6 +4,7 @@ import json
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.measure.ground_truth import GroundTruth
@@ -15,6 +16,7 @@ from registry import SceneBundle
 from registry.errors import EnvironmentMissing, UsageError
 
 _SOURCES = ("template.html.j2", "plain.html.j2", "blocks.html.j2", "style.css", "script.js")
+_MARK_WITHIN_BYTES = 4096  # exported pages name their scene at their beginning
 
 
 def build_page(
@@ -24,6 +26,7 @@ def build_page(
     evaluation: dict[str, Any] | None = None,
     *,
     labels: Path | None = None,
+    room_page: str | None = None,
     progress: Progress = NO_PROGRESS,
 ) -> str:
     """Return the report of a scene as one self-contained HTML page.
@@ -34,6 +37,7 @@ def build_page(
         ground_truth: folder of CONTRACT section 3; None: no error maps.
         evaluation: `Evaluation.to_json` of this scene; None: evaluated here, if there is ground truth.
         labels: outlines drawn by hand (CONTRACT section 5, COCO or labelme); None: no such section.
+        room_page: file name of a page of `simrecon studio --export` in the same folder, to link to; None: no link.
         progress: advanced by the evaluation.
 
     Raises:
@@ -52,7 +56,7 @@ def build_page(
         from reconstruction.measure.outlines import measure_outlines
 
         outlines = measure_outlines(bundle, placed_meshes(bundle), labels, stages)
-    return render(Gathered(bundle, stages, truth, evaluation, outlines))
+    return render(Gathered(bundle, stages, truth, evaluation, outlines), room_page)
 
 
 def read_evaluation(path: Path, bundle: SceneBundle) -> dict[str, Any]:
@@ -77,7 +81,18 @@ def read_evaluation(path: Path, bundle: SceneBundle) -> dict[str, Any]:
     return found
 
 
-def render(g: Gathered) -> str:
+def find_room_page(folder: Path, scene_id: str) -> str | None:
+    """Return the name of the newest page of `simrecon studio SCENE --export` in a folder; None: there is none."""
+    mark = f'<meta name="simrecon-scene" content="{scene_id}">'.encode()
+    found = []
+    for path in folder.glob("*.html"):
+        with path.open("rb") as file:
+            if mark in file.read(_MARK_WITHIN_BYTES):
+                found.append(path)
+    return max(found, key=lambda path: path.stat().st_mtime).name if found else None
+
+
+def render(g: Gathered, room_page: str | None = None) -> str:
     """Render the page.
 
     Raises:
@@ -87,6 +102,7 @@ def render(g: Gathered) -> str:
         "template.html.j2",
         scene=g.scene,
         revision=g.bundle.revision,
+        room_page=None if room_page is None else quote(room_page),
         picture=pictures.preview(g),
         tiles=sections.summary_tiles(g),
         sections=sections.all_sections(g),
