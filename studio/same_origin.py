@@ -36,11 +36,11 @@ def refusal(request: Request, *, loopback: bool) -> str | None:
         request: of a browser or program.
         loopback: the server listens on loopback, so only names of this machine can be meant (against DNS rebinding).
     """
-    host = request.headers.get("Host", "")
+    hosts = request.headers.get_all("Host")
+    host = hosts[0] if len(hosts) == 1 else ""
     if loopback and not is_loopback(urlsplit(f"//{host}").hostname or ""):
         return f"This studio answers to this machine only, not to {host!r}."
-    origin = request.headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc != host:
+    if any(urlsplit(origin).netloc != host for origin in request.headers.get_all("Origin")):
         return "Another site may not use this studio."
     return None
 

@@ -10,12 +10,15 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import viser
 
 from registry import SceneBundle, SceneRegistry
 from registry.geometry import WORLD_FROM_GLTF, quat_from_matrix
+from studio.as_filmed import as_filmed
 from studio.frames import Frames
 from studio.parts import Part
 from studio.picking import Pickable
@@ -23,7 +26,6 @@ from studio.same_origin import same_origin_only
 from studio.selection import Click, Listeners, Selection
 from studio.start_view import start_view
 from studio.text import bare
-from studio.unlit import unlit
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +33,7 @@ BRAND_COLOR = (38, 110, 142)
 _AMBIENT, _SUN = 1.4, 2.2  # of what has no baked texture, such as collision parts
 _PANEL_WIDTH_PX = 360
 _SWALLOW_S = 0.4  # a click on a node is also reported as a click into the scene, a moment later
+_BACKDROP = 0  # no object or base entity has this id
 _GLTF_WXYZ = quat_from_matrix(WORLD_FROM_GLTF[:3, :3])
 
 
@@ -68,18 +71,14 @@ class StudioPage:
         self._clicks, self._reloads, self._moves = Listeners(), Listeners(), Listeners()
         self._grabbed: Callable[[Click], object] | None = None
         self._swallow_until = 0.0
-        self.unpickable: frozenset[int] = (
-            frozenset()
-        )  # ids that clicks go through, because they are not shown
+        self.unpickable: frozenset[int] = frozenset()  # ids that are not shown, which clicks go through
         self._nodes: list[viser.SceneNodeHandle] = []
         self._frames_of: dict[int, viser.FrameHandle] = {}
         self._meshes: dict[int, viser.GlbHandle] = {}
         self._poses: dict[int, np.ndarray] = {}
         self._lock = threading.RLock()
-        with (
-            contextlib.redirect_stdout(io.StringIO()),
-            same_origin_only(host),
-        ):  # viser prints a table of its own
+        # viser prints a table of its own.
+        with contextlib.redirect_stdout(io.StringIO()), same_origin_only(host):
             self.server = viser.ViserServer(host=host, port=port, label=scene_id, verbose=False)
         self._dress()
         self.frames = Frames(self)
@@ -246,12 +245,15 @@ class StudioPage:
         self.pickable = Pickable()
         self._nodes.append(self.server.scene.add_frame("/objects", show_axes=False))
         self._nodes.append(self.server.scene.add_frame("/room", show_axes=False))
+        files = self._mesh_files()
+        with ThreadPoolExecutor() as pool:  # pictures are decoded and encoded without the interpreter's lock
+            read = dict(
+                zip(files, pool.map(lambda path: as_filmed(path.read_bytes()), files.values()), strict=True)
+            )
         for base in self.bundle.base:
-            self._room[base.id] = self._add_glb(f"/room/{base.id}", base.mesh)
-            self.pickable.add(base.id, self.bundle.resolve(base.mesh), np.eye(4))
-        self.backdrop = (
-            None if self.bundle.backdrop is None else self._add_glb("/room/backdrop", self.bundle.backdrop)
-        )
+            self._room[base.id] = self._add_glb(f"/room/{base.id}", read[base.id])
+            self.pickable.add(base.id, files[base.id], np.eye(4))
+        self.backdrop = self._add_glb("/room/backdrop", read[_BACKDROP]) if _BACKDROP in read else None
         for item in self.bundle.objects:
             pose = item.world_from_object
             name = f"/objects/{item.id}"
@@ -259,12 +261,20 @@ class StudioPage:
                 name, show_axes=False, wxyz=quat_from_matrix(pose[:3, :3]), position=pose[:3, 3]
             )
             self._poses[item.id] = pose
-            mesh = self._meshes[item.id] = self._add_glb(f"{name}/mesh", item.visual)
+            mesh = self._meshes[item.id] = self._add_glb(f"{name}/mesh", read[item.id])
             mesh.on_click(_show_pointer)
-            self.pickable.add(item.id, self.bundle.resolve(item.visual), pose)
+            self.pickable.add(item.id, files[item.id], pose)
 
-    def _add_glb(self, name: str, path: str) -> viser.GlbHandle:
-        data = unlit(self.bundle.resolve(path).read_bytes())
+    def _mesh_files(self) -> dict[int, Path]:
+        """Return the visual meshes by id of object or base entity; `_BACKDROP` is the backdrop's."""
+        found = {item.id: item.mesh for item in self.bundle.base} | {
+            o.id: o.visual for o in self.bundle.objects
+        }
+        if self.bundle.backdrop is not None:
+            found[_BACKDROP] = self.bundle.backdrop
+        return {key: self.bundle.resolve(path) for key, path in found.items()}
+
+    def _add_glb(self, name: str, data: bytes) -> viser.GlbHandle:
         return self.server.scene.add_glb(name, data, wxyz=_GLTF_WXYZ, cast_shadow=False, receive_shadow=False)
 
     def _dress(self) -> None:

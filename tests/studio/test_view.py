@@ -8,9 +8,12 @@ import pytest
 import trimesh
 from hostile import HOSTILE
 from made_scenes import BOOK, BOX, CYLINDER, KNOB, PICTURE, TABLE
+from PIL import Image
 
 from reconstruction.core.types import Camera, DepthMaps
 from registry.geometry import rigid, transform_points
+from registry.glb import read_glb_json
+from studio.as_filmed import GAIN, as_filmed, compensate, inverse_tone_map, to_linear, to_srgb, tone_map
 from studio.coverage import CLASSES, classify
 from studio.gaussians import read_gaussians
 from studio.inspector import object_html
@@ -22,7 +25,6 @@ from studio.scene_view import StudioPage
 from studio.selection import Selection
 from studio.start_view import start_view
 from studio.text import bare, plain, plain_markdown
-from studio.unlit import unlit
 
 
 @pytest.fixture(scope="module")
@@ -108,22 +110,49 @@ def test_the_panel_shows_hostile_text_as_text(made_registry):
     assert "&lt;img src=x" in html
 
 
-def test_unlit_changes_materials_only():
+def test_the_viewers_tone_mapping_is_undone():
+    """Colors that the filmic curve reaches come back within quantization; gray is shown as gray."""
+    rng = np.random.default_rng(1)
+    gray = rng.integers(0, 250, (64, 64, 1))
+    image = np.clip(gray + rng.integers(-30, 30, (64, 64, 3)), 0, 250).astype(np.uint8)
+    shown = 255 * to_srgb(tone_map(GAIN * to_linear(compensate(image) / 255)))
+    error = np.abs(shown - image)
+    assert error.mean() < 1.5
+    assert np.percentile(error, 99) < 5
+    linear = rng.uniform(0.02, 0.6, (200, 1)) * rng.uniform(0.7, 1.0, (200, 3))
+    assert tone_map(inverse_tone_map(linear)) == pytest.approx(linear, abs=1e-6)
+    assert inverse_tone_map(np.zeros(3)) == pytest.approx(0, abs=2e-3)
+
+
+def test_files_for_the_viewer_keep_their_shape_and_carry_no_light(tmp_path):
+    uv = np.random.default_rng(0).uniform(0, 1, (8, 2))
     box = trimesh.creation.box((1, 2, 3))
+    picture = Image.fromarray(np.full((16, 16, 3), 120, np.uint8))
     box.visual = trimesh.visual.TextureVisuals(
-        material=trimesh.visual.material.PBRMaterial(baseColorFactor=[9, 8, 7, 255])
+        uv, trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
     )
-    data = box.export(file_type="glb")
-    out = unlit(data)
-    length = struct.unpack_from("<I", out, 12)[0]
-    assert struct.unpack_from("<I", out, 8)[0] == len(out)
-    document = json.loads(out[20 : 20 + length])
+    out = as_filmed(box.export(file_type="glb"))
+    path = tmp_path / "out.glb"
+    path.write_bytes(out)
+    document, _ = read_glb_json(path, "out.glb")
     assert all("KHR_materials_unlit" in m["extensions"] for m in document["materials"])
-    assert "KHR_materials_unlit" in document["extensionsUsed"]
-    old = struct.unpack_from("<I", data, 12)[0]
-    assert out[20 + length :] == data[20 + old :]
-    again = trimesh.load(trimesh.util.wrap_as_stream(out), file_type="glb", force="mesh")
+    again = trimesh.load(path, force="mesh", process=False)
     assert again.bounds == pytest.approx(box.bounds)
+    assert again.visual.uv == pytest.approx(uv, abs=1e-6)
+    stored = np.asarray(again.visual.material.baseColorTexture.convert("RGB"))
+    factor = document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
+    shown = 255 * to_srgb(tone_map(np.array(factor[:3]) * to_linear(stored / 255)))
+    assert shown == pytest.approx(120, abs=3)
+
+
+def test_plain_colors_are_shown_as_they_are():
+    box = trimesh.creation.box()
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[140, 100, 60, 255])
+    box.visual = trimesh.visual.TextureVisuals(material=material)
+    out = as_filmed(box.export(file_type="glb"))
+    length = struct.unpack_from("<I", out, 12)[0]
+    factor = json.loads(out[20 : 20 + length])["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
+    assert tone_map(np.array(factor[:3])) == pytest.approx(np.array([140, 100, 60]) / 255, abs=1e-6)
 
 
 def test_hulls_face_outward():
