@@ -35,7 +35,7 @@ class Comparison:
     opacity: float  # 0 scene, 1 photograph
     wipe: float  # the photograph covers this share of the width, from the left
     image: viser.ImageHandle | None
-    since: float  # monotonic seconds
+    arrived: bool = False  # the viewer's camera has been where it was sent
 
 
 class Frames:
@@ -108,7 +108,7 @@ class Frames:
             self.leave(client.client_id)
             fly(client, world_from_camera, self._fov_for(client))
             with self._lock:
-                self._shown[client.client_id] = Comparison(frame, opacity, wipe, None, time.monotonic())
+                self._shown[client.client_id] = Comparison(frame, opacity, wipe, None)
                 self._draw(client)
         self._changes.call()
 
@@ -160,14 +160,15 @@ class Frames:
 
     def _leave_if_gone(self, client: viser.ClientHandle) -> None:
         shown = self._shown.get(client.client_id)
-        if shown is None or time.monotonic() - shown.since < 2 * _FLY_S:
+        if shown is None:
             return
         pose = self.world_from_camera(shown.frame)
-        turn = viser.transforms.SO3(client.camera.wxyz).inverse() @ viser.transforms.SO3(
-            quat_from_matrix(pose[:3, :3])
-        )
+        rotation = viser.transforms.SO3(quat_from_matrix(pose[:3, :3]))
+        turned = np.linalg.norm((viser.transforms.SO3(client.camera.wxyz).inverse() @ rotation).log())
         moved = np.linalg.norm(client.camera.position - pose[:3, 3])
-        if moved > _STAY_M or np.degrees(np.linalg.norm(turn.log())) > _STAY_DEG:
+        if moved <= _STAY_M and np.degrees(turned) <= _STAY_DEG:
+            shown.arrived = True
+        elif shown.arrived:
             self.leave(client.client_id)
 
     def _fov_for(self, client: viser.ClientHandle) -> float:

@@ -58,15 +58,16 @@ class LookingPart:
     # ---- Controls.
 
     def _add_layers(self) -> None:
-        modes = self._gui.add_dropdown(
+        modes = self.surfaces = self._gui.add_dropdown(
             "Surfaces",
             self.appearance.modes,
             initial_value=self.appearance.mode,
             hint="How the surfaces look",
         )
         room = self._gui.add_checkbox("Room", True, hint="Floor, walls and what is beyond them")
+        self.boxes: dict[str, viser.GuiCheckboxHandle] = {}
         for layer in self.overlays.values():
-            box = self._gui.add_checkbox(layer.label, layer.on, hint=layer.hint)
+            box = self.boxes[layer.label] = self._gui.add_checkbox(layer.label, layer.on, hint=layer.hint)
             box.on_update(lambda event, layer=layer: self._switch(layer, event.target.value))
         self._legend = self._gui.add_html("")
 

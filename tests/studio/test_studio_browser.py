@@ -232,8 +232,8 @@ def test_hostile_names_show_as_text(tab: Page, server, tmp_path):
     page.selection.set((BOOK,))
     tab.wait_for("document.body.innerText.includes('<img src=x')")
     looking = next(part for part in page.parts if type(part).__name__ == "LookingPart")
-    for layer in looking.overlays.values():
-        looking._switch(layer, True)
+    for box in looking.boxes.values():
+        box.value = True
     tab.settle(2.0)
     assert tab.evaluate("window.hacked === undefined")
     assert tab.evaluate("[...document.images].every((i) => !i.src.endsWith('/x'))")

@@ -1,0 +1,129 @@
+"""Measure the studio on a scene: time until the room is seen, frame rate, bytes of state per second, export size.
+
+    python -m benchmarks.studio SCENE [--registry DIR] [--width 960] [--height 640]
+
+Headless Chromium renders in software (SwiftShader): figures depend on the processor, whose load is printed beside them.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "tests"))
+_BLANK = 8.0  # standard deviation of pixel values below which a view counts as blank
+_LIMIT_S = 120.0
+_MOVES_S = 6.0
+_RATE_HZ = 30.0  # of poses that a running simulation sends
+
+
+def main() -> None:
+    """Print the figures of a scene."""
+    from browser import browser_page, find_browser
+
+    from registry import SceneRegistry
+    from studio.command import PARTS
+    from studio.export import export_html
+    from studio.parts import load_parts
+    from studio.server import StudioServer
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene")
+    parser.add_argument("--registry", type=Path)
+    parser.add_argument("--width", type=int, default=960)
+    parser.add_argument("--height", type=int, default=640)
+    arguments = parser.parse_args()
+    registry = SceneRegistry(arguments.registry)
+    start = time.monotonic()
+    server = StudioServer(registry, load_parts(PARTS), port=0)
+    server.start()
+    page = server.open(arguments.scene)
+    print(
+        f"{len(page.bundle.objects)} objects; server ready after {time.monotonic() - start:.1f} s (imports included)"
+    )
+    with (
+        tempfile.TemporaryDirectory() as profile,
+        browser_page(find_browser(), Path(profile), webgl=True) as tab,
+    ):
+        address = server.url(arguments.scene) + "?fixedDpr=1"
+        for visit in ("first visit", "second visit"):
+            seconds, busy = until_seen(tab, address, arguments.width, arguments.height)
+            print(f"{visit}: room seen after {seconds:.1f} s, {busy:.1f} s of processor time in the browser")
+        tab.settle(2.0)
+        print(f"frames per second while looking around: {frame_rate(tab):.1f} ({canvas_size(tab)})")
+        print(f"state of all objects moving at {_RATE_HZ:.0f} Hz: {state_rate(page) / 1e6:.3f} MB/s")
+    server.stop()
+    print(f"export: {len(export_html(registry, arguments.scene).encode()) / 1e6:.1f} MB")
+    print(f"load of this machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+def until_seen(tab, address: str, width: int, height: int) -> tuple[float, float]:
+    """Open a page; return seconds until its 3D view is not of one color, and the browser's processor seconds."""
+    import cv2
+
+    before, start = _browser_seconds(), time.monotonic()
+    tab.open(address, width, height)
+    while time.monotonic() - start < _LIMIT_S:
+        with tempfile.TemporaryDirectory() as folder:
+            tab.screenshot(Path(folder) / "now.png")
+            shown = cv2.imread(str(Path(folder) / "now.png"))
+        if shown[height // 3 :, : width // 2].std() > _BLANK:
+            return time.monotonic() - start, _browser_seconds() - before
+        time.sleep(0.05)
+    raise TimeoutError(f"the 3D view is blank after {_LIMIT_S:.0f} s")
+
+
+def frame_rate(tab) -> float:
+    """Return frames per second that the page draws while the camera turns with the mouse."""
+    tab.evaluate("window.frames_ = 0; (function f() { window.frames_++; requestAnimationFrame(f); })()")
+    x, y = 220, 300
+    first, start = tab.evaluate("window.frames_"), time.monotonic()
+    while time.monotonic() - start < _MOVES_S:
+        tab.drag((x, y), (x + 90, y + 20), steps=15, pause_s=0.03)
+        tab.drag((x + 90, y + 20), (x, y), steps=15, pause_s=0.03)
+    return (tab.evaluate("window.frames_") - first) / (time.monotonic() - start)
+
+
+def canvas_size(tab) -> str:
+    """Return the size of the 3D view in pixels."""
+    sizes = tab.evaluate("[...document.querySelectorAll('canvas')].map((c) => [c.width, c.height])")
+    width, height = max(sizes, key=lambda size: size[0] * size[1])
+    return f"{width} x {height} pixels"
+
+
+def state_rate(page) -> float:
+    """Return bytes per second of the messages that move all objects at `_RATE_HZ`, as they are serialized."""
+    recording = page.server.get_scene_serializer()
+    first = len(recording._messages)
+    for item in page.bundle.objects:
+        pose = page.pose_of(item.id)
+        pose[2, 3] += 0.001
+        page.set_pose(item.id, pose)
+    import msgspec
+
+    moved = [message for _, message in recording._messages[first:]]
+    recording.serialize()
+    for item in page.bundle.objects:
+        page.set_pose(item.id, page.bundle_pose(item.id))
+    return _RATE_HZ * len(msgspec.msgpack.encode(moved))
+
+
+def _browser_seconds() -> float:
+    total = 0.0
+    for process in psutil.Process().children(recursive=True):
+        try:
+            spent = process.cpu_times()
+        except psutil.Error:
+            continue
+        total += spent.user + spent.system
+    return float(np.round(total, 2))
+
+
+if __name__ == "__main__":
+    main()
