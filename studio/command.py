@@ -13,14 +13,15 @@ PARTS = ("studio.looking:LookingPart",)
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve pages until interrupted, or write one page."""
-    if arguments.export is not None and arguments.scene is None:
+    scene_id: str | None = arguments.scene
+    if arguments.export is not None and scene_id is None:
         raise UsageError("--export: name the scene, as in `simrecon studio SCENE --export room.html`")
     check_viser()
     registry = SceneRegistry(arguments.registry)
-    if arguments.scene is not None:
-        registry.get(arguments.scene)
-    if arguments.export is not None:
-        return _export(registry, arguments.scene, arguments.export)
+    if scene_id is not None:
+        registry.get(scene_id)
+        if arguments.export is not None:
+            return _export(registry, scene_id, arguments.export)
     return _serve(registry, arguments)
 
 

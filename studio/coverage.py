@@ -151,8 +151,8 @@ def _meshes(
 def _fine(mesh: Geometry, edge_m: float) -> Geometry:
     import trimesh
 
-    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge_m, max_iter=12)
-    return Geometry(np.asarray(vertices), np.asarray(faces))
+    fine = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge_m, max_iter=12)
+    return Geometry(np.asarray(fine[0]), np.asarray(fine[1]))
 
 
 def _by_share(mesh: Geometry, share: float) -> CoveredSurface:

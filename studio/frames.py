@@ -5,7 +5,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -80,7 +81,8 @@ class Frames:
     def photograph(self, frame: int) -> np.ndarray | None:
         """Return the undistorted photograph, RGB uint8 (h, w, 3); None: it is not kept."""
         found = self._photographs.get(frame)
-        return None if found is None else np.asarray(found() if callable(found) else found)
+        found = found() if callable(found) else found
+        return None if found is None else np.asarray(found)
 
     def pixel(self, frame: int, point_world: np.ndarray) -> tuple[float, float] | None:
         """Project a point (3,) into a frame, in pixels of the bundle's cameras; None: it is behind the camera."""
@@ -211,15 +213,18 @@ class Frames:
         from reconstruction.measure.stage_results import StageResults
 
         bundle = self._page.bundle
-        found: dict = {
-            f["index"]: lambda path=f["image"]: cv2.imread(str(bundle.resolve(path)))[..., ::-1]
-            for f in bundle.scene.get("instances", {"frames": []})["frames"]
-        }
+        kept = bundle.scene.get("instances", {"frames": []})["frames"]
+        found: dict = {f["index"]: partial(_read_picture, bundle.resolve(f["image"])) for f in kept}
         posed = StageResults.find(bundle, self._page.registry.root).get("poses")
         if posed is not None:
             found |= dict(zip(posed.indices.tolist(), posed.images))
             found |= dict(zip(posed.held_out_indices.tolist(), posed.held_out_images))
         return found
+
+
+def _read_picture(path: Path) -> np.ndarray | None:
+    image = cv2.imread(str(path))
+    return None if image is None else image[..., ::-1]
 
 
 def fly(client: viser.ClientHandle, world_from_camera: np.ndarray, fov: float) -> None:

@@ -1,7 +1,6 @@
 """The panel of one object: what is known about it, as HTML. Texts of the scene are escaped."""
 
 import base64
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -21,13 +20,13 @@ _MARGIN = 0.25  # of the object's own size, around it in its pictures
 _STYLE = "font-size:12.5px;line-height:1.5;padding:2px 10px;color:inherit"
 
 
-def object_html(page: "StudioPage", object_id: int, share_seen: Sequence[float] | None = None) -> str:
+def object_html(page: "StudioPage", object_id: int, share_seen: np.ndarray | None = None) -> str:
     """Return a table about an object.
 
     Args:
         page: the page.
         object_id: one of its objects.
-        share_seen: shares of its surface that are guessed, completed and seen, if they were measured.
+        share_seen: shares (3,) of its surface that are guessed, completed and seen; None: not measured.
     """
     item = next(o for o in page.bundle.objects if o.id == object_id)
     entry = next(o for o in page.bundle.scene["objects"] if o["id"] == object_id)
@@ -129,7 +128,7 @@ def _facts(page: "StudioPage", item: BundleObject) -> list[tuple[str, str]]:
 
 
 def _origins(
-    item: BundleObject, entry: dict[str, Any], share_seen: Sequence[float] | None
+    item: BundleObject, entry: dict[str, Any], share_seen: np.ndarray | None
 ) -> list[tuple[str, str]]:
     seen = float(item.provenance["observed_fraction"])
     bar = (

@@ -128,8 +128,7 @@ class StudioServer:
     async def _serve(self, ready: threading.Event) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         wanted = self._wanted_port
-        ports = range(DEFAULT_PORT, DEFAULT_PORT + _PORTS) if wanted is None else (wanted,)
-        for port in ports:
+        for port in range(DEFAULT_PORT, DEFAULT_PORT + _PORTS) if wanted is None else (wanted,):
             try:
                 server = await serve(
                     self._pass_on, self.host, port, process_request=self._answer, compression=None,
@@ -139,11 +138,11 @@ class StudioServer:
                 self._failed = error
                 continue
             self._failed, self.port = None, next(iter(server.sockets)).getsockname()[1]
-            break
-        ready.set()
-        if self._failed is None:
+            ready.set()
             async with server:
                 await self._stop.wait()
+            return
+        ready.set()
 
     async def _pass_on(self, browser: ServerConnection) -> None:
         """Carry the messages of one browser to its page and back."""

@@ -1,5 +1,6 @@
 """The cameras of the video's frames, with small photographs; a click flies there."""
 
+import threading
 from typing import Any
 
 import cv2
@@ -50,7 +51,7 @@ class CameraLayer(Layer):
         async def on_click(event: viser.SceneNodePointerEvent) -> None:
             self.page.swallow_click()
             # Flying takes a moment; the loop must not wait for it.
-            event.client._thread_executor.submit(self.page.show_frame, frame, event.client_id)
+            threading.Thread(target=self.page.show_frame, args=(frame, event.client_id), daemon=True).start()
 
         return on_click
 

@@ -186,6 +186,25 @@ def test_a_viewer_flies_to_a_camera_and_walks_away(room, tab: Page):
     assert no_errors(tab) == []
 
 
+def test_a_click_on_a_camera_leads_to_it(room, tab: Page):
+    page, client = room
+    looking = next(part for part in page.parts if type(part).__name__ == "LookingPart")
+    looking.boxes["Cameras"].value = True
+    tab.settle(2.0)
+    try:
+        pose = page.frames.world_from_camera(0)
+        tab.click(*in_window(tab, client, pose[:3, 3] + 0.05 * pose[:3, 2]))
+        limit = time.monotonic() + 15
+        while page.frames.shown_to(client.client_id) is None and time.monotonic() < limit:
+            tab.settle(0.3)
+        assert page.frames.shown_to(client.client_id) == 0
+        assert page.selection.ids == ()
+    finally:
+        looking.boxes["Cameras"].value = False
+        page.frames.leave()
+    assert no_errors(tab) == []
+
+
 def test_every_layer_changes_the_picture_and_goes_away_again(room, tab: Page, tmp_path):
     plain = picture(tab, tmp_path)
     for name in ("Names", "Relations", "Scale", "Cameras"):
