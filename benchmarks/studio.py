@@ -56,7 +56,11 @@ def main() -> None:
             seconds, busy = until_seen(tab, address, arguments.width, arguments.height)
             print(f"{visit}: room seen after {seconds:.1f} s, {busy:.1f} s of processor time in the browser")
         tab.settle(2.0)
-        print(f"frames per second while looking around: {frame_rate(tab):.1f} ({canvas_size(tab)})")
+        rate, busy = frame_rate(tab)
+        print(
+            f"frames per second while looking around: {rate:.1f}, {1000 * busy:.0f} ms of processor time a frame "
+            f"({canvas_size(tab)})"
+        )
         print(f"state of all objects moving at {_RATE_HZ:.0f} Hz: {state_rate(page) / 1e6:.3f} MB/s")
     server.stop()
     print(f"export: {len(export_html(registry, arguments.scene).encode()) / 1e6:.1f} MB")
@@ -79,15 +83,16 @@ def until_seen(tab, address: str, width: int, height: int) -> tuple[float, float
     raise TimeoutError(f"the 3D view is blank after {_LIMIT_S:.0f} s")
 
 
-def frame_rate(tab) -> float:
-    """Return frames per second that the page draws while the camera turns with the mouse."""
+def frame_rate(tab) -> tuple[float, float]:
+    """Return frames per second while the camera turns with the mouse, and the browser's processor seconds a frame."""
     tab.evaluate("window.frames_ = 0; (function f() { window.frames_++; requestAnimationFrame(f); })()")
     x, y = 220, 300
-    first, start = tab.evaluate("window.frames_"), time.monotonic()
+    first, start, before = tab.evaluate("window.frames_"), time.monotonic(), _browser_seconds()
     while time.monotonic() - start < _MOVES_S:
         tab.drag((x, y), (x + 90, y + 20), steps=15, pause_s=0.03)
         tab.drag((x + 90, y + 20), (x, y), steps=15, pause_s=0.03)
-    return (tab.evaluate("window.frames_") - first) / (time.monotonic() - start)
+    frames = tab.evaluate("window.frames_") - first
+    return frames / (time.monotonic() - start), (_browser_seconds() - before) / frames
 
 
 def canvas_size(tab) -> str:
