@@ -12,6 +12,7 @@ from studio.layers.base import Layer
 
 _SCALE_M = 0.05  # distance of a frustum's picture from its camera
 _THUMBNAIL_PX = 96
+_BLANK = np.full((18, 24, 3), 225, np.uint8)  # where no photograph is kept: the lines alone cannot be clicked
 _KEYFRAME, _HELD_OUT = (38, 110, 142), (150, 150, 150)
 
 
@@ -32,7 +33,7 @@ class CameraLayer(Layer):
             node = page.server.scene.add_camera_frustum(
                 f"/layers/cameras/{frame}", fov, cameras.width / cameras.height, scale=_SCALE_M, thickness=0.0015,
                 color=_HELD_OUT if frame in held_out else _KEYFRAME, format="jpeg", jpeg_quality=70,
-                image=None if photograph is None else _thumbnail(photograph), wxyz=quat_from_matrix(pose[:3, :3]),
+                image=_BLANK if photograph is None else _thumbnail(photograph), wxyz=quat_from_matrix(pose[:3, :3]),
                 position=pose[:3, 3], cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
             node.on_click(self._clicked(frame))

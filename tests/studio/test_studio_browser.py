@@ -193,7 +193,10 @@ def test_a_click_on_a_camera_leads_to_it(room, tab: Page):
     tab.settle(2.0)
     try:
         pose = page.frames.world_from_camera(0)
-        tab.click(*in_window(tab, client, pose[:3, 3] + 0.05 * pose[:3, 2]))
+        place = in_window(tab, client, pose[:3, 3] + 0.05 * pose[:3, 2])
+        tab.move(*place)
+        tab.settle(1.0)  # what is below the pointer is found in the next frames
+        tab.click(*place)
         limit = time.monotonic() + 15
         while page.frames.shown_to(client.client_id) is None and time.monotonic() < limit:
             tab.settle(0.3)
