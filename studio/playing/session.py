@@ -174,6 +174,12 @@ class PhysicsSession:
         self._put(key, pose)
         self.wake()
 
+    def place(self, key: int, world_from_object: np.ndarray) -> None:
+        """Set the pose (4, 4) of any object, at rest; the others wake, as it may have carried them."""
+        pose = np.asarray(world_from_object, np.float64)
+        self._physics.set_pose(key, pose)
+        self.wake()
+
     # ---- Inside.
 
     def _check_movable(self, key: int) -> None:
