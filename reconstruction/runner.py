@@ -58,7 +58,7 @@ class Run:
     input_digest: str = ""  # of the video; computed if not given
     computed: set[str] = field(default_factory=set)  # stages that this run computed; the others were loaded
     started: float = field(default_factory=time.perf_counter)
-    after_stage: "Callable[[Run, str], None] | None" = None  # called with the name of each computed stage
+    after_stage: "Callable[[Run, str], None] | None" = None  # called after each stage, computed or loaded
 
     def __post_init__(self) -> None:
         """Compute the digest of the input.
@@ -142,7 +142,7 @@ class Run:
         if stage.name == "world":
             self._note_coordinates()
         self.listener.end_stage(stage.name, None if kept else self.usage[stage.name])
-        if self.after_stage is not None and not kept:
+        if self.after_stage is not None:
             self.after_stage(self, stage.name)
 
     def key_of(self, stage: Stage, corrections: list) -> str:

@@ -1,6 +1,7 @@
 """Reconstruction of a video as a registered scene: all stages, passes at other scales if needed, publication."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +51,7 @@ def reconstruct(
     require_stable: bool = False,
     keep_results: int = KEPT_PER_STAGE,
     listener: StageListener = NO_PROGRESS,
+    after_stage: Callable[[Run, str], None] | None = None,
 ) -> Reconstruction:
     """Reconstruct a video, or a folder of images, as a scene of the registry.
 
@@ -64,6 +66,7 @@ def reconstruct(
         require_stable: do not publish a scene in which an object moves in the final simulation.
         keep_results: number of results of each stage that stay in the stage cache.
         listener: receives stages, progress and notes.
+        after_stage: called with the run and the name of each stage that is computed or loaded; it must return at once.
 
     Raises:
         UsageError: the video does not exist, the id is malformed, or an option names an unknown backend.
@@ -93,7 +96,7 @@ def reconstruct(
             listener,
             input_digest=digest,
             started=started,
-            after_stage=_check_registered,
+            after_stage=_after(after_stage),
         )
         try:
             run.execute()
@@ -107,9 +110,20 @@ def reconstruct(
     return Reconstruction(record, run)
 
 
+def _after(also: Callable[[Run, str], None] | None) -> Callable[[Run, str], None]:
+    """Return what is called after each stage."""
+
+    def after(run: Run, stage: str) -> None:
+        _check_registered(run, stage)
+        if also is not None:
+            also(run, stage)
+
+    return after
+
+
 def _check_registered(run: Run, stage: str) -> None:
-    """Note what `simrecon check` finds if the poses stage left many keyframes without a pose."""
-    if stage != "poses":
+    """Note what `simrecon check` finds if the poses stage, just computed, left many keyframes without a pose."""
+    if stage != "poses" or stage not in run.computed:
         return
     posed = run.results["poses"]
     if len(posed.images) < _FEW_REGISTERED * posed.chosen_frames:

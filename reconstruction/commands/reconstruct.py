@@ -3,8 +3,10 @@
 import argparse
 import json
 import sys
+from contextlib import AbstractContextManager, nullcontext
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from reconstruction.commands.options import add_common, add_verb
 
@@ -30,6 +32,7 @@ metric scale, best first:
 examples:
   simrecon reconstruct room.mp4
   simrecon reconstruct room.mp4 --scene kitchen --preset quality
+  simrecon reconstruct room.mp4 --studio      # watch it in the browser; needs pip install 'simrecon[studio]'
   simrecon reconstruct my_scan.r3d            # Record3D or Polycam raw data, with its poses and metric scale
   simrecon reconstruct photos/ --scene dorm --set depth.depth_side_px=640
 """
@@ -83,6 +86,11 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         help="for evaluation: take poses, depth, world, instances (comma separated) from the ground truth",
     )
     add("--ground-truth", type=Path, metavar="DIR", help="folder with the ground truth for --oracle")
+    add(
+        "--studio",
+        action="store_true",
+        help="open a web page that fills as the stages finish and says what to film again; see docs/studio_playing.md",
+    )
     add("--quiet", action="store_true", help="print only the result, no progress")
     add_common(parser)
     parser.set_defaults(run=run)
@@ -107,22 +115,32 @@ def run(arguments: argparse.Namespace) -> int:
     from reconstruction.editing.overrides import Overrides
     from reconstruction.video_to_scene import reconstruct
 
-    listener = make_listener(quiet=arguments.quiet or arguments.json)
-    with listener:
-        result = reconstruct(
-            arguments.video,
-            scene_id=arguments.scene,
-            registry_root=arguments.registry,
-            work_dir=arguments.work_dir,
-            config=config_of(arguments),
-            overrides=Overrides.load(arguments.overrides) if arguments.overrides else None,
-            oracle=oracle_of(arguments),
-            require_stable=arguments.require_stable,
-            keep_results=arguments.keep_results,
-            listener=listener,
-        )
-    _print_result(result, arguments)
+    with _live_page(arguments) as page:
+        with make_listener(quiet=arguments.quiet or arguments.json) as listener:
+            result = reconstruct(
+                arguments.video,
+                scene_id=arguments.scene,
+                registry_root=arguments.registry,
+                work_dir=arguments.work_dir,
+                config=config_of(arguments),
+                overrides=Overrides.load(arguments.overrides) if arguments.overrides else None,
+                oracle=oracle_of(arguments),
+                require_stable=arguments.require_stable,
+                keep_results=arguments.keep_results,
+                listener=listener if page is None else page.watch(listener),
+                after_stage=None if page is None else page.show,
+            )
+        _print_result(result, arguments)
+        if page is not None:
+            page.keep(arguments.registry, result.record.scene_id)
     return 0
+
+
+def _live_page(arguments: argparse.Namespace) -> AbstractContextManager[Any]:
+    """Return the page of `--studio`, or a context of None; `studio` is imported by name, only if asked for."""
+    if not arguments.studio:
+        return nullcontext()
+    return import_module("studio.live").LivePage(arguments.video)
 
 
 def oracle_of(arguments: argparse.Namespace) -> "Oracle | None":

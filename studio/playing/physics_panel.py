@@ -35,7 +35,7 @@ class PhysicsPanel:
         self._said_at = 0.0
         gui = page.server.gui
         with gui.add_folder("Physics"):
-            self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, hint="Let time pass, at real time")
+            self._play = gui.add_button("Run physics", icon=viser.Icon.PLAYER_PLAY, hint="Let time pass, at real time")
             self._more = gui.add_button_group("Physics", ("Step", "Reset"))
             self._mouse = gui.add_dropdown(
                 "Mouse", (DRAG, PUSH), initial_value=DRAG, hint="drag: pull a thing with the left button; push: click it"
@@ -155,7 +155,7 @@ class PhysicsPanel:
         self._page.say(text, error=True)
 
     def _show_running(self, running: bool) -> None:
-        self._play.label = "Pause" if running else "Play"
+        self._play.label = "Pause physics" if running else "Run physics"
         self._play.icon = viser.Icon.PLAYER_PAUSE if running else viser.Icon.PLAYER_PLAY
 
     def _moved_elsewhere(self, key: int) -> None:
