@@ -22,6 +22,7 @@ from reconstruction.runner import Run
 from registry import SceneRegistry
 from studio.command import PARTS, check_viser
 from studio.refilm import FilmCheck, advice_on_poses, advice_on_things
+from studio.same_origin import same_origin_only
 from studio.text import bare, plain_markdown
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ class LivePage:
         from studio.live_layers import LiveLayers
 
         self._video = video
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of its own
+        # viser prints a table of its own.
+        with contextlib.redirect_stdout(io.StringIO()), same_origin_only(_HOST):
             self._server: Any = viser.ViserServer(host=_HOST, port=port, label=bare(video.name), verbose=False)
         self.port: int = self._server.get_port()
         self._layers: LiveLayers = LiveLayers(self._server)

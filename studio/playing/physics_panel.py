@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
+from registry.errors import SimReconError
 from registry.geometry import matrix_from_quat, rigid
 from registry.simulation import specs_from_bundle
 from studio.playing.player import PhysicsPlayer, PlayerState
 from studio.playing.session import PhysicsSession
 from studio.selection import Click
+from studio.text import plain_markdown
 
 if TYPE_CHECKING:
     from studio.playing.poses_in_use import PosesInUse
@@ -62,6 +64,8 @@ class PhysicsPanel:
     def play(self) -> None:
         """Let time pass from the poses that the page shows."""
         player = self._ready()
+        if player is None:
+            return
         player.play()
         self._show_running(True)
         self._arm()
@@ -76,7 +80,9 @@ class PhysicsPanel:
     def step(self) -> None:
         """Simulate 1/30 s."""
         self.pause()
-        self._ready().step()
+        player = self._ready()
+        if player is not None:
+            player.step()
 
     def reset(self) -> None:
         """Return everything to where it was before the first play, to the bit."""
@@ -90,8 +96,8 @@ class PhysicsPanel:
             return
         height = float(self._height.value)
         self.play()
-        player = self._ready()
-        for key in ids:
+        player = self._player
+        for key in ids if player is not None else ():
             player.do(lambda session, key=key: session.lift(key, height))
 
     # ---- Life.
@@ -118,11 +124,16 @@ class PhysicsPanel:
 
     # ---- Inside.
 
-    def _ready(self) -> PhysicsPlayer:
-        """Return the player, with bodies where the page shows them."""
+    def _ready(self) -> PhysicsPlayer | None:
+        """Return the player, with bodies where the page shows them; None: the scene has no physics, which is told."""
         start = self._poses.take(self)
         if self._player is None:
-            session = PhysicsSession(specs_from_bundle(self._page.bundle), start)
+            try:
+                session = PhysicsSession(specs_from_bundle(self._page.bundle), start)
+            except SimReconError as error:
+                self._state.content = plain_markdown(error)
+                self._page.say(str(error), error=True)
+                return None
             self._player = PhysicsPlayer(session, self._show_poses, self._show_state, self._refuse)
             self._set_speed()
         return self._player

@@ -20,6 +20,7 @@ _PULL_RAD_S = 20.0  # natural frequency of the spring of a drag, critically damp
 _MOST_PULL_M_S2 = 60.0  # a grabbed object pushes others with at most six times its weight
 _GRABBED_DAMPING = 4.0  # 1/s, angular: a grabbed object stops swinging
 _SHOWN_M, _SHOWN_RAD = 1e-4, 1e-3  # smaller motion of an awake body is not reported
+_REST_M, _REST_RAD = 1e-5, 1e-4  # that of a body that has fallen asleep; woken bodies settle by less
 _LOST_M = 5.0  # below the lowest body of the start: an object that falls this deep returns
 
 
@@ -81,13 +82,13 @@ class PhysicsSession:
     def changes(self) -> dict[int, np.ndarray]:
         """Return the poses (7,) of the bodies that moved since the last call, by id.
 
-        A body that sleeps is reported once more, with its exact pose, and then not at all.
+        A body that falls asleep is reported once more, so that it is shown to 0.01 mm, and then not at all.
         """
         found: dict[int, np.ndarray] = {}
         for key, body in self._bodies.items():
             pose, shown = self.pose(key), self._shown[key]
-            differs = not np.array_equal(pose, shown) if body.is_sleeping else _visibly_differs(pose, shown)
-            if differs:
+            most = (_REST_M, _REST_RAD) if body.is_sleeping else (_SHOWN_M, _SHOWN_RAD)
+            if _differs(pose, shown, *most):
                 found[key] = self._shown[key] = pose
         return found
 
@@ -222,7 +223,8 @@ def _floats(values: Any) -> Any:
     return np.asarray(values, np.float32)
 
 
-def _visibly_differs(pose: np.ndarray, shown: np.ndarray) -> bool:
+def _differs(pose: np.ndarray, shown: np.ndarray, most_m: float, most_rad: float) -> bool:
     moved = float(np.linalg.norm(pose[:3] - shown[:3]))
-    turned = 2 * float(np.arccos(min(1.0, abs(float(pose[3:] @ shown[3:])))))
-    return not (moved < _SHOWN_M and turned < _SHOWN_RAD)
+    # Differences are accurate for small angles; arccos of float32 quaternions is not.
+    turned = 2 * float(min(np.linalg.norm(pose[3:] - shown[3:]), np.linalg.norm(pose[3:] + shown[3:])))
+    return not (moved < most_m and turned < most_rad)  # also if it is not finite
