@@ -14,7 +14,7 @@ import threading
 import time
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from reconstruction.core.profiling import Usage
 from reconstruction.core.progress import StageListener
@@ -24,9 +24,6 @@ from studio.command import PARTS, check_viser
 from studio.refilm import FilmCheck, advice_on_poses, advice_on_things
 from studio.same_origin import same_origin_only
 from studio.text import bare, plain_markdown
-
-if TYPE_CHECKING:
-    from studio.live_layers import LiveLayers
 
 logger = logging.getLogger(__name__)
 _HOST = "127.0.0.1"
@@ -53,9 +50,11 @@ class LivePage:
         self._video = video
         # viser prints a table of its own.
         with contextlib.redirect_stdout(io.StringIO()), same_origin_only(_HOST):
-            self._server: Any = viser.ViserServer(host=_HOST, port=port, label=bare(video.name), verbose=False)
+            self._server: Any = viser.ViserServer(
+                host=_HOST, port=port, label=bare(video.name), verbose=False
+            )
         self.port: int = self._server.get_port()
-        self._layers: LiveLayers = LiveLayers(self._server)
+        self._layers = LiveLayers(self._server)
         self._build()
         self._jobs: queue.Queue = queue.Queue()
         self._check: FilmCheck | None = None
@@ -72,8 +71,12 @@ class LivePage:
 
     def __enter__(self) -> "LivePage":
         """Say where the page is, and open it."""
-        print(f"studio: {self.url}", file=sys.stderr, flush=True)
-        if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32"):
+        _tell_terminal(self.url)
+        if (
+            os.environ.get("DISPLAY")
+            or os.environ.get("WAYLAND_DISPLAY")
+            or sys.platform in ("darwin", "win32")
+        ):
             with contextlib.suppress(webbrowser.Error):
                 webbrowser.open(self.url)
         return self
@@ -108,11 +111,11 @@ class LivePage:
         page = StudioPage(
             SceneRegistry(registry_root), scene_id, parts=load_parts(PARTS), host=_HOST, port=self.port
         )
-        print(f"studio: {self.url} stays until it is closed; Ctrl-C ends it, too", file=sys.stderr, flush=True)
+        _tell_terminal(f"{self.url} stays until it is closed; Ctrl-C ends it, too")
         try:
             _wait_for_viewers(page.server, time.monotonic() + _COME_BACK_S)
         except KeyboardInterrupt:
-            print(file=sys.stderr)
+            _tell_terminal("ended")
         finally:
             page.close()
 
@@ -131,7 +134,9 @@ class LivePage:
     def _do(self, kind: str, *values: Any) -> None:
         if kind == "begin":
             name, number, total, cached = values
-            self._step.content = f"**{number} of {total}: {plain_markdown(name)}**" + (" (from the cache)" if cached else "")
+            self._step.content = f"**{number} of {total}: {plain_markdown(name)}**" + (
+                " (from the cache)" if cached else ""
+            )
             self._bar.value = 100.0 * (number - 1) / total
         elif kind == "progress":
             label, done, of = values
@@ -161,7 +166,9 @@ class LivePage:
         self._tell()
 
     def _tell(self) -> None:
-        done = "\n".join(f"- {plain_markdown(stage)}: {plain_markdown(line)}" for stage, line in self._lines.items())
+        done = "\n".join(
+            f"- {plain_markdown(stage)}: {plain_markdown(line)}" for stage, line in self._lines.items()
+        )
         self._done.content = done
         advice = "\n".join(f"- {plain_markdown(line)}" for line in self._advice)
         self._again.content = advice or "nothing so far"
@@ -198,7 +205,7 @@ class LivePage:
 
 
 class _Watched:
-    """A listener that passes everything on, and hands it to the thread that draws; progress at most 4 times a second."""
+    """Passes everything on, and hands it to the thread that draws; progress at most 4 times a second."""
 
     def __init__(self, listener: StageListener, jobs: queue.Queue) -> None:
         self._listener, self._jobs = listener, jobs
@@ -227,6 +234,11 @@ class _Watched:
     def note(self, message: str) -> None:
         self._listener.note(message)
         self._jobs.put(("note", message))
+
+
+def _tell_terminal(text: str) -> None:
+    sys.stderr.write(f"studio: {text}\n")
+    sys.stderr.flush()
 
 
 def _wait_for_viewers(server: Any, until: float) -> None:

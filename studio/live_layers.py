@@ -30,7 +30,15 @@ _SHEET_FRAMES, _SHEET_PX = 12, 160  # of the sheet of keyframes
 _POINTS = 60_000  # depth pixels that are shown
 _ASSUMED_M = 1.5  # median distance from camera to points before the scale is known
 _INSTANCE_COLORS = np.array(
-    [[228, 26, 28], [55, 126, 184], [77, 175, 74], [152, 78, 163], [255, 127, 0], [166, 86, 40], [247, 129, 191]]
+    [
+        [228, 26, 28],
+        [55, 126, 184],
+        [77, 175, 74],
+        [152, 78, 163],
+        [255, 127, 0],
+        [166, 86, 40],
+        [247, 129, 191],
+    ]
 )  # ColorBrewer's Set1
 
 
@@ -106,8 +114,10 @@ class LiveLayers:
             colors[mine] = 0.5 * colors[mine] + 0.5 * shown
             self._draw_surface(colors.astype(np.uint8))
         for thing in found.objects:
-            top = thing.center + [0, 0, 0.5 * thing.extents_m[2] + 0.03]
-            self._server.scene.add_label(f"/live/labels/{thing.id}", bare(f"{thing.label} {thing.id}"), position=top)
+            top = thing.center + np.array([0, 0, 0.5 * thing.extents_m[2] + 0.03])
+            self._server.scene.add_label(
+                f"/live/labels/{thing.id}", bare(f"{thing.label} {thing.id}"), position=top
+            )
         return f"{len(found.objects)} things"
 
     def _assets(self, assets: AssetSet) -> str:
@@ -136,7 +146,11 @@ class LiveLayers:
         poses, points = moved_by(self._world_from_sfm, posed)
         scene = self._server.scene
         scene.add_point_cloud(
-            "/live/points", points.astype(np.float32), posed.point_colors, point_size=0.012, precision="float32"
+            "/live/points",
+            points.astype(np.float32),
+            posed.point_colors,
+            point_size=0.012,
+            precision="float32",
         )
         fov = 2 * np.arctan2(0.5 * posed.camera.height, posed.camera.fy)
         for row, pose in enumerate(poses):

@@ -1,4 +1,4 @@
-"""Advice on what to film again: from `simrecon check`, from notes of the stages, and from how much of things was seen."""
+"""Advice on what to film again: from `simrecon check`, from frames without a pose, and from how much was seen."""
 
 import json
 import subprocess
@@ -44,7 +44,9 @@ class FilmCheck:
             lines = json.loads(text)["lines"]
         except (ValueError, KeyError):  # it was ended, or the film cannot be read
             return
-        self._on_advice([f"{x['name']}: {x['text']}. {x['advice']}".strip() for x in lines if x["status"] != "pass"])
+        self._on_advice(
+            [f"{x['name']}: {x['text']}. {x['advice']}".strip() for x in lines if x["status"] != "pass"]
+        )
 
 
 def advice_on_poses(posed: PosedFrames) -> list[str]:
@@ -76,7 +78,9 @@ def advice_on_things(assets: AssetSet, posed: PosedFrames, world_from_sfm: np.nd
         seen = item.provenance.observed_fraction
         if seen < LITTLE_SEEN:
             side = unvisited_side(item.world_from_object[:3, 3], centers, forward, float(half))
-            out.append(f"{item.label} {item.id}: {seen:.0%} of its surface was seen. Film it from its {side} side, too")
+            out.append(
+                f"{item.label} {item.id}: {seen:.0%} of its surface was seen. Film it from its {side} side, too"
+            )
     return out
 
 

@@ -1,6 +1,7 @@
 """The assembly of a scene as steps: floor and walls first, then each object after the object that carries it.
 
-A bundle stores no steps. The order follows from its scene graph, as in `reconstruction.assembly`: by depth, then height.
+A bundle stores no steps. The order follows from its scene graph, as in `reconstruction.assembly`: by depth, then by
+height.
 """
 
 from collections.abc import Mapping
@@ -31,7 +32,9 @@ class AssemblyStep:
     settling: str  # difference to the reconstructed pose, and repairs
 
 
-def assembly_steps(bundle: SceneBundle, poses: Mapping[int, np.ndarray] | None = None) -> tuple[AssemblyStep, ...]:
+def assembly_steps(
+    bundle: SceneBundle, poses: Mapping[int, np.ndarray] | None = None
+) -> tuple[AssemblyStep, ...]:
     """Return the steps of a bundle's assembly, in order.
 
     Args:

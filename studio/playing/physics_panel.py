@@ -37,10 +37,15 @@ class PhysicsPanel:
         self._said_at = 0.0
         gui = page.server.gui
         with gui.add_folder("Physics"):
-            self._play = gui.add_button("Run physics", icon=viser.Icon.PLAYER_PLAY, hint="Let time pass, at real time")
+            self._play = gui.add_button(
+                "Run physics", icon=viser.Icon.PLAYER_PLAY, hint="Let time pass, at real time"
+            )
             self._more = gui.add_button_group("Physics", ("Step", "Reset"))
             self._mouse = gui.add_dropdown(
-                "Mouse", (DRAG, PUSH), initial_value=DRAG, hint="drag: pull a thing with the left button; push: click it"
+                "Mouse",
+                (DRAG, PUSH),
+                initial_value=DRAG,
+                hint="drag: pull a thing with the left button; push: click it",
             )
             self._push_speed = gui.add_slider("Push (m/s)", 0.1, 3.0, 0.1, 0.8)
             self._drop = gui.add_button("Drop selected", icon=viser.Icon.ARROW_DOWN)
@@ -159,7 +164,9 @@ class PhysicsPanel:
         self._said_at = now
         how = "running" if state.running else _PAUSED
         moving = "all at rest" if not state.moving else f"{state.moving} moving"
-        pace = f", {100 * state.real_time:.0f} % of real time" if state.running and state.real_time < 0.9 else ""
+        pace = (
+            f", {100 * state.real_time:.0f} % of real time" if state.running and state.real_time < 0.9 else ""
+        )
         self._state.content = f"{how}, {state.time_s:.1f} s, {moving}{pace}"
 
     def _refuse(self, text: str) -> None:
@@ -226,5 +233,10 @@ class PhysicsPanel:
             return
         if click.id not in self._page.object_handles():
             return
-        key, point, along, speed = click.id, click.point_world, click.ray_direction, float(self._push_speed.value)
+        key, point, along, speed = (
+            click.id,
+            click.point_world,
+            click.ray_direction,
+            float(self._push_speed.value),
+        )
         player.do(lambda session: session.push(key, point, along, speed))

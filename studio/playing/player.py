@@ -140,7 +140,9 @@ class PhysicsPlayer:
                 logger.exception("studio: the physics stopped")
                 self._set_running(False)
             if running and last is not None:
-                self._real_time += _SHARE * (self._tick_s * self.speed / max(now - last, 1e-6) - self._real_time)
+                self._real_time += _SHARE * (
+                    self._tick_s * self.speed / max(now - last, 1e-6) - self._real_time
+                )
             last = now if running else None
             due += self._tick_s
             time.sleep(max(0.0, due - time.perf_counter()))

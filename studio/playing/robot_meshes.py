@@ -12,7 +12,9 @@ import numpy as np
 from registry.geometry import rigid, transform_points
 
 logger = logging.getLogger(__name__)
-_MOST_FACES = 1500  # of a part: a robot of 25 parts stays below 40,000, and keeps its silhouette at arm's length
+_MOST_FACES = (
+    1500  # of a part: a robot of 25 parts stays below 40,000, and keeps its silhouette at arm's length
+)
 _GRAY = (0.62, 0.64, 0.67)
 _PRIMITIVES = ("box", "cylinder", "sphere")
 
@@ -29,9 +31,7 @@ class LinkPart:
 def link_parts(agent: Any) -> list[tuple[LinkPart, ...]]:
     """Return the meshes of every link of a ManiSkill agent, in the order of `agent.robot.links`."""
     visuals = _urdf_visuals(Path(agent.urdf_path)) if getattr(agent, "urdf_path", None) else {}
-    return [
-        tuple(visuals.get(link.name) or _collision_parts(link._objs[0])) for link in agent.robot.links
-    ]
+    return [tuple(visuals.get(link.name) or _collision_parts(link._objs[0])) for link in agent.robot.links]
 
 
 def _urdf_visuals(file: Path) -> dict[str, list[LinkPart]]:
@@ -65,7 +65,9 @@ def _visual_parts(visual: Any, folder: Path, colors: dict) -> Iterator[LinkPart]
             part = scene.geometry[name]
             if isinstance(part, trimesh.Trimesh):
                 vertices = transform_points(file_from_part, np.asarray(part.vertices, np.float64)) * scale
-                yield _thinned(transform_points(link_from_visual, vertices), part.faces, told or _color_of(part))
+                yield _thinned(
+                    transform_points(link_from_visual, vertices), part.faces, told or _color_of(part)
+                )
         return
     shape = next(geometry.find(kind) for kind in _PRIMITIVES if geometry.find(kind) is not None)
     if shape.tag == "box":

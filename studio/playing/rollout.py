@@ -89,7 +89,9 @@ def record(request: RolloutRequest, send: Send) -> None:
     try:
         scene: Any = env.unwrapped
         if scene.task_object is None:
-            raise UsageError(f"task {request.task}: {scene.task_note or 'there is nothing to do in this scene'}")
+            raise UsageError(
+                f"task {request.task}: {scene.task_note or 'there is nothing to do in this scene'}"
+            )
         actor = policy.make(env)
         watcher = _Watcher(scene)
         name = f"{request.policy}, seed {request.seed}"
@@ -214,7 +216,7 @@ def _read_index(file: Path) -> dict[str, Any]:
     if file.suffix != ".h5" or not file.is_file() or not index.is_file():
         raise UsageError(
             f"{file}: there is no ManiSkill trajectory; name a file trajectory.h5 with its .json, as written by "
-            "`simrecon benchmark generate --demos`"
+            "`simrecon benchmark demos --maniskill`"
         )
     try:
         found = json.loads(index.read_text(encoding="utf-8"))

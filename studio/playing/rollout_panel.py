@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from studio.playing.poses_in_use import PosesInUse
     from studio.scene_view import StudioPage
 
-_SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
+_SPEEDS: tuple[str, ...] = ("0.25x", "0.5x", "1x", "2x", "4x")
 _IDLE = "A robot does a task of this scene. The simulator starts in a process of its own, which takes some seconds."
 
 
@@ -33,14 +33,18 @@ class RolloutPanel:
         self._ticker = Ticker(self._tick, "studio-rollout")
         gui = page.server.gui
         with gui.add_folder("Rollout", expand_by_default=False):
-            self._task = gui.add_dropdown("Task", KINDS, initial_value=KINDS[0], hint="a kind, or a task of the list")
+            self._task = gui.add_dropdown(
+                "Task", KINDS, initial_value=KINDS[0], hint="a kind, or a task of the list"
+            )
             self._policy = gui.add_dropdown("By", policy_names(page.scene_id), initial_value=SCRIPT)
             self._robot = gui.add_dropdown("Robot", ROBOTS, initial_value=ROBOTS[0])
             self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
             self._record = gui.add_button("Record", icon=viser.Icon.PLAYER_RECORD)
             self._list = gui.add_button("List tasks", hint="the tasks that the robot can likely do here")
             with gui.add_folder("Demonstration", expand_by_default=False):
-                self._file = gui.add_text("File", "", hint="trajectory.h5, from `simrecon benchmark generate --demos`")
+                self._file = gui.add_text(
+                    "File", "", hint="trajectory.h5, from `simrecon benchmark demos --maniskill`"
+                )
                 self._episode = gui.add_number("Episode", 0, min=0, max=100_000, step=1)
                 self._open = gui.add_button("Open")
             self._play = gui.add_button("Play rollout", icon=viser.Icon.PLAYER_PLAY, disabled=True)
@@ -150,7 +154,11 @@ class RolloutPanel:
 
     def _where(self) -> dict[str, str]:
         page = self._page
-        return {"scene": page.scene_id, "registry": str(page.registry.root.absolute()), "revision": page.revision}
+        return {
+            "scene": page.scene_id,
+            "registry": str(page.registry.root.absolute()),
+            "revision": page.revision,
+        }
 
     def _start(self, request: RolloutRequest) -> None:
         self.leave()

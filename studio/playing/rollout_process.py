@@ -46,7 +46,7 @@ class RolloutProcess:
 
         Args:
             request: What to make.
-            on_message: Receives a `RolloutHead`, then `RolloutFrame`s; or a tuple of names of tasks. Called in a thread.
+            on_message: Receives a `RolloutHead`, then `RolloutFrame`s; or names of tasks. Called in a thread.
             on_end: Receives "" at the end, or why it failed; not called after `stop`.
         """
         # spawn: the page's process has threads, and a simulator must not be forked.

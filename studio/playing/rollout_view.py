@@ -75,7 +75,10 @@ class RolloutView:
         second = min(first + 1, len(self._frames) - 1)
         share = float(np.clip(at - first, 0.0, 1.0))
         a, b = self._frames[first], self._frames[second]
-        objects, links = _between(a.object_poses, b.object_poses, share), _between(a.link_poses, b.link_poses, share)
+        objects, links = (
+            _between(a.object_poses, b.object_poses, share),
+            _between(a.link_poses, b.link_poses, share),
+        )
         with self._page.server.atomic():
             for row, key in enumerate(self.head.object_ids):
                 if self._shown is None or not np.array_equal(objects[row], self._shown[0][row]):
@@ -122,7 +125,10 @@ class RolloutView:
         time_s = series(label="s")
         plots = [
             gui.add_uplot(
-                (empty, empty), (time_s, series(label="reward", stroke=_REWARD, width=2)), title="Reward", **common
+                (empty, empty),
+                (time_s, series(label="reward", stroke=_REWARD, width=2)),
+                title="Reward",
+                **common,
             )
         ]
         if self.head.has_contacts:
@@ -131,7 +137,9 @@ class RolloutView:
                 series(label=CONTACTS[0], stroke=_TARGET, width=2),
                 series(label=CONTACTS[1], stroke=_OTHERS, width=1),
             )
-            plots.append(gui.add_uplot((empty, empty, empty), both, title="Contact forces of the robot", **common))
+            plots.append(
+                gui.add_uplot((empty, empty, empty), both, title="Contact forces of the robot", **common)
+            )
         return plots
 
     def _plot(self) -> None:

@@ -187,7 +187,9 @@ class PhysicsSession:
         if key not in self._bodies:
             spec = self._physics.specs.get(key)
             name = f"object {key}" if spec is None else spec.name.replace("_", " ")
-            raise UsageError(f"{name} does not move: it is fixed in this scene. `movable` in the overrides frees it")
+            raise UsageError(
+                f"{name} does not move: it is fixed in this scene. `movable` in the overrides frees it"
+            )
 
     def _matrix(self, key: int) -> np.ndarray:
         pose = self._entities[key].pose

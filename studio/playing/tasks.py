@@ -5,9 +5,9 @@ from pathlib import Path
 from registry import SceneBundle, SceneRegistry
 from registry.errors import UsageError
 
-KINDS = ("pick", "reach", "place", "put", "stack", "push", "rearrange", "navigate")
+KINDS: tuple[str, ...] = ("pick", "reach", "place", "put", "stack", "push", "rearrange", "navigate")
 """Kinds of tasks, without the import of the simulator; the scene's easiest task of a kind is taken."""
-ROBOTS = ("panda", "panda_wristcam", "fetch", "so100", "koch-v1.1")
+ROBOTS: tuple[str, ...] = ("panda", "panda_wristcam", "fetch", "so100", "koch-v1.1")
 SCRIPT, STILL, RANDOM = "script", "nothing (still)", "random"
 TRAINED = "trained: "
 _POLICIES = {SCRIPT: "oracle", STILL: "still", RANDOM: "random"}

@@ -1,6 +1,6 @@
 """Runs the physics of a page for a while with a viewer, and prints its memory and its messages.
 
-    python tests/studio/playing/soak.py REGISTRY SCENE [SECONDS]
+python tests/studio/playing/soak.py REGISTRY SCENE [SECONDS]
 """
 
 import sys
@@ -37,7 +37,7 @@ def soak(registry: Path, scene: str, seconds: float, warm_s: float = _WARM_S) ->
             if time.monotonic() > report:
                 report += 60
                 now = memory.memory_info().rss / 2**20
-                print(f"{time.monotonic() - began:.0f} s: {now:.1f} MB, {now - first:+.1f}", flush=True)
+                sys.stderr.write(f"{time.monotonic() - began:.0f} s: {now:.1f} MB, {now - first:+.1f}\n")
         passed = time.monotonic() - began
         last = memory.memory_info().rss / 2**20
         return {
@@ -68,4 +68,6 @@ def _play(physics, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    print(soak(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]) if len(sys.argv) > 3 else 1800.0))
+    sys.stdout.write(
+        f"{soak(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]) if len(sys.argv) > 3 else 1800.0)}\n"
+    )

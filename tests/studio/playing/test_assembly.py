@@ -44,4 +44,6 @@ def test_moved_objects_end_where_they_were_moved(bundle):
     pose[:3, 3] = [0.3, 0.2, 0.1]
     steps = {step.object_id: step for step in assembly_steps(bundle, {BOOK: pose})}
     assert np.array_equal(steps[BOOK].pose, pose)
-    assert steps[KNOB].pose == pytest.approx(next(o for o in bundle.objects if o.id == KNOB).world_from_object)
+    assert steps[KNOB].pose == pytest.approx(
+        next(o for o in bundle.objects if o.id == KNOB).world_from_object
+    )

@@ -55,7 +55,9 @@ def test_before_the_world_frame_the_cameras_put_the_scene_upright(sfm):
     posed, _, world = sfm
     poses, points = moved_by(upright_from_cameras(posed), posed)
     assert (-poses[:, :3, 1]).mean(axis=0)[2] > 0.8
-    assert np.median(points, axis=0) == pytest.approx([0, 0, 0], abs=0.15)  # a median of coordinates turns a little
+    assert np.median(points, axis=0) == pytest.approx(
+        [0, 0, 0], abs=0.15
+    )  # a median of coordinates turns a little
     distance = np.linalg.norm(poses[:, :3, 3], axis=1)
     assert np.median(distance) == pytest.approx(1.5)  # from where the median of the points went
     assert np.linalg.det(poses[:, :3, :3]) == pytest.approx(np.ones(len(poses)))
@@ -134,12 +136,19 @@ def test_the_page_fills_as_stages_finish_and_passes_everything_on(small_capture,
         page._drain()
         assert kept.done == 20
         assert len(kept.notes) == 4
-        until(lambda: created(viewer) >= {"/live/points", "/live/depth", "/live/floor"}, "points and depth are shown")
+        until(
+            lambda: created(viewer) >= {"/live/points", "/live/depth", "/live/floor"},
+            "points and depth are shown",
+        )
         cameras = [name for name in created(viewer) if name.startswith("/live/cameras/")]
         assert len(cameras) == len(posed.images)
         camera = int(posed.indices[0])
         true = world.apply_to(posed).world_from_camera[0]
-        place = [m["position"] for m in viewer.messages if m.get("name") == f"/live/cameras/{camera}" and "position" in m]
+        place = [
+            m["position"]
+            for m in viewer.messages
+            if m.get("name") == f"/live/cameras/{camera}" and "position" in m
+        ]
         assert place[-1] == pytest.approx(true[:3, 3], abs=1e-5)
         assert "script" in page._said.content
         assert "<script" not in page._said.content
@@ -160,7 +169,11 @@ def test_the_page_ends_at_once_if_nobody_looks(play_registry, tmp_path):
 
 
 def created(viewer):
-    return {m["name"] for m in viewer.messages if "name" in m and m["type"].endswith(("Message",)) and "props" in m}
+    return {
+        m["name"]
+        for m in viewer.messages
+        if "name" in m and m["type"].endswith(("Message",)) and "props" in m
+    }
 
 
 def until(true, what, seconds=15.0):

@@ -60,11 +60,21 @@ def test_a_dragged_thing_rises_in_the_picture_and_lands_when_it_is_let_go(page, 
         browser._mouse("mouseMoved", x, y - 5 * step, "left", 1, ())
         browser.settle(0.1)
     until(browser, lambda: page.pose_of(BOX)[2, 3] > before[2, 3] + 0.1, "the box is in the air")
-    until(browser, lambda: (at := red_box(browser, shot)) and at[1] < y - 35, "the picture shows it in the air")
+    until(
+        browser, lambda: (at := red_box(browser, shot)) and at[1] < y - 35, "the picture shows it in the air"
+    )
     browser._mouse("mouseReleased", x, y - 75, "left", 0, ())
     until(browser, lambda: page.pose_of(BOX)[2, 3] < TABLE_TOP_M + 0.05, "the box has landed")
-    until(browser, lambda: (at := red_box(browser, shot)) and abs(at[1] - y) < 20, "the picture shows it on the table")
+    until(
+        browser,
+        lambda: (at := red_box(browser, shot)) and abs(at[1] - y) < 20,
+        "the picture shows it on the table",
+    )
     browser.press("Reset")
     until(browser, lambda: np.array_equal(page.pose_of(BOX), before), "it is where it was")
-    until(browser, lambda: (at := red_box(browser, shot)) and np.hypot(at[0] - x, at[1] - y) < 3, "the picture, too")
+    until(
+        browser,
+        lambda: (at := red_box(browser, shot)) and np.hypot(at[0] - x, at[1] - y) < 3,
+        "the picture, too",
+    )
     assert [e for e in browser.errors if not any(known in e for known in OF_VISER)] == []

@@ -63,7 +63,9 @@ def test_links_move_as_one_robot(pick):
         apart = frame.link_poses[finger, :3] - frame.link_poses[hand, :3]
         rotation = matrix_from_quat(frame.link_poses[hand, 3:].astype(np.float64))
         local = rotation.T @ apart
-        assert local[[0, 2]] == pytest.approx([0.0, 0.0584], abs=1e-3)  # the joint of the URDF; it slides along y
+        assert local[[0, 2]] == pytest.approx(
+            [0.0, 0.0584], abs=1e-3
+        )  # the joint of the URDF; it slides along y
         assert 0 <= local[1] <= 0.0405
 
 
@@ -81,7 +83,13 @@ def test_a_trajectory_is_replayed_as_it_was_recorded(play_registry, tmp_path):
     from simrecon_envs.benchmark.policies import CONTROL_MODE, OraclePolicy
     from simrecon_envs.registration import make_cpu
 
-    env = make_cpu("room", registry=play_registry.root, task="reach_box", control_mode=CONTROL_MODE, obs_mode="state_dict")
+    env = make_cpu(
+        "room",
+        registry=play_registry.root,
+        task="reach_box",
+        control_mode=CONTROL_MODE,
+        obs_mode="state_dict",
+    )
     file = TrajectoryFile(env, tmp_path)
     seen, rewards = [], []
 
@@ -110,7 +118,10 @@ def test_a_trajectory_is_replayed_as_it_was_recorded(play_registry, tmp_path):
         ({"trajectory": str(tmp_path / "none.h5")}, "no ManiSkill trajectory"),
     ):
         with pytest.raises(UsageError, match=text):
-            replay(RolloutRequest(**{**where(play_registry), "trajectory": request.trajectory, **wrong}), got.append)
+            replay(
+                RolloutRequest(**{**where(play_registry), "trajectory": request.trajectory, **wrong}),
+                got.append,
+            )
 
 
 @pytest.mark.end_to_end

@@ -66,7 +66,7 @@ def test_the_last_report_of_a_body_is_where_it_rests(session):
 
 
 def test_a_dragged_thing_follows_the_pointer(session):
-    point = session.pose(BOX)[:3] + [0.0, 0.0, 0.06]
+    point = session.pose(BOX)[:3] + np.array([0.0, 0.0, 0.06])
     session.grab("me", BOX, point)
     local = np.array([0.0, 0.0, 0.06])
     target = point
@@ -92,7 +92,7 @@ def test_a_thing_is_not_dragged_through_the_table(session):
 
 def test_a_push_gives_the_speed_that_was_asked_for(session):
     pose = session.pose(BOX)
-    center = pose[:3] + [0.0, 0.0, 0.045]
+    center = pose[:3] + np.array([0.0, 0.0, 0.045])
     session.push(BOX, center, np.array([0.0, 0.0, 2.0]), 1.0)  # straight up, through the centre
     highest = 0.0
     for _ in range(48):

@@ -17,7 +17,10 @@ class Viewer:
         self.messages: list[dict[str, Any]] = []
         self._lock = threading.Lock()
         self._socket = connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, compression=None
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+            compression=None,
         )
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -28,7 +31,11 @@ class Viewer:
     def moved(self, prefix: str = "/objects/") -> list[str]:
         """Names of the nodes whose position was sent, in order."""
         with self._lock:
-            return [m["name"] for m in self.messages if m["type"] == "SetPositionMessage" and m["name"].startswith(prefix)]
+            return [
+                m["name"]
+                for m in self.messages
+                if m["type"] == "SetPositionMessage" and m["name"].startswith(prefix)
+            ]
 
     def close(self) -> None:
         self._socket.close()
