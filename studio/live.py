@@ -177,6 +177,7 @@ class LivePage:
     def _build(self) -> None:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        gui.main_panel.dock_right()
         self._server.scene.set_up_direction("+z")
         self._step = gui.add_markdown("starting")
         self._bar = gui.add_progress_bar(0.0)

@@ -156,7 +156,7 @@ class LiveLayers:
         for row, pose in enumerate(poses):
             scene.add_camera_frustum(
                 f"/live/cameras/{int(posed.indices[row])}", fov, posed.camera.width / posed.camera.height,
-                scale=_FRUSTUM_M, image=_smaller(posed.images[row], _THUMBNAIL_PX), format="jpeg",
+                scale=_FRUSTUM_M, thickness=0.003, image=_smaller(posed.images[row], _THUMBNAIL_PX), format="jpeg",
                 wxyz=quat_from_matrix(pose[:3, :3]), position=pose[:3, 3], cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
         self._frame_view(poses, points)
@@ -181,12 +181,14 @@ class LiveLayers:
     def _add_textured(self, name: str, visual: TexturedMesh, world_from_mesh: np.ndarray) -> None:
         import trimesh
         from PIL import Image
+        from trimesh.visual import TextureVisuals
+        from trimesh.visual.material import PBRMaterial
 
-        material = trimesh.visual.material.PBRMaterial(
+        material = PBRMaterial(
             baseColorTexture=Image.fromarray(visual.texture), metallicFactor=0.0, roughnessFactor=1.0
         )
         mesh = trimesh.Trimesh(visual.vertices, visual.faces, process=False)
-        mesh.visual = trimesh.visual.TextureVisuals(uv=visual.uvs, material=material)
+        mesh.visual = TextureVisuals(uv=visual.uvs, material=material)
         node = self._server.scene.add_mesh_trimesh(name, mesh, cast_shadow=False, receive_shadow=False)
         _put(node, world_from_mesh)
 
@@ -197,7 +199,7 @@ class LiveLayers:
         self._framed = True
         middle = np.median(points, axis=0)
         away = poses[:, :3, 3].mean(axis=0) - middle
-        eye = middle + 1.8 * away + [0, 0, 0.6 * float(np.linalg.norm(away))]
+        eye = middle + 1.8 * away + [0, 0, 0.9 * float(np.linalg.norm(away))]
         cameras = [self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())]
         for camera in cameras:
             camera.position, camera.look_at = tuple(eye), tuple(middle)

@@ -102,7 +102,9 @@ class PhysicsPanel:
         height = float(self._height.value)
         self.play()
         player = self._player
-        for key in ids if player is not None else ():
+        if player is None:  # the scene has no physics, which `play` said
+            return
+        for key in ids:
             player.do(lambda session, key=key: session.lift(key, height))
 
     # ---- Life.

@@ -109,7 +109,8 @@ def _thinned(vertices: np.ndarray, faces: Any, color: tuple[float, float, float]
     mesh = trimesh.Trimesh(np.asarray(vertices), np.asarray(faces), process=True)  # merges equal vertices
     points, triangles = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
     if len(triangles) > _MOST_FACES:
-        points, triangles = fast_simplification.simplify(points, triangles, target_count=_MOST_FACES)
+        simplify: Any = fast_simplification.simplify
+        points, triangles = simplify(points, triangles, target_count=_MOST_FACES)
     return LinkPart(np.asarray(points, np.float32), np.asarray(triangles, np.uint32), color)
 
 

@@ -16,6 +16,7 @@ from registry.errors import UsageError
 from registry.geometry import matrix_from_quat, quat_from_matrix, rigid
 from studio.playing.robot_meshes import LinkPart
 
+_PEDESTAL_COLOR = (0.22, 0.23, 0.25)  # as in `simrecon_envs.scene_builder`
 CONTACTS = ("on the target (N)", "on others (N)")
 
 
@@ -47,6 +48,7 @@ class RolloutHead:
     target_id: int | None
     link_names: tuple[str, ...]
     link_parts: tuple[tuple[LinkPart, ...], ...]
+    pedestal: LinkPart | None  # what the robot stands on, world space; None: the floor or furniture
     has_contacts: bool  # False: a trajectory stores none
     note: str = ""
 
@@ -169,6 +171,7 @@ class _Watcher:
             target_id=scene.target_id,
             link_names=tuple(link.name for link in self._links),
             link_parts=tuple(link_parts(scene.agent)) if self._links else (),
+            pedestal=_pedestal(scene),
             has_contacts=has_contacts,
             note="; ".join(text for text in (note, scene.task_note) if text),
         )
@@ -263,6 +266,20 @@ def _of_object(placed: Any) -> np.ndarray:
     actor = rigid(matrix_from_quat(np.asarray(pose.q, np.float64)), np.asarray(pose.p, np.float64))
     world_from_object = actor @ placed.actor_from_object
     return np.concatenate([world_from_object[:3, 3], quat_from_matrix(world_from_object[:3, :3])])
+
+
+def _pedestal(scene: Any) -> LinkPart | None:
+    """Return the box of the robot's pedestal, world space; it has no mesh where nothing is rendered."""
+    import trimesh
+
+    actor = scene.scene.actors.get("pedestal")
+    if actor is None:
+        return None
+    body = actor._bodies[0]
+    shape = body.collision_shapes[0]
+    pose = (body.entity.pose * shape.local_pose).to_transformation_matrix()
+    box = trimesh.creation.box(2 * np.asarray(shape.half_size), transform=pose)
+    return LinkPart(np.asarray(box.vertices, np.float32), np.asarray(box.faces, np.uint32), _PEDESTAL_COLOR)
 
 
 def _seven(pose: Any) -> np.ndarray:

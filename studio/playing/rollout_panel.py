@@ -77,7 +77,7 @@ class RolloutPanel:
             return
         self._start(
             RolloutRequest(
-                **self._where(),
+                *self._where(),
                 task=self._task.value,
                 robot=self._robot.value,
                 policy=policy,
@@ -91,7 +91,7 @@ class RolloutPanel:
         if not file.strip():
             self._page.say("Name the file of a demonstration: .../trajectory.h5", error=True)
             return
-        self._start(RolloutRequest(**self._where(), trajectory=file.strip(), episode=episode))
+        self._start(RolloutRequest(*self._where(), trajectory=file.strip(), episode=episode))
 
     def stop(self) -> None:
         """End the making of a rollout; the recorded steps stay."""
@@ -124,7 +124,7 @@ class RolloutPanel:
             if failure:
                 self._text.content = plain_markdown(failure)
 
-        RolloutProcess(TasksRequest(**self._where(), robot=self._robot.value), found, ended)
+        RolloutProcess(TasksRequest(*self._where(), robot=self._robot.value), found, ended)
 
     # ---- Life.
 
@@ -152,13 +152,10 @@ class RolloutPanel:
 
     # ---- Inside.
 
-    def _where(self) -> dict[str, str]:
+    def _where(self) -> tuple[str, str, str]:
+        """Return scene, registry and revision of a request."""
         page = self._page
-        return {
-            "scene": page.scene_id,
-            "registry": str(page.registry.root.absolute()),
-            "revision": page.revision,
-        }
+        return page.scene_id, str(page.registry.root.absolute()), page.revision
 
     def _start(self, request: RolloutRequest) -> None:
         self.leave()

@@ -39,6 +39,9 @@ class RolloutView:
                     f"/rollout/{name}/{number}", part.vertices, part.faces, color=part.color, flat_shading=False,
                     side="double", cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
+        if head.pedestal is not None:
+            box = head.pedestal
+            scene.add_mesh_simple("/rollout/pedestal", box.vertices, box.faces, color=box.color, cast_shadow=False)
         with plots:
             self._plots = self._make_plots()
 

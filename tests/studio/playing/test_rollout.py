@@ -77,6 +77,12 @@ def test_the_robots_meshes_are_those_of_its_urdf(pick):
     assert not head.link_parts[head.link_names.index("panda_hand_tcp")]
 
 
+def test_a_robot_that_stands_on_the_table_has_no_pedestal(pick):
+    head, frames = pick
+    assert frames[0].link_poses[head.link_names.index("panda_link0"), 2] == pytest.approx(TABLE_TOP_M, abs=0.005)
+    assert head.pedestal is None
+
+
 def test_a_trajectory_is_replayed_as_it_was_recorded(play_registry, tmp_path):
     from simrecon_envs.benchmark.demonstrations_maniskill import TrajectoryFile
     from simrecon_envs.benchmark.episodes import run_episode
