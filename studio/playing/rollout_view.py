@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from studio.scene_view import StudioPage
 
 _PLOT_EVERY_S = 1.0  # while steps arrive
-_PLOT_PX = 140
+_PLOT_PX = 160
 _REWARD, _TARGET, _OTHERS = "#266e8e", "#c2571a", "#7a7a7a"
 
 
@@ -116,7 +116,7 @@ class RolloutView:
 
     def _make_plots(self) -> list[Any]:
         series = viser.uplot.Series
-        axes = (viser.uplot.Axis(size=24), viser.uplot.Axis(size=40))
+        axes = (viser.uplot.Axis(size=32), viser.uplot.Axis(size=40))
         common: dict[str, Any] = {
             "scales": {"x": viser.uplot.Scale(time=False), "y": viser.uplot.Scale(auto=True)},
             "axes": axes,
