@@ -125,14 +125,14 @@ class AssemblyPanel:
 
     def _show(self, missing: set[int]) -> None:
         """Hide the objects that are not there yet, and show those that this panel hid."""
-        meshes = self._page.object_handles()
-        for key in missing - self._hidden:
-            if key in meshes and meshes[key].visible:
-                meshes[key].visible = False
+        known, scene = self._page.object_handles(), self._page.server.scene
+        for key in (missing - self._hidden) & known.keys():
+            frame = scene.get_handle_by_name(f"/objects/{key}")
+            if frame is not None and frame.visible:
+                self._page.show_object(key, False)
                 self._hidden.add(key)
-        for key in self._hidden - missing:
-            if key in meshes:
-                meshes[key].visible = True
+        for key in (self._hidden - missing) & known.keys():
+            self._page.show_object(key, True)
         self._hidden &= missing
 
     def _say(self) -> None:

@@ -104,7 +104,7 @@ def test_the_assembly_goes_forward_and_back(page):
     assembly, meshes = page.parts[0].assembly, page.object_handles()
 
     def shown():
-        return {key for key, mesh in meshes.items() if mesh.visible}
+        return {key for key in meshes if page.server.scene.get_handle_by_name(f"/objects/{key}").visible}
 
     assembly.forward()
     until(lambda: assembly.step == 1, "the first thing stands")
@@ -123,12 +123,12 @@ def test_the_assembly_goes_forward_and_back(page):
 
 
 def test_a_hidden_thing_stays_hidden_after_the_assembly(page):
-    assembly, mesh = page.parts[0].assembly, page.object_handles()[BOX]
-    mesh.visible = False
+    assembly = page.parts[0].assembly
+    page.show_object(BOX, False)
     assembly.play()
     until(lambda: assembly.step == len(page.bundle.objects), "the end")
     assembly.end()
-    assert not mesh.visible
+    assert not page.server.scene.get_handle_by_name(f"/objects/{BOX}").visible
 
 
 def test_hostile_names_are_shown_as_text(made_registry):
