@@ -41,7 +41,9 @@ class RolloutView:
                 )  # fmt: skip
         if head.pedestal is not None:
             box = head.pedestal
-            scene.add_mesh_simple("/rollout/pedestal", box.vertices, box.faces, color=box.color, cast_shadow=False)
+            scene.add_mesh_simple(
+                "/rollout/pedestal", box.vertices, box.faces, color=box.color, cast_shadow=False
+            )
         with plots:
             self._plots = self._make_plots()
 

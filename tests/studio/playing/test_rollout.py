@@ -8,9 +8,19 @@ from made_scenes import BOX, TABLE_TOP_M
 
 from registry.errors import UsageError
 from registry.geometry import matrix_from_quat
+from simrecon_envs.training.config import parse_settings
 from studio.playing.rollout import RolloutFrame, RolloutHead, RolloutRequest, record, replay
 from studio.playing.rollout_process import RolloutProcess, TasksRequest
-from studio.playing.tasks import KINDS, RANDOM, SCRIPT, policy_of, trained_runs
+from studio.playing.tasks import (
+    KINDS,
+    RANDOM,
+    SCRIPT,
+    TRAINED,
+    policy_names,
+    policy_of,
+    task_of_run,
+    trained_runs,
+)
 
 pytestmark = pytest.mark.env
 
@@ -79,7 +89,9 @@ def test_the_robots_meshes_are_those_of_its_urdf(pick):
 
 def test_a_robot_that_stands_on_the_table_has_no_pedestal(pick):
     head, frames = pick
-    assert frames[0].link_poses[head.link_names.index("panda_link0"), 2] == pytest.approx(TABLE_TOP_M, abs=0.005)
+    assert frames[0].link_poses[head.link_names.index("panda_link0"), 2] == pytest.approx(
+        TABLE_TOP_M, abs=0.005
+    )
     assert head.pedestal is None
 
 
@@ -140,6 +152,35 @@ def test_a_process_lists_tasks_and_says_why_a_rollout_fails(play_registry):
     assert failure == ""
     assert isinstance(got[0], RolloutHead)
     assert got[-1].success
+
+
+@pytest.mark.end_to_end
+def test_a_trained_policy_acts_in_the_task_that_it_was_trained_for(play_registry, tmp_path, monkeypatch):
+    from simrecon_envs.training import TrainConfig, load_policy, runs_root, train
+
+    monkeypatch.setenv("SIMRECON_HOME", str(tmp_path))
+    folder = runs_root() / "tiny"
+    settings = parse_settings("ppo", ["rollout_steps=60", "batch_size=30", "n_epochs=1", "net_arch=16"])
+    root = str(play_registry.root)
+    config = TrainConfig(scene="room", registry=root, steps=120, eval_episodes=0, settings=settings)
+    train(config, folder, video=False)
+    name = f"{TRAINED}tiny"
+    assert name in policy_names("room")
+    task, robot = task_of_run(name, "room")
+    assert robot == "panda"
+    policy, arguments = policy_of(name, "room")
+    request = RolloutRequest(
+        **where(play_registry), task=task, robot=robot, policy=policy, arguments=arguments, seed=5
+    )
+    got = []
+    record(request, got.append)
+    again = []
+    record(request, again.append)
+    assert len(got) == len(again) > 10
+    moved = np.abs(got[-1].link_poses - got[1].link_poses).max()
+    assert moved > 0.01  # an untrained network moves the arm somewhere
+    assert got[-1].link_poses == pytest.approx(again[-1].link_poses, abs=1e-6)
+    assert load_policy(folder).steps == 120
 
 
 def run(request):
