@@ -13,6 +13,7 @@ from reconstruction.config import PipelineConfig
 from reconstruction.core.progress import NO_PROGRESS, StageListener
 from reconstruction.core.types import ObjectAsset
 from reconstruction.editing.overrides import Overrides
+from reconstruction.made_by import note_made_by
 from reconstruction.publish import publish_scene
 from reconstruction.runner import Run
 from registry import SceneRecord, SceneRegistry
@@ -107,6 +108,7 @@ def reconstruct(
         run = _with_object_scale(run)
         record = publish_scene(run, registry, scene_id, require_stable=require_stable)
         run.store.note_published(scene_id, record.revision, run.keys)
+        note_made_by(folder, scene_id, video, run.overrides.file)
     return Reconstruction(record, run)
 
 

@@ -26,6 +26,7 @@ class Overrides:
 
     entries: list[dict] = field(default_factory=list)
     folder: Path = Path()  # of the file; paths of meshes are relative to it
+    file: Path | None = None
 
     @classmethod
     def load(cls, path: Path) -> "Overrides":
@@ -50,7 +51,7 @@ class Overrides:
             )
         for number, entry in enumerate(entries, start=1):
             check_entry(entry, f"--overrides {path}: entry {number}")
-        loaded = cls(entries, path.resolve().parent)
+        loaded = cls(entries, path.resolve().parent, path)
         parse_scene_entries(loaded.of_stage("world"), f"--overrides {path}")
         return loaded
 

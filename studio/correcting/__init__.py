@@ -1,1 +1,1 @@
-"""Correction of a scene in the page: acts become entries of its overrides file, Apply runs the stages that they change."""
+"""Corrections in the page: acts become entries of the overrides file, Apply runs the stages that they change."""
