@@ -153,7 +153,7 @@ class Document:
 
 def check_entries(entries: list[Any], name: str) -> None:
     """Raise UsageError for the first entry that no stage can apply."""
-    from reconstruction.editing.overrides import check_entry
+    from reconstruction.editing.entries import check_entry
 
     for number, entry in enumerate(entries, start=1):
         check_entry(entry, name if len(entries) == 1 else f"{name}: entry {number}")
