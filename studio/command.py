@@ -8,7 +8,11 @@ from registry import SceneRegistry
 from registry.errors import EnvironmentMissing, UsageError
 
 # Parts of a page, `module:class`, in the order of their tabs.
-PARTS = ("studio.looking:LookingPart", "studio.playing.part:PlayingPart")
+PARTS = (
+    "studio.looking:LookingPart",
+    "studio.correcting.tab:CorrectPart",
+    "studio.playing.part:PlayingPart",
+)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from reconstruction.editing.scene_entries import SCENE_KEYS
 from registry.errors import UsageError
 from registry.geometry import quat_from_matrix
 from studio.correcting.anchoring import Anchors
+from studio.correcting.document import Document, DocumentState
 from studio.correcting.yaml_text import one_line
 from studio.selection import Click
 
@@ -29,6 +31,30 @@ class Outline:
 
     frame: int
     pixels: tuple[tuple[float, float], ...]
+
+
+def perform(document: Document, act: Act, applied: int = 0) -> DocumentState:
+    """Write an act: as a new entry, or over the one that it replaces.
+
+    A scene has one scale, one up direction and one floor, and of two moves of a thing in a row only the last counts.
+
+    Args:
+        document: the file.
+        act: the act.
+        applied: entries that the scene was made with; of these no move is replaced.
+    """
+    entries = document.state().entries
+    for number, entry in reversed(list(enumerate(entries))):
+        last = number == len(entries) - 1 >= applied
+        if (set(act.entry) & set(SCENE_KEYS) and set(entry) == set(act.entry)) or (
+            last and "move" in act.entry and _same_but("move", entry, act.entry)
+        ):
+            return document.replace(number, act.entry, act.title)
+    return document.append(act.entry, act.title)
+
+
+def _same_but(action: str, a: dict, b: dict) -> bool:
+    return set(a) == set(b) and all(a[key] == b[key] for key in a if key != action)
 
 
 class Acts:

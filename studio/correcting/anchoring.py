@@ -1,6 +1,7 @@
-"""Addresses that last for what is clicked in the page: pixels of video frames, as `docs/overrides.md` describes them."""
+"""Addresses that last for clicks in the page: pixels of video frames (docs/overrides.md)."""
 
 from collections.abc import Iterable
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -99,7 +100,7 @@ class Anchors:
         found, posed, cameras = self._results.get("instances"), self._posed, self._bundle.cameras
         if found is None or posed is None or not len(found.id_maps):
             return
-        depth = self._depth()
+        depth, unit_m = self._depth or (None, 1.0)
         row_of = {int(index): row for row, index in enumerate(posed.indices)}
         height, width = found.id_maps.shape[1:]
         scale = np.array([width / cameras.width, height / cameras.height])
@@ -114,19 +115,27 @@ class Anchors:
             if not (0 <= column < width and 0 <= line < height) or found.id_maps[row][line, column] != owner:
                 continue
             if depth is not None:
-                seen = depth[row][line * depth.shape[1] // height, column * depth.shape[2] // width]
+                seen = unit_m * depth[row][line * depth.shape[1] // height, column * depth.shape[2] // width]
                 if abs(seen - local[2]) > _NEAR_M + _NEAR_SHARE * local[2]:
                     continue
             mine = np.pad((np.asarray(found.id_maps[row]) == owner).astype(np.uint8), 1)
             margin = float(cv2.distanceTransform(mine, cv2.DIST_L2, 5)[line + 1, column + 1])
             if margin >= _LEAST_PX:
                 # Of frames with the same margin the one nearest to the point shows it best.
-                yield min(margin, _ENOUGH_PX) - 0.1 * float(local[2]), int(index), float(pixel[0]), float(pixel[1])
+                yield (
+                    min(margin, _ENOUGH_PX) - 0.1 * float(local[2]),
+                    int(index),
+                    float(pixel[0]),
+                    float(pixel[1]),
+                )
 
-    def _depth(self) -> np.ndarray | None:
-        """Return the depth maps (n, h, w) in metres, of the keyframes; None if they are missing."""
-        _, depth = self._results.refined_in_world()
-        return None if depth is None else depth.depth
+    @cached_property
+    def _depth(self) -> tuple[np.ndarray, float] | None:
+        """Return the refined depth maps (n, h, w) of the keyframes and their unit in metres; None if missing."""
+        world, gaussians = self._results.get("world"), self._results.get("gaussians")
+        if world is None or gaussians is None:
+            return None
+        return gaussians.depth.depth, float(np.cbrt(np.linalg.det(world.world_from_sfm[:3, :3])))
 
 
 def _rays(pixels: np.ndarray, params: np.ndarray) -> np.ndarray:

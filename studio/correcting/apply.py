@@ -44,14 +44,18 @@ class ApplyState:
 class ApplyRun:
     """One run of `simrecon reconstruct`, started here or found going."""
 
-    def __init__(self, record: Path, log: Path, pid: int, started: float, registry_root: Path, scene_id: str) -> None:
+    def __init__(
+        self, record: Path, log: Path, pid: int, started: float, registry_root: Path, scene_id: str
+    ) -> None:
         self._record, self._log, self.pid, self._started = record, log, pid, started
         self._registry_root, self._scene_id = registry_root, scene_id
         self._process: subprocess.Popen | None = None
         self._elapsed_s: float | None = None
 
     @classmethod
-    def start(cls, origin: Origin, overrides: Path, folder: Path, *, require_stable: bool = True) -> "ApplyRun":
+    def start(
+        cls, origin: Origin, overrides: Path, folder: Path, *, require_stable: bool = True
+    ) -> "ApplyRun":
         """Start a run.
 
         Args:
@@ -111,7 +115,9 @@ class ApplyRun:
         if code is None:
             return ApplyState(True, *_progress(stages), elapsed_s=elapsed, reused=reused, computed=begun)
         if code != 0:
-            return ApplyState(False, error=_failure(lines, code), elapsed_s=elapsed, reused=reused, computed=begun)
+            return ApplyState(
+                False, error=_failure(lines, code), elapsed_s=elapsed, reused=reused, computed=begun
+            )
         revision = SceneRegistry(self._registry_root).get(self._scene_id).revision
         return ApplyState(False, "", 1.0, "done", "", revision, elapsed, reused, begun)
 
@@ -169,7 +175,9 @@ def _failure(lines: list[str], code: int) -> str:
         return f"Apply was ended by signal {-code}; finished stages are kept, apply again to go on"
     said = [k for k, line in enumerate(lines) if line.startswith("simrecon reconstruct:")]
     if said:
-        return " ".join(" ".join(lines[said[-1] :]).removeprefix("simrecon reconstruct:").split(_ENDED)[0].split())
+        return " ".join(
+            " ".join(lines[said[-1] :]).removeprefix("simrecon reconstruct:").split(_ENDED)[0].split()
+        )
     last = [line for line in lines if not line.startswith(_ENDED)]
     return f"Apply failed with exit code {code}: {last[-1] if last else 'it said nothing'}"
 
@@ -198,7 +206,11 @@ def _environment() -> dict[str, str]:
     """Return the environment with this source tree first among the modules, whatever folder the run starts in."""
     root = str(Path(__file__).resolve().parents[2])
     others = os.environ.get("PYTHONPATH", "")
-    return {**os.environ, "PYTHONPATH": root + (os.pathsep + others if others else ""), "PYTHONUNBUFFERED": "1"}
+    return {
+        **os.environ,
+        "PYTHONPATH": root + (os.pathsep + others if others else ""),
+        "PYTHONUNBUFFERED": "1",
+    }
 
 
 def _main() -> int:
@@ -210,7 +222,8 @@ def _main() -> int:
     try:
         code = main(sys.argv[1:])
     finally:
-        print(f"{_ENDED}{code}", file=sys.stderr, flush=True)
+        sys.stderr.write(f"{_ENDED}{code}\n")
+        sys.stderr.flush()
     return code
 
 

@@ -170,3 +170,15 @@ def _first_that_holds(wanted: list[Any], candidates: Iterator[str]) -> str:
     except yaml.YAMLError:
         pass
     return "".join(entry_line(entry) + "\n" for entry in wanted)
+
+
+def comments_of(text: str, count: int) -> list[str]:
+    """Return the comment behind each of `count` entries on its own line; "" where there is none."""
+    try:
+        layout = _Layout.of(text)
+    except yaml.YAMLError:
+        layout = None
+    if layout is None or layout.brackets or len(layout.items) != count:
+        return [""] * count
+    rests = [text[end:].split("\n", 1)[0].strip() for _, end in layout.items]
+    return [rest.lstrip("# ").rstrip() if rest.startswith("#") else "" for rest in rests]
