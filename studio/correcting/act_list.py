@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from studio.correcting.document import DocumentState
-from studio.correcting.preview import Preview
+from studio.correcting.pending import Preview
 from studio.correcting.yaml_text import comments_of, entry_line
 from studio.text import bare, plain_markdown
 

@@ -2,16 +2,18 @@
 
 from collections.abc import Iterable
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
-from reconstruction.core.types import DistortedCamera, PosedFrames
-from reconstruction.measure.stage_results import StageResults
 from registry import SceneBundle
 from registry.errors import UsageError
 from registry.geometry import invert_rigid
+
+if TYPE_CHECKING:
+    from reconstruction.core.types import DistortedCamera, PosedFrames
+    from reconstruction.measure.stage_results import StageResults
 
 _NEAR_M, _NEAR_SHARE = 0.02, 0.02  # a point is seen where its depth differs by less: noise of the depth maps
 _ENOUGH_PX = 12.0  # from here on a wider margin around the pixel is no better
@@ -21,7 +23,7 @@ _LEAST_PX = 3.0  # a click may miss by 2 pixels of the id maps (docs/overrides.m
 class Anchors:
     """Makes addresses for one revision of a scene."""
 
-    def __init__(self, bundle: SceneBundle, results: StageResults) -> None:
+    def __init__(self, bundle: SceneBundle, results: "StageResults") -> None:
         """Read the anchors of the bundle; the stage results give pixels for any point.
 
         Args:
@@ -92,7 +94,7 @@ class Anchors:
         return self._posed is not None and self._results.get("instances") is not None
 
     @property
-    def _posed(self) -> PosedFrames | None:
+    def _posed(self) -> "PosedFrames | None":
         return self._results.get("poses")
 
     def _sightings(self, point: np.ndarray, owner: int) -> Iterable[tuple[float, int, float, float]]:
@@ -143,7 +145,7 @@ def _rays(pixels: np.ndarray, params: np.ndarray) -> np.ndarray:
     return np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy])
 
 
-def _distorted(rays: np.ndarray, camera: DistortedCamera) -> tuple[np.ndarray, tuple[int, int]]:
+def _distorted(rays: np.ndarray, camera: "DistortedCamera") -> tuple[np.ndarray, tuple[int, int]]:
     """Project rays (n, 3) into a camera with distortion; return pixels (n, 2) and the camera's size."""
     import pycolmap
 

@@ -34,7 +34,9 @@ class ClickTools:
                 self._split,
                 "click each part of one thing; Shift and click: another point of the same part",
             )
-            self._relation = gui.add_dropdown("Relation", ("supported_by", "attached_to"), "supported_by")
+            self._relation = gui.add_dropdown(
+                "Relation", ("supported_by", "attached_to"), initial_value="supported_by"
+            )
             part.button("Stands on", self._parent, "then click what carries the selected thing")
             self._metres = gui.add_number("Length (m)", 0.5, min=0.01, max=100.0, step=0.001)
             part.button("Measured length", self._measure, "click the two ends of a length that you know")
@@ -44,8 +46,7 @@ class ClickTools:
             part.button("Floor is here", self._floor, "click a place on the floor")
         with gui.add_folder("Add a missed thing"):
             self._label = gui.add_text("Name", "")
-            frames = [str(index) for index in self._page.frames.photographed] or ["none"]
-            self._frame = gui.add_dropdown("Frame", frames, frames[0])
+            self._frame = gui.add_dropdown("Frame", ("none",), initial_value="none")
             part.button(
                 "Outline", self._outline, "go to the frame, and click around the thing in the photograph"
             )
@@ -54,6 +55,13 @@ class ClickTools:
         self._done = part.button("Done", self._end, "write the act")
         self._cancel = part.button("Cancel", self.cancel, "forget these clicks")
         self._done.visible = self._cancel.visible = False
+
+    def fill(self) -> None:
+        """Offer the frames whose photographs are kept; reads the stage cache."""
+        frames = tuple(str(index) for index in self._page.frames.photographed)
+        if frames:
+            self._frame.options = frames
+            self._frame.value = frames[0]
 
     @property
     def busy(self) -> bool:

@@ -52,9 +52,8 @@ def find_origin(
         UsageError: the film is not found or is another one, or the scene cannot be made again by a command.
     """
     scene = bundle.scene
-    made_with = scene["report"].get("volatile", {}).get("work", {})
-    digest = str(made_with.get("input_digest") or scene["source"].get("sha256", ""))
-    folder = (work_dir or registry_root.parent / "work" / digest[:16]).absolute()
+    digest = _input_digest(bundle)
+    folder = work_folder(bundle, registry_root, work_dir)
     noted = read_made_by(folder, scene["id"])
     truth = [s for s, backend in scene["report"].get("backends", {}).items() if backend == "ground-truth"]
     if truth:
@@ -72,6 +71,16 @@ def find_origin(
         folder=noted.folder if noted is not None and noted.folder.is_dir() else Path.cwd(),
         overrides=overrides if overrides is not None and overrides.is_file() else None,
     )
+
+
+def work_folder(bundle: SceneBundle, registry_root: Path, work_dir: Path | None = None) -> Path:
+    """Return the folder of a scene's stage results: as it was given, else the default one beside the registry."""
+    return (work_dir or registry_root.parent / "work" / _input_digest(bundle)[:16]).absolute()
+
+
+def _input_digest(bundle: SceneBundle) -> str:
+    made_with = bundle.scene["report"].get("volatile", {}).get("work", {})
+    return str(made_with.get("input_digest") or bundle.scene["source"].get("sha256", ""))
 
 
 def options_of(recorded: dict[str, Any]) -> list[str]:

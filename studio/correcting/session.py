@@ -4,9 +4,9 @@ import contextlib
 import json
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from reconstruction.made_by import read_made_by
-from reconstruction.measure.stage_results import StageResults
 from registry import SceneBundle, SceneRegistry
 from registry.errors import UsageError
 from registry.locks import LockHeld, file_lock
@@ -15,9 +15,13 @@ from studio.correcting.anchoring import Anchors
 from studio.correcting.apply import ApplyRun
 from studio.correcting.document import Document, DocumentState
 from studio.correcting.journal import write_whole
-from studio.correcting.origin import Origin, find_origin
-from studio.correcting.preview import Preview, Previewer, pending_entries
+from studio.correcting.origin import Origin, find_origin, work_folder
+from studio.correcting.pending import Preview, pending_entries
 from studio.correcting.yaml_text import appended
+
+if TYPE_CHECKING:
+    from reconstruction.measure.stage_results import StageResults
+    from studio.correcting.preview import Previewer
 
 FOLDER = "corrections"  # beside the registry
 
@@ -69,8 +73,10 @@ class Session:
             self.__dict__.pop(name, None)
 
     @cached_property
-    def results(self) -> StageResults:
+    def results(self) -> "StageResults":
         """Stage results of the revision."""
+        from reconstruction.measure.stage_results import StageResults  # the whole pipeline: seconds
+
         work_dir = _said(self.registry.root, self.scene_id).get("work_dir")
         return StageResults.find(self.bundle, self.registry.root, Path(work_dir) if work_dir else None)
 
@@ -85,8 +91,10 @@ class Session:
         return Acts(self.anchors, self.name_of)
 
     @cached_property
-    def previewer(self) -> Previewer:
+    def previewer(self) -> "Previewer":
         """Previews for this revision."""
+        from studio.correcting.preview import Previewer
+
         return Previewer(self.bundle, self.results)
 
     def name_of(self, number: int) -> str:
@@ -106,7 +114,8 @@ class Session:
 
     def preview(self, state: DocumentState) -> Preview:
         """Return what the pending acts change, as far as ids and anchors say."""
-        return self.previewer.quick(state.entries)
+        pending, taken_back = self.pending(state)
+        return self.previewer.quick(state.entries) if pending else Preview(0, taken_back)
 
     def origin(self) -> Origin:
         """Return how the scene was made.
@@ -143,7 +152,8 @@ class Session:
         said = _said(self.registry.root, self.scene_id)
         if "overrides" in said:
             return Path(said["overrides"])
-        noted = read_made_by(self.results.work_dir, self.scene_id) if self.results.work_dir else None
+        work_dir = Path(said["work_dir"]) if "work_dir" in said else None
+        noted = read_made_by(work_folder(self.bundle, self.registry.root, work_dir), self.scene_id)
         if noted is not None and noted.overrides is not None and noted.overrides.is_file():
             return noted.overrides
         return self.folder / f"{self.scene_id}.yaml"

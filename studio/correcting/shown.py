@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from studio.correcting.preview import Preview
+from studio.correcting.pending import Preview
 from studio.text import bare
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from studio.correcting.applying import Applying
 from studio.correcting.click_tools import ClickTools
 from studio.correcting.document import DocumentState
 from studio.correcting.gizmo import Gizmo
-from studio.correcting.preview import Preview
+from studio.correcting.pending import Preview
 from studio.correcting.session import Session
 from studio.correcting.shown import Shown
 from studio.correcting.thing_tools import ThingTools
@@ -165,11 +165,17 @@ class CorrectPart:
             self._shown = Shown(self.page)
             self.clicks.cancel()
             self.session.show(self.page.bundle)
-            self.things.selected(self.page.selection.ids)
+            self._fill()
             self._show(self.session.document.state())
+
+    def _fill(self) -> None:
+        """Fill the lists that take seconds to know."""
+        self.things.fill()
+        self.clicks.fill()
 
     def _watch(self) -> None:
         """Notice edits by hand, acts of other pages, and other viewers."""
+        self.run(self._fill)
         while not self._closed.wait(_LOOK_EVERY_S):
             try:
                 state = self.session.document.state()

@@ -13,8 +13,6 @@ class ThingTools:
     """The folder of the selected thing."""
 
     def __init__(self, part: "CorrectPart") -> None:
-        from reconstruction.assets.physics.materials import MATERIALS
-
         self._part = part
         gui, acts = part.page.server.gui, lambda: part.session.acts
         with gui.add_folder("Selected thing"):
@@ -37,8 +35,15 @@ class ThingTools:
             part.act("Set mass", lambda: acts().mass(part.selected(), float(self._mass.value)))
             self._friction = gui.add_number("Friction", 0.5, min=0.01, max=10.0, step=0.01)
             part.act("Set friction", lambda: acts().friction(part.selected(), float(self._friction.value)))
-            self._material = gui.add_dropdown("Material", tuple(sorted(MATERIALS)), initial_value="wood")
+            self._material = gui.add_dropdown("Material", ("unknown",), initial_value="unknown")
             part.act("Set material", lambda: acts().material(part.selected(), str(self._material.value)))
+
+    def fill(self) -> None:
+        """Offer the materials of the table; imports the assets stage."""
+        from reconstruction.assets.physics.materials import MATERIALS
+
+        self._material.options = tuple(sorted(MATERIALS))
+        self.selected(self._part.page.selection.ids)
 
     def selected(self, ids: tuple[int, ...]) -> None:
         """Show the values of the selection."""
