@@ -53,7 +53,12 @@ class CorrectPart:
             page.selection.on_change(self._selected),
             page.on_reload(self._reloaded),
         ]
-        self._show(self.session.document.state())
+        state = self.session.document.state()
+        self._text = state.text
+        pending, taken_back = self.session.pending(state)
+        self.list.show(
+            state, Preview(len(pending), taken_back)
+        )  # drawn by the watcher, which can wait for it
         self._tell()
         self._watcher = threading.Thread(target=self._watch, name="corrections", daemon=True)
         self._watcher.start()
@@ -166,10 +171,10 @@ class CorrectPart:
             self.clicks.cancel()
             self.session.show(self.page.bundle)
             self._fill()
-            self._show(self.session.document.state())
 
     def _fill(self) -> None:
         """Fill the lists that take seconds to know."""
+        self._show(self.session.document.state())
         self.things.fill()
         self.clicks.fill()
 
