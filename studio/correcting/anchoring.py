@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from reconstruction.core.types import DistortedCamera, PosedFrames
     from reconstruction.measure.stage_results import StageResults
 
-_NEAR_M, _NEAR_SHARE = 0.02, 0.02  # a point is seen where its depth differs by less: noise of the depth maps
+_NEAR_M, _NEAR_SHARE = 0.01, 0.01  # a point is seen where its depth differs by less: noise of the depth maps
+_PX_PER_M = 200.0  # a depth that is off by 5 mm counts as much as a margin that is narrower by a pixel
 _ENOUGH_PX = 12.0  # from here on a wider margin around the pixel is no better
 _LEAST_PX = 3.0  # a click may miss by 2 pixels of the id maps (docs/overrides.md), and one is rounding
 
@@ -116,20 +117,18 @@ class Anchors:
             column, line = (pixel * scale).astype(int)
             if not (0 <= column < width and 0 <= line < height) or found.id_maps[row][line, column] != owner:
                 continue
+            gap = 0.0
             if depth is not None:
                 seen = unit_m * depth[row][line * depth.shape[1] // height, column * depth.shape[2] // width]
-                if abs(seen - local[2]) > _NEAR_M + _NEAR_SHARE * local[2]:
+                gap = abs(float(seen - local[2]))
+                if gap > _NEAR_M + _NEAR_SHARE * local[2]:
                     continue
             mine = np.pad((np.asarray(found.id_maps[row]) == owner).astype(np.uint8), 1)
             margin = float(cv2.distanceTransform(mine, cv2.DIST_L2, 5)[line + 1, column + 1])
             if margin >= _LEAST_PX:
                 # Of frames with the same margin the one nearest to the point shows it best.
-                yield (
-                    min(margin, _ENOUGH_PX) - 0.1 * float(local[2]),
-                    int(index),
-                    float(pixel[0]),
-                    float(pixel[1]),
-                )
+                score = min(margin, _ENOUGH_PX) - _PX_PER_M * gap - 0.1 * float(local[2])
+                yield score, int(index), float(pixel[0]), float(pixel[1])
 
     @cached_property
     def _depth(self) -> tuple[np.ndarray, float] | None:

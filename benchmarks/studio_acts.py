@@ -1,0 +1,319 @@
+"""Acts to a right scene: corrects scenes of bench captures through the studio's acts, with a user played from the truth.
+
+    python -m benchmarks.studio_acts --home HOME --scene default --truth CAPTURE/ground_truth --video FILE --out FILE
+
+The user sees the things of the scene and the true room. In each round they click parts of wrongly merged things (split),
+outline missed things in two frames, merge pieces, drop what is no thing, and press Apply; then they set wrong relations and
+apply again. Everything goes through `studio.correcting` as in the page, but for the browser. Reported: acts, clicks, time
+of the acts (computing, and as a person needs at 3 s a click), time of Apply, and figures before and after.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+from reconstruction.measure.alignment import align
+from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
+from reconstruction.measure.matching import match_base
+from reconstruction.measure.object_scores import score_graph, score_objects
+from reconstruction.measure.scene import bundle_poses, placed_meshes
+from reconstruction.measure.surfaces import nearest_entities
+from registry import SceneRegistry
+from registry.errors import SimReconError
+from studio.correcting.acts import Act, Outline
+from studio.correcting.session import Session, remember
+from studio.selection import Click
+
+SECONDS_A_CLICK = 3.0  # a person who knows what to click: aim, press, look
+_NEAR_M, _SAMPLES = 0.03, 30_000  # as `reconstruction.measure.stages`
+_PART = 0.35  # a true object of which this share of the seen surface is in a thing is a part of it
+_LEAST = 60  # vertices; fewer are borders
+_MOSTLY = 0.6
+_FIGURES = (
+    "object_recall_25",
+    "object_recall_50",
+    "object_precision_25",
+    "graph_f1",
+    "graph_f1_matched",
+    "stable_rate",
+    "things",
+)
+
+
+@dataclass
+class Played:
+    """What the user did, and what it brought."""
+
+    scene: str
+    acts: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    clicks: int = 0
+    computing_s: float = 0.0
+    apply_s: list[float] = field(default_factory=list)
+    before: dict = field(default_factory=dict)
+    after: list[dict] = field(default_factory=list)
+
+    @property
+    def person_s(self) -> float:
+        """Time of the acts for a person."""
+        return SECONDS_A_CLICK * self.clicks
+
+
+class User:
+    """Knows the true room, and looks at one revision of the scene."""
+
+    def __init__(self, session: Session, truth: GroundTruth, played: Played) -> None:
+        self.session, self.truth, self.played = session, truth, played
+        self.look()
+
+    def look(self) -> None:
+        """Compare the scene with the truth: which true entity each vertex of the surface belongs to."""
+        bundle = self.session.bundle
+        self.alignment = align(bundle_poses(bundle), self.truth.world_from_camera, self.truth.up)
+        pointer = self.session.previewer.pointer()
+        assert pointer is not None
+        self.points = np.asarray(pointer.surface.vertices, np.float64)
+        self.owner = np.asarray(pointer.found.vertex_instance)
+        true = nearest_entities(self.alignment.to_true(self.points), self.truth.entities, _SAMPLES, _NEAR_M)
+        self.true = np.asarray(true)
+        self.things = [item.id for item in bundle.objects]
+
+    def do(self, make, clicks: int) -> bool:  # noqa: ANN001
+        """Perform an act; False if the page refuses it."""
+        began = time.perf_counter()
+        try:
+            act: Act = make()
+            state = self.session.perform(act)
+            error = self.session.previewer.full(state.entries).error
+            if error:
+                self.session.document.undo()
+                raise SimReconError(error)
+        except SimReconError as error:
+            self.played.refused.append(str(error))
+            return False
+        finally:
+            self.played.computing_s += time.perf_counter() - began
+        self.played.acts.append(act.title)
+        self.played.clicks += clicks
+        return True
+
+    def seen(self, entity: TrueEntity) -> np.ndarray:
+        """Return the vertices int (k,) of a true object."""
+        return np.flatnonzero(self.true == entity.id)
+
+    def parts_of(self, thing: int) -> list[TrueEntity]:
+        """Return the true objects that are to a good part in a thing."""
+        mine = self.owner == thing
+        out = []
+        for entity in self.truth.evaluated:
+            rows = self.seen(entity)
+            inside = int(mine[rows].sum())
+            if inside >= _LEAST and inside >= _PART * len(rows):
+                out.append(entity)
+        return out
+
+    def clicks_on(self, thing: int, entity: TrueEntity, count: int) -> list[Click]:
+        """Return clicks deep inside a part, far from each other."""
+        mine = np.flatnonzero((self.owner == thing) & (self.true == entity.id))
+        other = np.flatnonzero((self.owner == thing) & (self.true != entity.id) & (self.true > 0))
+        deep = cKDTree(self.points[other]).query(self.points[mine])[0] if len(other) else np.ones(len(mine))
+        chosen: list[int] = []
+        score = deep.copy()
+        for _ in range(count):
+            row = int(np.argmax(score))
+            chosen.append(mine[row])
+            score = np.minimum(score, np.linalg.norm(self.points[mine] - self.points[mine[row]], axis=1))
+        return [_click(thing, self.points[row]) for row in chosen]
+
+    def split(self, thing: int, entities: list[TrueEntity]) -> None:
+        """Split a thing into true objects, with one click a part; with more where that does not separate them."""
+        for count in (1, 2, 4):
+            parts = [self.clicks_on(thing, entity, count) for entity in entities]
+            if not self.do(lambda parts=parts: self.session.acts.split(parts), 2 + count * len(parts)):
+                continue
+            if count == 4 or self._pure(thing, entities) >= 0.9:
+                return
+            self.session.document.undo()
+            self.played.clicks += 1  # the press on Undo
+
+    def _pure(self, thing: int, entities: list[TrueEntity]) -> float:
+        """Return the share of a split thing's vertices that end in the part of their true object."""
+        from reconstruction.editing.overrides import Overrides
+
+        pointer = self.session.previewer.pointer()
+        pending, _ = self.session.pending(self.session.document.state())
+        assert pointer is not None
+        after = np.asarray(Overrides(pending).apply_to_instances(pointer).vertex_instance)
+        right = total = 0
+        for entity in entities:
+            rows = np.flatnonzero((self.owner == thing) & (self.true == entity.id))
+            right += int(np.bincount(after[rows]).max())
+            total += len(rows)
+        return right / max(total, 1)
+
+    def outline(self, entity: TrueEntity, count: int) -> list[Outline]:
+        """Return outlines around a true object in the frames that show most of it, from different sides."""
+        cameras, size = self.session.bundle.cameras, self.session.bundle.cameras
+        shown = []
+        for index, pose in zip(cameras.indices, cameras.world_from_camera):
+            ids = self.truth.instances(int(index))
+            if ids is None:
+                continue
+            mask = (ids == entity.id).astype(np.uint8)
+            border = mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()
+            shown.append((float(mask.sum()) * (0.3 if border else 1.0), int(index), pose[:3, 2], mask))
+        shown.sort(key=lambda item: -item[0])
+        chosen: list = []
+        for item in shown:
+            apart = [np.degrees(np.arccos(np.clip(item[2] @ other[2], -1, 1))) for other in chosen]
+            if len(chosen) < count and item[0] > 0 and all(angle > 15 for angle in apart):
+                chosen.append(item)
+        out = []
+        for _, index, _, mask in chosen:
+            grown = cv2.dilate(mask, np.ones((5, 5), np.uint8))
+            contour = max(
+                cv2.findContours(grown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0], key=cv2.contourArea
+            )
+            corners = (
+                cv2.approxPolyDP(contour, 0.01 * cv2.arcLength(contour, True), True)[:, 0].astype(float) + 0.5
+            )
+            scale = np.array([size.width / mask.shape[1], size.height / mask.shape[0]])
+            out.append(Outline(index, tuple((float(x), float(y)) for x, y in corners * scale)))
+        return out
+
+    def correct_cut(self) -> None:
+        """Mend the cut: splits, additions, merges, drops."""
+        for thing in self.things:
+            entities = self.parts_of(thing)
+            if len(entities) > 1:
+                self.split(thing, entities)
+        for entity in self.truth.evaluated:
+            rows = self.seen(entity)
+            held = np.bincount(self.owner[rows], minlength=1) if len(rows) else np.zeros(1, int)
+            holders = [t for t in self.things if t < len(held) and held[t] >= max(_LEAST, _PART * len(rows))]
+            if not holders:
+                outlines = self.outline(entity, 2)
+                points = sum(len(o.pixels) for o in outlines)
+                self.do(lambda o=outlines, e=entity: self.session.acts.add(e.label, o), 5 + points)
+                continue
+            pieces = [
+                t for t in self.things if t < len(held) and held[t] >= _LEAST and self._mostly(t, entity.id)
+            ]
+            if len(pieces) > 1:
+                self.do(lambda p=pieces: self.session.acts.merge(p), len(pieces) + 1)
+        known = {e.id for e in self.truth.evaluated}
+        for thing in self.things:
+            mine = self.true[self.owner == thing]
+            if len(mine) and np.isin(mine, list(known)).mean() < 0.2:
+                self.do(lambda t=thing: self.session.acts.drop(t), 2)
+
+    def _mostly(self, thing: int, true_id: int) -> bool:
+        mine = self.true[self.owner == thing]
+        return len(mine) > 0 and float((mine == true_id).mean()) >= _MOSTLY
+
+    def correct_relations(self, objects: list[dict]) -> None:
+        """Set the parents that are not the true ones."""
+        base_of = {true: mine for mine, true in self._base().items()}
+        thing_of = {o["true_id"]: o["match"] for o in objects if o.get("match") is not None}
+        edges = {
+            e["child"]: (e["parent"], e["relation"]) for e in self.session.bundle.scene["graph"]["edges"]
+        }
+        for entity in self.truth.evaluated:
+            child, parent = thing_of.get(entity.id), base_of.get(entity.parent, thing_of.get(entity.parent))
+            if child is None or parent is None or edges.get(child) == (parent, entity.relation):
+                continue
+            where: Click | int = parent
+            if not self.session.anchors.knows(parent):
+                rows = np.flatnonzero(self.owner == parent)
+                near = self.points[rows] - self.points[self.owner == child].mean(axis=0)
+                where = _click(parent, self.points[rows[np.argmin(np.linalg.norm(near, axis=1))]])
+            relation = entity.relation or "supported_by"
+            self.do(lambda c=child, w=where, r=relation: self.session.acts.parent(c, w, r), 3)
+
+    def _base(self) -> dict[int, int]:
+        """Return the true base entity of each estimated one."""
+        placed = [m.moved(self.alignment.true_from_estimated) for m in placed_meshes(self.session.bundle)]
+        return match_base([m for m in placed if m.base], self.truth.base)
+
+
+def _click(thing: int, point: np.ndarray) -> Click:
+    up = np.array([0.0, 0.0, 1.0])
+    return Click(thing, np.asarray(point, np.float64), up, point + up, -up, None, None, 0)
+
+
+def play(home: Path, scene_id: str, truth_folder: Path, video: Path, rounds: int) -> Played:
+    """Correct one scene and measure it."""
+    registry = SceneRegistry(home / "registry")
+    remember(registry.root, scene_id, video=video)
+    session = Session(registry, registry.load(scene_id))
+    truth, played = GroundTruth.load(truth_folder), Played(scene_id)
+    played.before, objects = _figures(session, truth_folder)
+    user = User(session, truth, played)
+    for round_ in range(rounds):
+        count = len(played.acts)
+        if round_ < rounds - 1:
+            user.correct_cut()
+        if round_ > 0:
+            user.correct_relations(objects)
+        if len(played.acts) == count:
+            break
+        run = session.apply(require_stable=False)
+        state = run.wait(3600)
+        played.apply_s.append(round(state.elapsed_s, 1))
+        if state.error:
+            played.refused.append(f"Apply: {state.error}")
+            break
+        session.show(registry.load(scene_id))
+        figures, objects = _figures(session, truth_folder)
+        played.after.append(
+            {"round": round_ + 1, "acts": len(played.acts), "clicks": played.clicks, **figures}
+        )
+        user.look()
+    session.close()
+    return played
+
+
+def _figures(session: Session, folder: Path) -> tuple[dict, list[dict]]:
+    """Return the figures of objects and relations as `simrecon evaluate` has them, and its records of the objects."""
+    bundle, truth = session.bundle, GroundTruth.load(folder)
+    alignment = align(bundle_poses(bundle), truth.world_from_camera, truth.up)
+    placed = [mesh.moved(alignment.true_from_estimated) for mesh in placed_meshes(bundle)]
+    scores = score_objects([m for m in placed if not m.base], truth, 5_000)
+    edges = bundle.scene["graph"]["edges"]
+    base = [m for m in placed if m.base]
+    relations = score_graph(edges, base, truth, scores.true_of, scores.records)
+    rest = {"stable_rate": bundle.scene["report"]["physics"].get("stable_rate")}
+    found = {**scores.metrics, **relations, **rest, "things": len(bundle.objects)}
+    return {name: found.get(name) for name in _FIGURES}, scores.records
+
+
+def main() -> None:
+    """Play, print and write the result."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--home", type=Path, required=True, help="folder with registry/ and work/; it is changed"
+    )
+    parser.add_argument("--scene", default="default")
+    parser.add_argument("--truth", type=Path, required=True)
+    parser.add_argument("--video", type=Path, required=True)
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="times of Apply at most; the last sets relations only"
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    asked = parser.parse_args()
+    played = play(asked.home, asked.scene, asked.truth, asked.video, asked.rounds)
+    text = json.dumps({**asdict(played), "person_s": played.person_s}, indent=1, default=float)
+    asked.out.write_text(text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
