@@ -1,23 +1,25 @@
-"""Acts to a right scene: corrects scenes of bench captures through the studio's acts, with a user played from the truth.
+"""Acts to a right scene: correct scenes of bench captures through the studio, by a user who is played from the truth.
 
     python -m benchmarks.studio_acts --home HOME --scene default --truth CAPTURE/ground_truth --video FILE --out FILE
 
-The user sees the things of the scene and the true room. In each round they click parts of wrongly merged things (split),
-outline missed things in two frames, merge pieces, drop what is no thing, and press Apply; then they set wrong relations and
-apply again. Everything goes through `studio.correcting` as in the page, but for the browser. Reported: acts, clicks, time
-of the acts (computing, and as a person needs at 3 s a click), time of Apply, and figures before and after.
+The user sees the things of the scene and the true room. In each round they click the parts of wrong merges (split), draw
+outlines of missed things in two frames, merge pieces, drop others, and press Apply; from the second round on they also set
+wrong relations. Everything goes through `studio.correcting` as in the page, but for the browser. Reported: acts, clicks,
+the time of the acts (computing, and of a person at 3 s a click), the time of Apply, and figures before and after.
 """
 
 import argparse
 import json
 import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from reconstruction.editing.overrides import Overrides
 from reconstruction.measure.alignment import align
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
 from reconstruction.measure.matching import match_base
@@ -35,6 +37,7 @@ _NEAR_M, _SAMPLES = 0.03, 30_000  # as `reconstruction.measure.stages`
 _PART = 0.35  # a true object of which this share of the seen surface is in a thing is a part of it
 _LEAST = 60  # vertices; fewer are borders
 _MOSTLY = 0.6
+_RIGHT = 0.75  # of a part that a look at the preview accepts
 _FIGURES = (
     "object_recall_25",
     "object_recall_50",
@@ -78,29 +81,41 @@ class User:
         self.alignment = align(bundle_poses(bundle), self.truth.world_from_camera, self.truth.up)
         pointer = self.session.previewer.pointer()
         assert pointer is not None
+        self.pointer = pointer
         self.points = np.asarray(pointer.surface.vertices, np.float64)
         self.owner = np.asarray(pointer.found.vertex_instance)
         true = nearest_entities(self.alignment.to_true(self.points), self.truth.entities, _SAMPLES, _NEAR_M)
         self.true = np.asarray(true)
         self.things = [item.id for item in bundle.objects]
 
-    def do(self, make, clicks: int) -> bool:  # noqa: ANN001
-        """Perform an act; False if the page refuses it."""
+    def do(
+        self, make: Callable[[], Act], clicks: int, good: Callable[[np.ndarray], bool] | None = None
+    ) -> bool:
+        """Perform an act; False if the page refuses it, or if its preview does not look good (then it is undone).
+
+        Args:
+            make: makes the act.
+            clicks: presses of the mouse that it takes.
+            good: judges the owners (v,) of the surface that the preview shows.
+        """
         began = time.perf_counter()
+        self.played.clicks += clicks
         try:
-            act: Act = make()
-            state = self.session.perform(act)
-            error = self.session.previewer.full(state.entries).error
-            if error:
+            act = make()
+            self.session.perform(act)
+            after = Overrides([act.entry]).apply_to_instances(self.pointer)
+            if good is not None and not good(np.asarray(after.vertex_instance)):
                 self.session.document.undo()
-                raise SimReconError(error)
+                self.played.clicks += 1
+                return False
+            self.pointer = replace(self.pointer, found=after)
         except SimReconError as error:
+            self.session.document.undo()
             self.played.refused.append(str(error))
             return False
         finally:
             self.played.computing_s += time.perf_counter() - began
         self.played.acts.append(act.title)
-        self.played.clicks += clicks
         return True
 
     def seen(self, entity: TrueEntity) -> np.ndarray:
@@ -132,30 +147,32 @@ class User:
         return [_click(thing, self.points[row]) for row in chosen]
 
     def split(self, thing: int, entities: list[TrueEntity]) -> None:
-        """Split a thing into true objects, with one click a part; with more where that does not separate them."""
-        for count in (1, 2, 4):
-            parts = [self.clicks_on(thing, entity, count) for entity in entities]
-            if not self.do(lambda parts=parts: self.session.acts.split(parts), 2 + count * len(parts)):
-                continue
-            if count == 4 or self._pure(thing, entities) >= 0.9:
+        """Split a thing into true objects by a click each; by more if that looks wrong, most on the largest."""
+        sizes = [int(((self.owner == thing) & (self.true == e.id)).sum()) for e in entities]
+        largest = int(np.argmax(sizes))
+        for on_largest, on_others in ((1, 1), (3, 1), (5, 2)):
+            parts = [
+                self.clicks_on(thing, entity, on_largest if k == largest else on_others)
+                for k, entity in enumerate(entities)
+            ]
+            last = on_largest == 5
+
+            def good(after: np.ndarray, last: bool = last) -> bool:
+                return last or self._pure(after, thing, entities) >= _RIGHT
+
+            if self.do(lambda parts=parts: self.session.acts.split(parts), 2 + sum(map(len, parts)), good):
                 return
-            self.session.document.undo()
-            self.played.clicks += 1  # the press on Undo
 
-    def _pure(self, thing: int, entities: list[TrueEntity]) -> float:
-        """Return the share of a split thing's vertices that end in the part of their true object."""
-        from reconstruction.editing.overrides import Overrides
-
-        pointer = self.session.previewer.pointer()
-        pending, _ = self.session.pending(self.session.document.state())
-        assert pointer is not None
-        after = np.asarray(Overrides(pending).apply_to_instances(pointer).vertex_instance)
-        right = total = 0
+    def _pure(self, after: np.ndarray, thing: int, entities: list[TrueEntity]) -> float:
+        """Return the least share of a true object's vertices in a thing that stay together after a split of it."""
+        shares = []
         for entity in entities:
-            rows = np.flatnonzero((self.owner == thing) & (self.true == entity.id))
-            right += int(np.bincount(after[rows]).max())
-            total += len(rows)
-        return right / max(total, 1)
+            rows = (self.owner == thing) & (self.true == entity.id)
+            counts = np.bincount(after[rows])
+            part = np.bincount(after[(self.owner == thing) & (self.true > 0)], minlength=len(counts))
+            best = int(np.argmax(counts))
+            shares += [counts[best] / rows.sum(), counts[best] / max(part[best], 1)]
+        return float(min(shares))
 
     def outline(self, entity: TrueEntity, count: int) -> list[Outline]:
         """Return outlines around a true object in the frames that show most of it, from different sides."""
