@@ -20,7 +20,7 @@ class Gizmo:
 
     def __init__(self, part: "CorrectPart") -> None:
         self._part, self._page = part, part.page
-        self._handle: viser.TransformControlsHandle | None = None
+        self.handle: viser.TransformControlsHandle | None = None
         self._object_id: int | None = None
         gui = self._page.server.gui
         with gui.add_folder("Place"):
@@ -37,21 +37,21 @@ class Gizmo:
             return
         pose, tilt = self._page.pose_of(object_id), bool(self._tilt.value)
         self._object_id = object_id
-        self._handle = self._page.server.scene.add_transform_controls(
+        self.handle = self._page.server.scene.add_transform_controls(
             "/correct/gizmo", scale=_SIZE_M, depth_test=False, wxyz=quat_from_matrix(pose[:3, :3]),
             position=pose[:3, 3], disable_rotations=False,
             rotation_limits=((-9, 9),) * 3 if tilt else ((0, 0), (0, 0), (-9, 9)),
         )  # fmt: skip
-        self._handle.on_update(self._moved)
+        self.handle.on_update(self._moved)
 
     def remove(self) -> None:
         """Take the gizmo away."""
-        if self._handle is not None:
-            self._handle.remove()
-        self._handle = self._object_id = None
+        if self.handle is not None:
+            self.handle.remove()
+        self.handle = self._object_id = None
 
     async def _moved(self, event: viser.TransformControlsEvent) -> None:
-        if self._object_id is None or self._handle is None:
+        if self._object_id is None or self.handle is None:
             return
         target = event.target
         pose = rigid(

@@ -51,12 +51,13 @@ class Shown:
         self._nodes = []
 
     def _hide(self, hidden: set[int]) -> None:
-        handles = self._page.object_handles()
-        for object_id in self._hidden - hidden:
-            if object_id in handles:
-                handles[object_id].visible = True
-        for object_id in hidden & handles.keys():
-            handles[object_id].visible = False
+        """Hide these objects, so that clicks go through them; show those that were hidden before."""
+        known = self._page.object_handles().keys()
+        for object_id in (self._hidden - hidden) & known:
+            self._page.show_object(object_id, True)
+        for object_id in hidden & known:
+            self._page.show_object(object_id, False)
+        self._page.unpickable = (self._page.unpickable - self._hidden) | (hidden & known)
         self._hidden = set(hidden)
 
     def _move(self, preview: Preview) -> None:

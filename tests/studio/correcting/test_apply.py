@@ -1,4 +1,4 @@
-"""Apply: the command that made a scene is found again, runs in a process of its own, and says in one line if it fails."""
+"""Apply: the command that made a scene is found again, runs in its own process, and says in one line why it fails."""
 
 import json
 import time
@@ -120,7 +120,9 @@ def test_a_failing_run_says_one_line_and_loses_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.stage
-def test_a_run_is_found_again_is_alone_and_can_be_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_found_again_is_alone_and_can_be_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slow = tmp_path / "slow"
     slow.mkdir()
     (slow / "sitecustomize.py").write_text("import time\ntime.sleep(60)\n")
