@@ -26,7 +26,18 @@ def run(arguments: argparse.Namespace) -> int:
         registry.get(scene_id)
         if arguments.export is not None:
             return _export(registry, scene_id, arguments.export)
+        _remember(registry, arguments)
     return _serve(registry, arguments)
+
+
+def _remember(registry: SceneRegistry, arguments: argparse.Namespace) -> None:
+    """Keep what the command line says about the scene's film, work folder and corrections."""
+    from studio.correcting.session import remember
+
+    remember(
+        registry.root, arguments.scene, video=arguments.video, work_dir=arguments.work_dir,
+        overrides=arguments.overrides,
+    )  # fmt: skip
 
 
 def check_viser() -> None:

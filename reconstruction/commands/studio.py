@@ -42,5 +42,8 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         help="address to listen on (default: 127.0.0.1, this machine only); beyond that, visitors need the token",
     )
     add("--port", type=int, metavar="N", help="port (default: 8090 or the next free one; 0: any free one)")
+    add("--video", type=Path, metavar="FILE", help="the film of the scene, if it is no longer where it was")
+    add("--work-dir", type=Path, metavar="DIR", help="folder of the stage cache, as given to reconstruct")
+    add("--overrides", type=Path, metavar="FILE", help="file of corrections (default: that of the last run)")
     add_common(parser, json=False)
     parser.set_defaults(run=run_by_name("studio.command:run"))

@@ -21,9 +21,9 @@ class ActList:
         gui = part.page.server.gui
         with gui.add_folder("Acts"):
             self._file = gui.add_text("File", str(part.session.document.path), disabled=True)
-            self._list = gui.add_markdown("No acts yet.")
             self._undo = part.button("Undo", lambda: part.show(part.session.document.undo()))
             self._redo = part.button("Redo", lambda: part.show(part.session.document.redo()))
+            self._list = gui.add_markdown("No acts yet.")
             self._which = gui.add_dropdown("Act", ("none",), initial_value="none")
             self._delete = part.button("Delete act", self._remove)
 

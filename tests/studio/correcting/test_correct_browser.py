@@ -90,14 +90,19 @@ class Viewer:
             f"""(() => {{
               const wanted = {json.dumps(label)};
               const l = [...document.querySelectorAll('label')].find(e => e.innerText.trim() === wanted);
-              const i = document.getElementById(l.htmlFor); i.scrollIntoView(); i.focus(); i.select(); }})()"""
+              const i = [...document.querySelectorAll('input')].find(e => l.compareDocumentPosition(e) & 4);
+              i.scrollIntoView({{ block: 'nearest' }}); i.focus(); i.select(); }})()"""
         )
         self.browser.type(text)
         self.browser.settle(0.5)
 
     def press(self, text: str) -> None:
-        """Press a button of the tab."""
-        self.browser.press(text, "button, label, [role=tab]")
+        """Press a button of the tab, once it has stopped moving."""
+        kinds, last = "button, label, [role=tab]", None
+        while (box := self.browser.box_of(text, kinds)) != last:
+            last = box
+            self.browser.settle(0.5)
+        self.browser.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         self.browser.settle(0.5)
 
     def acts(self) -> list[dict]:
@@ -122,7 +127,9 @@ def test_a_scene_is_corrected_in_the_page(studio: StudioPage, tmp_path: Path) ->
     with browser_page(executable, tmp_path / "profile", webgl=True) as browser:
         browser.open(f"http://127.0.0.1:{studio.port}", 1400, 1000)
         play(studio, browser)
-        assert not [e for e in browser.errors if "GPU stall" not in e and "GL Driver" not in e]
+        # viser's own three.js says that its clock is old, and SwiftShader that it is slow.
+        known = ("GPU stall", "GL Driver", "THREE.Clock")
+        assert not [error for error in browser.errors if not any(word in error for word in known)]
 
 
 def play(studio: StudioPage, browser: Page) -> None:
