@@ -21,7 +21,8 @@ def edited(assets: AssetSet, *entries: dict, notes: Notes | None = None) -> dict
         Instance(o.id, o.label, 0.9, np.zeros(3), 0.0, np.full(3, 0.2), 1, False) for o in assets.objects
     ]
     nothing = np.zeros((0, 0, 0), np.uint16)
-    pointer = Pointer(InstanceSet(np.zeros(0, np.int32), (), tuple(items), nothing), None)
+    found = InstanceSet(np.zeros(0, np.int32), (), tuple(items), nothing)
+    pointer = Pointer(found, None)  # pyright: ignore[reportArgumentType]
     out = Overrides(list(entries)).apply_to_assets(assets, pointer, notes or Notes())
     return {o.id: o for o in out.objects}
 
@@ -52,7 +53,9 @@ def test_an_absolute_pose_is_the_same_applied_once_or_twice():
     quaternion = quat_from_matrix(tilt(25.0)).tolist()
     entry = {"id": 11, "move": {"to": [-0.3, 0.2, 0.7], "wxyz": quaternion}}
     once, twice = edited(scene(), entry), edited(scene(), entry, entry)
-    np.testing.assert_allclose(once[11].world_from_object, rigid(tilt(25.0), [-0.3, 0.2, 0.7]), atol=1e-9)
+    np.testing.assert_allclose(
+        once[11].world_from_object, rigid(tilt(25.0), np.array([-0.3, 0.2, 0.7])), atol=1e-9
+    )
     np.testing.assert_allclose(once[11].world_from_object, twice[11].world_from_object, atol=1e-9)
 
 
