@@ -2,10 +2,11 @@
 
     python -m benchmarks.studio_acts --home HOME --scene default --truth CAPTURE/ground_truth --video FILE --out FILE
 
-The user sees the things of the scene and the true room. In each round they click the parts of wrong merges (split), draw
-outlines of missed things in two frames, merge pieces, drop others, and press Apply; from the second round on they also set
-wrong relations. Everything goes through `studio.correcting` as in the page, but for the browser. Reported: acts, clicks,
-the time of the acts (computing, and of a person at 3 s a click), the time of Apply, and figures before and after.
+The user sees the things of the scene and the true room. In each round they click the parts of wrong merges (split),
+draw outlines of missed things in two frames, merge pieces, drop others, and press Apply; from the second round on they
+also set wrong relations. Everything goes through `studio.correcting` as in the page, but for the browser. Reported:
+acts, clicks, the time of the acts (computing, and of a person at 3 s a click), the time of Apply, and figures before
+and after.
 """
 
 import argparse

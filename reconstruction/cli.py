@@ -49,7 +49,19 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_version())
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for module in (check, reconstruct, scenes, studio, evaluate, report, export, marker, benchmark, train, doctor):
+    for module in (
+        check,
+        reconstruct,
+        scenes,
+        studio,
+        evaluate,
+        report,
+        export,
+        marker,
+        benchmark,
+        train,
+        doctor,
+    ):
         module.add_parser(verbs)
     return parser
 

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _SHOWN = 60  # acts in the list; the file has all
 
+_NOTHING: tuple[str, ...] = ("none",)
+
 
 class ActList:
     """The folder "Acts"."""
@@ -24,7 +26,7 @@ class ActList:
             self._undo = part.button("Undo", lambda: part.show(part.session.document.undo()))
             self._redo = part.button("Redo", lambda: part.show(part.session.document.redo()))
             self._list = gui.add_markdown("No acts yet.")
-            self._which = gui.add_dropdown("Act", ("none",), initial_value="none")
+            self._which = gui.add_dropdown("Act", _NOTHING, initial_value=_NOTHING[0])
             self._delete = part.button("Delete act", self._remove)
 
     def show(self, state: DocumentState, preview: Preview) -> None:

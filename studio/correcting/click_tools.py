@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 _DOT_M = 0.008
 _NEAR = 0.14  # metres before the camera, where outlines are drawn: nearer than the photograph
 
+_NOTHING: tuple[str, ...] = ("none",)
+
 
 class ClickTools:
     """One tool at a time takes the clicks, until it is done or cancelled."""
@@ -46,7 +48,7 @@ class ClickTools:
             part.button("Floor is here", self._floor, "click a place on the floor")
         with gui.add_folder("Add a missed thing"):
             self._label = gui.add_text("Name", "")
-            self._frame = gui.add_dropdown("Frame", ("none",), initial_value="none")
+            self._frame = gui.add_dropdown("Frame", _NOTHING, initial_value=_NOTHING[0])
             part.button(
                 "Outline", self._outline, "go to the frame, and click around the thing in the photograph"
             )

@@ -35,12 +35,13 @@ class Gizmo:
         self.remove()
         if not self._on.value or object_id not in self._page.object_handles():
             return
-        pose, tilt = self._page.pose_of(object_id), bool(self._tilt.value)
+        pose = self._page.pose_of(object_id)
+        sideways = (-9, 9) if self._tilt.value else (0, 0)
         self._object_id = object_id
         self.handle = self._page.server.scene.add_transform_controls(
             "/correct/gizmo", scale=_SIZE_M, depth_test=False, wxyz=quat_from_matrix(pose[:3, :3]),
             position=pose[:3, 3], disable_rotations=False,
-            rotation_limits=((-9, 9),) * 3 if tilt else ((0, 0), (0, 0), (-9, 9)),
+            rotation_limits=(sideways, sideways, (-9, 9)),
         )  # fmt: skip
         self.handle.on_update(self._moved)
 

@@ -59,12 +59,12 @@ class Previewer:
     def pointer(self) -> Pointer | None:
         """Return what resolves addresses in this revision; None if its stage results are gone."""
         if self._pointer is None:
-            found, surface, posed = (self._results.get(name) for name in ("instances", "surface", "poses"))
-            world, scene = self._results.get("world"), self._results.get("gaussians")
-            if any(part is None for part in (found, surface, posed, world, scene)):
+            read = ("instances", "surface", "poses", "world", "gaussians")
+            results = {name: result for name in read if (result := self._results.get(name)) is not None}
+            if len(results) < len(read):
                 return None
-            placed = world.apply_to(scene.posed(posed))
-            depth = world.scale_depth(scene.depth)
+            found, surface, posed, world, scene = (results[name] for name in read)
+            placed, depth = world.apply_to(scene.posed(posed)), world.scale_depth(scene.depth)
             self._pointer = Pointer(found, surface, Footage(placed, depth, Lens.of(posed), surface))
         return self._pointer
 

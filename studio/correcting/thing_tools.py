@@ -8,6 +8,8 @@ from studio.text import bare
 if TYPE_CHECKING:
     from studio.correcting.tab import CorrectPart
 
+_NOT_FILLED: tuple[str, ...] = ("unknown",)
+
 
 class ThingTools:
     """The folder of the selected thing."""
@@ -35,7 +37,7 @@ class ThingTools:
             part.act("Set mass", lambda: acts().mass(part.selected(), float(self._mass.value)))
             self._friction = gui.add_number("Friction", 0.5, min=0.01, max=10.0, step=0.01)
             part.act("Set friction", lambda: acts().friction(part.selected(), float(self._friction.value)))
-            self._material = gui.add_dropdown("Material", ("unknown",), initial_value="unknown")
+            self._material = gui.add_dropdown("Material", _NOT_FILLED, initial_value=_NOT_FILLED[0])
             part.act("Set material", lambda: acts().material(part.selected(), str(self._material.value)))
 
     def fill(self) -> None:
