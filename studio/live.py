@@ -30,6 +30,7 @@ _HOST = "127.0.0.1"
 _NICE = 10  # of the thread that draws
 _SHOW_EVERY_S = 0.25  # progress within a stage
 _COME_BACK_S = 20.0  # in which a viewer connects again after the studio page has taken over
+_DRAWN_S = 60.0  # longest wait for the thread that draws
 _GONE_S = 10.0  # without a viewer after which the page counts as closed; a reload of the page takes less
 
 
@@ -193,13 +194,14 @@ class LivePage:
         """Wait until everything that was handed over is drawn."""
         finished = threading.Event()
         self._jobs.put(("done", finished))
-        finished.wait(timeout=60)
+        finished.wait(timeout=_DRAWN_S)
 
     def _stop(self) -> None:
         if self._check is not None:
             self._check.stop()
         if self._server is not None:
             self._jobs.put(None)
+            self._thread.join(timeout=_DRAWN_S)
             server, self._server = self._server, None
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
