@@ -20,6 +20,9 @@ pytestmark = [pytest.mark.browser, pytest.mark.end_to_end, pytest.mark.timeout(3
 _HOSTILE = "<img src=x onerror=document.title='hacked'>"
 
 
+_ARROW_M = 0.09  # a place on the gizmo's arrow, from its middle
+
+
 class Viewer:
     """A person at the page: sees what the server knows about the viewer's camera, and uses mouse and keys only."""
 
@@ -55,21 +58,33 @@ class Viewer:
         return box["x"] + 0.5 * box["width"] + focal * x / z, box["y"] + 0.5 * box["height"] + focal * y / z
 
     def spots(self, object_id: int) -> np.ndarray:
-        """Return points (n, 3) of an object that this viewer sees and no panel hides."""
-        pose, _, _ = self.camera()
+        """Return points (n, 3) of an object that this viewer sees, that no panel hides, and that a hand can hit."""
+        pose, fov, box = self.camera()
         mesh = self.page.pickable.geometry(object_id)
         centers = mesh.vertices[mesh.faces].mean(axis=1)
         shown = self.page.pose_of(object_id)
+        metre_px = 0.5 * box["height"] / np.tan(0.5 * fov)  # at 1 m
         rng, found = np.random.default_rng(0), []
-        for local in centers[rng.permutation(len(centers))[:80]]:
+        for local in centers[rng.permutation(len(centers))[:60]]:
             point = shown[:3, :3] @ local + shown[:3, 3]
-            hit = self.page.pickable.cast(pose[:3, 3], point - pose[:3, 3], self.page.unpickable)
-            x, y = self.at(point)
-            if hit is None or hit.owner != object_id or np.linalg.norm(hit.point - point) > 0.02:
-                continue
-            if self.browser.evaluate(f"(document.elementFromPoint({x}, {y}) || {{}}).tagName") == "CANVAS":
-                found.append(point)
+            hand = 6.0 / metre_px * np.linalg.norm(point - pose[:3, 3])
+            around = [point + hand * k * pose[:3, axis] for axis in (0, 1) for k in (-1, 1)]
+            if all(self._sees(object_id, pose[:3, 3], aim) for aim in (point, *around)):
+                x, y = self.at(point)
+                if (
+                    self.browser.evaluate(f"(document.elementFromPoint({x}, {y}) || {{}}).tagName")
+                    == "CANVAS"
+                ):
+                    found.append(point)
         return np.array(found).reshape(-1, 3)
+
+    def _sees(self, object_id: int, eye: np.ndarray, aim: np.ndarray) -> bool:
+        hit = self.page.pickable.cast(eye, aim - eye, self.page.unpickable)
+        return (
+            hit is not None
+            and hit.owner == object_id
+            and abs(hit.distance - np.linalg.norm(aim - eye)) < 0.03
+        )
 
     def click(self, point: np.ndarray, *modifiers: str) -> None:
         """Click a world point."""
@@ -206,6 +221,6 @@ def viewer_drag(viewer: Viewer, place: np.ndarray) -> None:
         np.linalg.norm(np.subtract(viewer.at(place[:3, 3] + 0.1 * a), viewer.at(place[:3, 3]))) for a in axes
     ]
     axis = axes[int(np.argmax(across))]
-    start, end = place[:3, 3] + 0.18 * axis, place[:3, 3] + 0.30 * axis
+    start, end = place[:3, 3] + _ARROW_M * axis, place[:3, 3] + 3 * _ARROW_M * axis
     viewer.browser.drag(viewer.at(start), viewer.at(end), steps=20)
     viewer.browser.settle(1.0)
