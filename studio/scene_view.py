@@ -9,7 +9,7 @@ import io
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -71,7 +71,7 @@ class StudioPage:
         self._clicks, self._reloads, self._moves = Listeners(), Listeners(), Listeners()
         self._grabbed: Callable[[Click], object] | None = None
         self._swallow_until = 0.0
-        self.unpickable: frozenset[int] = frozenset()  # ids that are not shown, which clicks go through
+        self._unpickable: dict[str, frozenset[int]] = {}  # ids that are not shown, by who hid them
         self._nodes: list[viser.SceneNodeHandle] = []
         self._frames_of: dict[int, viser.FrameHandle] = {}
         self._meshes: dict[int, viser.GlbHandle] = {}
@@ -162,6 +162,15 @@ class StudioPage:
     def _listen_to_clicks(self) -> None:
         for modifier in (None, "shift", "cmd/ctrl"):
             self.server.scene.on_click(modifier=modifier)(self._clicked)
+
+    @property
+    def unpickable(self) -> frozenset[int]:
+        """Ids that are not shown, which clicks go through."""
+        return frozenset().union(*self._unpickable.values())
+
+    def skip_in_clicks(self, who: str, ids: Iterable[int]) -> None:
+        """Let clicks go through these ids, in place of those that `who` named before."""
+        self._unpickable[who] = frozenset(ids)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if time.monotonic() < self._swallow_until:

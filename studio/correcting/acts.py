@@ -167,7 +167,7 @@ class Acts:
             raise UsageError("add: type a name for the new thing first, for example mug")
         if not 1 <= len(outlines) <= 2 or any(len(o.pixels) < 3 for o in outlines):
             raise UsageError("add: draw one outline or two in different frames, each of at least 3 points")
-        shapes = [{"frame": o.frame, "points": self._anchors.filmed(o.pixels)} for o in outlines]
+        shapes = [{"frame": o.frame, "points": self._anchors.filmed(o.pixels, o.frame)} for o in outlines]
         how = {"label": new, "outline": shapes[0] if len(shapes) == 1 else shapes}
         return Act({"add": how}, f"a {new} is added")
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from reconstruction.poses.lens import Lens
 from registry import SceneBundle
 from registry.errors import UsageError
 from registry.geometry import invert_rigid
@@ -67,20 +68,21 @@ class Anchors:
 
     def click(self, frame: int, pixel: tuple[float, float]) -> dict[str, Any]:
         """Return the address of a pixel of the undistorted photograph, counted in the bundle's cameras."""
-        x, y = self.filmed([pixel])[0]
+        x, y = self.filmed([pixel], frame)[0]
         return {"pixel": {"frame": int(frame), "x": x, "y": y}}
 
-    def filmed(self, pixels: Iterable[tuple[float, float]]) -> list[list[float]]:
-        """Map pixels of the undistorted frame (bundle's cameras) to pixels of the video as filmed.
+    def filmed(self, pixels: Iterable[tuple[float, float]], frame: int) -> list[list[float]]:
+        """Map pixels of an undistorted frame (bundle's cameras) to pixels of the video as filmed.
 
         Raises:
             UsageError: one lies outside of the video's frame.
         """
-        cameras, posed = self._bundle.cameras, self._posed
+        cameras = self._bundle.cameras
+        distorted = None if self._posed is None else Lens.of(self._posed).at(frame).distorted
         at = np.asarray(list(pixels), np.float64)
-        if posed is not None and posed.distorted is not None:
+        if distorted is not None:
             rays = np.column_stack([_rays(at, cameras.params), np.ones(len(at))])
-            at, counted = _distorted(rays, posed.distorted)
+            at, counted = _distorted(rays, distorted)
         else:
             counted = (cameras.width, cameras.height)
         scale = np.array(self._size) / counted

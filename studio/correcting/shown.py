@@ -57,7 +57,7 @@ class Shown:
             self._page.show_object(object_id, True)
         for object_id in hidden & known:
             self._page.show_object(object_id, False)
-        self._page.unpickable = (self._page.unpickable - self._hidden) | (hidden & known)
+        self._page.skip_in_clicks("corrections", hidden & known)
         self._hidden = set(hidden)
 
     def _move(self, preview: Preview) -> None:

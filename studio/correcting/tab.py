@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 _LOOK_EVERY_S = 0.7  # for edits by hand and for acts of another page
+_INEXACT = (
+    "**The results of the stages are gone, or another version made them.** Clicks on surfaces become metres, and "
+    "splits are not shown before *Apply*, which makes the results again."
+)
 
 
 class CorrectPart:
@@ -42,6 +46,7 @@ class CorrectPart:
         self._shown = Shown(page)
         with page.tabs.add_tab("Correct", viser.Icon.PENCIL):
             self._told = page.server.gui.add_markdown("", visible=False)
+            self._inexact = page.server.gui.add_markdown(_INEXACT, visible=False)
             self.things = ThingTools(self)
             self.gizmo = Gizmo(self)
             self.clicks = ClickTools(self)
@@ -175,6 +180,7 @@ class CorrectPart:
     def _fill(self) -> None:
         """Fill the lists that take seconds to know."""
         self._show(self.session.document.state())
+        self._inexact.visible = not self.session.anchors.exact
         self.things.fill()
         self.clicks.fill()
 

@@ -85,7 +85,7 @@ class Appearance:
                 for mode, nodes in made.items():
                     for node in nodes:
                         node.visible = shown and mode == self.mode
-        page.unpickable = frozenset() if self.room else frozenset(b.id for b in page.bundle.base)
+        page.skip_in_clicks("room", () if self.room else (b.id for b in page.bundle.base))
 
     def _gaussians(self) -> tuple[list[Any], list[Any]]:
         found = read_gaussians(self._page.bundle)

@@ -96,7 +96,7 @@ def test_pixels_are_counted_in_the_film_with_its_lens(pristine):
     inner = rng.uniform(
         [0.2 * camera.width, 0.2 * camera.height], [0.8 * camera.width, 0.8 * camera.height], (30, 2)
     )
-    filmed = np.array(anchors.filmed([(x, y) for x, y in inner]))
+    filmed = np.array(anchors.filmed([(x, y) for x, y in inner], 0))
     source = bundle.scene["source"]
     working = filmed * [camera.width / source["width"], camera.height / source["height"]]
     back = lens.straightened(working)
