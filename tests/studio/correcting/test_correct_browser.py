@@ -210,6 +210,7 @@ def play(studio: StudioPage, browser: Page) -> None:
     assert [o["label"] for o in studio.bundle.scene["objects"]].count(_HOSTILE) == 1
     viewer.press("Show before")
     viewer.until(lambda: studio.revision == before, "the scene before is shown")
+    viewer.until(lambda: "Show after" in browser.text(), "the button leads back")
     viewer.press("Show after")
     viewer.until(lambda: studio.revision != before, "the scene after is shown again")
 
