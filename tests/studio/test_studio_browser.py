@@ -175,7 +175,8 @@ def test_a_viewer_flies_to_a_camera_and_walks_away(room, tab: Page):
     pose = page.frames.world_from_camera(0)
     tab.settle(1.0)
     assert client.camera.position == pytest.approx(pose[:3, 3], abs=1e-3)
-    assert matrix_from_quat(client.camera.wxyz) == pytest.approx(pose[:3, :3], abs=1e-3)
+    # The controls of the browser turn to it by look-at and up: within .3 degrees.
+    assert matrix_from_quat(client.camera.wxyz) == pytest.approx(pose[:3, :3], abs=5e-3)
     assert page.frames.shown_to(client.client_id) == 0
     x, y, width, height = canvas_box(tab)
     tab.settle(1.0)
