@@ -1,17 +1,17 @@
 """One self-contained page of a scene: walk around, names of objects, and its assembly as a film."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from registry import SceneBundle, SceneRegistry
+from studio.assembly import assembly_steps, pose_at
 from studio.layers.names import NameLayer
 from studio.scene_view import StudioPage
 from studio.text import plain
 
 MAX_BYTES = 25_000_000
-_FALL_M, _FALL_S, _FPS = 0.35, 0.55, 20  # each thing comes from above
+_STEP_S, _FPS = 0.55, 20  # of the replay: one object, frames
 _START_S, _PAUSE_S, _END_S = 0.8, 0.15, 1.0
 _CAPTION = (
     "position:fixed;right:14px;top:12px;z-index:5;pointer-events:none;font:13px/1.45 system-ui,sans-serif;"
@@ -47,12 +47,10 @@ def export_html(registry: SceneRegistry, scene_id: str) -> str:
         _lift(page)
         recording = page.server.get_scene_serializer()
         recording.insert_sleep(_START_S)
-        for object_id in assembly_order(page.bundle):
-            for offset in _falling():
-                pose = page.bundle_pose(object_id)
-                pose[2, 3] += offset
-                page.set_pose(object_id, pose)
-                page.show_object(object_id, True)
+        for number, step in enumerate(assembly_steps(page.bundle)):
+            for share in np.linspace(0, 1, round(_STEP_S * _FPS) + 1)[1:]:
+                page.set_pose(step.object_id, pose_at(step, number, number + share))
+                page.show_object(step.object_id, True)
                 recording.insert_sleep(1 / _FPS)
             recording.insert_sleep(_PAUSE_S)
         recording.insert_sleep(_END_S)
@@ -66,24 +64,6 @@ def write_export(registry: SceneRegistry, scene_id: str, path: Path) -> int:
     data = export_html(registry, scene_id).encode("utf-8")
     path.write_bytes(data)
     return len(data)
-
-
-def assembly_order(bundle: SceneBundle) -> list[int]:
-    """Return the ids of all objects, every one after what carries it: breadth first from floor and walls."""
-    children: dict[int, list[int]] = {}
-    for edge in bundle.edges:
-        children.setdefault(edge.parent, []).append(edge.child)
-    order, front = [], [base.id for base in bundle.base]
-    while front:
-        front = [child for parent in front for child in sorted(children.get(parent, ()))]
-        order += front
-    return order
-
-
-def _falling() -> Iterator[float]:
-    """Yield heights above the final pose, metres: a smooth fall that ends at zero."""
-    steps = round(_FALL_S * _FPS)
-    yield from _FALL_M * (1 - np.linspace(0, 1, steps + 1) ** 2)
 
 
 def _lift(page: StudioPage) -> None:

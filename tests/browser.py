@@ -43,6 +43,17 @@ def find_browser() -> str | None:
     return next((path for path in map(shutil.which, _NAMES) if path), None)
 
 
+def require_browser() -> str:
+    """Return the path of a Chromium; without one skip the test, or fail it where SIMRECON_REQUIRE_BROWSER is set."""
+    import pytest
+
+    executable = find_browser()
+    if executable is None:
+        hint = "there is no Chromium on this machine; run tools/setup_browser.sh"
+        (pytest.fail if os.environ.get("SIMRECON_REQUIRE_BROWSER") else pytest.skip)(hint)
+    return executable
+
+
 class Page:
     """One tab of a browser that is driven through a pipe."""
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import viser
 
-from studio.playing.assembly import AssemblyStep, assembly_steps, pose_at
+from studio.assembly import AssemblyStep, assembly_steps, pose_at
 from studio.playing.ticker import Ticker
 from studio.text import plain_markdown
 

@@ -1,11 +1,9 @@
 """The page in a browser, opened from disk: no errors, no requests, no blank images, phone and print layouts."""
 
-import os
-
 import cv2
 import numpy as np
 import pytest
-from browser import Page, browser_page, find_browser
+from browser import Page, browser_page, require_browser
 
 pytestmark = [pytest.mark.browser, pytest.mark.end_to_end]
 
@@ -31,14 +29,7 @@ _MEASURE = """[...document.querySelectorAll("img, svg")].map((item) => {
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory):
-    executable = find_browser()
-    if executable is None:
-        if os.environ.get("SIMRECON_REQUIRE_BROWSER"):
-            pytest.fail(
-                "SIMRECON_REQUIRE_BROWSER is set, but there is no Chromium; run tools/setup_browser.sh"
-            )
-        pytest.skip("there is no Chromium on this machine; run tools/setup_browser.sh")
-    with browser_page(executable, tmp_path_factory.mktemp("profile")) as page:
+    with browser_page(require_browser(), tmp_path_factory.mktemp("profile")) as page:
         yield page
 
 

@@ -1,13 +1,12 @@
 """The page in a browser: ready, fly, select, layers, a hostile scene, the gallery, and the exported page."""
 
-import os
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from browser import Page, browser_page, find_browser
+from browser import Page, browser_page, require_browser
 from made_scenes import BOOK, BOX, TABLE
 
 from registry.geometry import matrix_from_quat
@@ -39,14 +38,7 @@ def server(made_registry):
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory):
-    executable = find_browser()
-    if executable is None:
-        if os.environ.get("SIMRECON_REQUIRE_BROWSER"):
-            pytest.fail(
-                "SIMRECON_REQUIRE_BROWSER is set, but there is no Chromium; run tools/setup_browser.sh"
-            )
-        pytest.skip("there is no Chromium on this machine; run tools/setup_browser.sh")
-    with browser_page(executable, tmp_path_factory.mktemp("profile"), webgl=True) as page:
+    with browser_page(require_browser(), tmp_path_factory.mktemp("profile"), webgl=True) as page:
         yield page
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Page, browser_page, find_browser
+from browser import Page, browser_page, require_browser
 from rooms.demo_room import fast_demo
 
 from registry import SceneRegistry
@@ -136,10 +136,7 @@ def studio(tmp_path: Path, demo_video: Path) -> Iterator[StudioPage]:
 
 
 def test_a_scene_is_corrected_in_the_page(studio: StudioPage, tmp_path: Path) -> None:
-    executable = find_browser()
-    if executable is None:
-        pytest.skip("no Chromium")
-    with browser_page(executable, tmp_path / "profile", webgl=True) as browser:
+    with browser_page(require_browser(), tmp_path / "profile", webgl=True) as browser:
         browser.open(f"http://127.0.0.1:{studio.port}", 1400, 1000)
         play(studio, browser)
         # viser's own three.js says that its clock is old, and SwiftShader that it is slow.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import browser_page, find_browser
+from browser import browser_page, require_browser
 from made_scenes import BOX, TABLE_TOP_M
 from PIL import Image
 
@@ -17,10 +17,7 @@ PATIENCE_S = 90.0  # software rendering on a busy machine draws one frame a seco
 
 @pytest.fixture
 def browser(tmp_path):
-    executable = find_browser()
-    if executable is None:
-        pytest.skip("no Chromium")
-    with browser_page(executable, tmp_path / "profile", webgl=True) as tab:
+    with browser_page(require_browser(), tmp_path / "profile", webgl=True) as tab:
         yield tab
 
 

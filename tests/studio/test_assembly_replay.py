@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from made_scenes import BOOK, KNOB, PICTURE, TABLE
 
-from studio.playing.assembly import APPROACH_M, assembly_steps, pose_at
+from studio.assembly import APPROACH_M, assembly_steps, pose_at
 
 
 @pytest.fixture(scope="module")
-def bundle(play_registry):
-    return play_registry.load("room")
+def bundle(made_registry):
+    return made_registry.load("room")
 
 
 def test_every_object_comes_after_what_carries_it(bundle):
