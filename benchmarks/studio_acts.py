@@ -30,7 +30,8 @@ from reconstruction.measure.surfaces import nearest_entities
 from registry import SceneRegistry
 from registry.errors import SimReconError
 from studio.correcting.acts import Act, Outline
-from studio.correcting.session import Session, remember
+from studio.correcting.session import Session
+from studio.remembered import remember
 from studio.selection import Click
 
 SECONDS_A_CLICK = 3.0  # a person who knows what to click: aim, press, look
@@ -52,7 +53,7 @@ _FIGURES = (
 
 @dataclass
 class Played:
-    """What the user did, and what it brought."""
+    """Acts and clicks of the played user, and the scene's figures before and after."""
 
     scene: str
     acts: list[str] = field(default_factory=list)

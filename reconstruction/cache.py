@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from reconstruction.core import artifacts
 from registry.errors import EnvironmentMissing
+from registry.files import write_whole
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -112,9 +113,7 @@ class StageStore:
     def note_published(self, scene_id: str, revision: str, keys: dict[str, str]) -> None:
         """Record the fingerprints that a published scene was made from; an equal bundle may hold an older report."""
         path = self.work_dir / f"published-{scene_id}.json"
-        partial = self.work_dir / f"tmp-{os.getpid()}-{path.name}"
-        partial.write_text(canonical_json({"revision": revision, "stage_keys": keys}))
-        partial.replace(path)
+        write_whole(path, canonical_json({"revision": revision, "stage_keys": keys}).encode())
 
     def scratch(self, stage: str) -> Path:
         """Create an empty folder for temporary files of a stage; remove it with `discard`."""

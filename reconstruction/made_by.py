@@ -1,9 +1,10 @@
 """A note in the work folder of where a scene's film and corrections lie, so that the studio finds them again."""
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
+
+from registry.files import write_whole
 
 
 @dataclass(frozen=True)
@@ -18,12 +19,10 @@ class MadeBy:
 def note_made_by(work_dir: Path, scene_id: str, video: Path, overrides: Path | None) -> None:
     """Write the note of a published scene."""
     path = work_dir / f"made-{scene_id}.json"
-    partial = work_dir / f"tmp-{os.getpid()}-{path.name}"
     said = {"video": str(video.absolute()), "folder": str(Path.cwd())}
     if overrides is not None:
         said["overrides"] = str(overrides.absolute())
-    partial.write_text(json.dumps(said))
-    partial.replace(path)
+    write_whole(path, json.dumps(said).encode())
 
 
 def read_made_by(work_dir: Path, scene_id: str) -> MadeBy | None:

@@ -113,7 +113,7 @@ def reconstruct(
 
 
 def _after(also: Callable[[Run, str], None] | None) -> Callable[[Run, str], None]:
-    """Return what is called after each stage."""
+    """Return the callback after each stage: the check of the poses, then `also`."""
 
     def after(run: Run, stage: str) -> None:
         _check_registered(run, stage)

@@ -2,12 +2,12 @@
 
 import hashlib
 import json
-import os
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from registry import EnvironmentMissing, UsageError
+from registry.files import write_whole
 
 PACKAGES = ("simrecon", "mani_skill", "sapien", "gymnasium", "torch", "numpy")
 
@@ -43,17 +43,10 @@ def write_json(path: Path, value: Any) -> None:
     Raises:
         EnvironmentMissing: The folder cannot be written.
     """
-    partial = path.with_name(f".{path.name}-{os.getpid()}")
     text = json.dumps(value, indent=1, allow_nan=False) + "\n"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("w", encoding="utf-8") as handle:
-            handle.write(text)
-            handle.flush()
-            os.fsync(handle.fileno())
-        partial.replace(path)
+        write_whole(path, text.encode())
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise EnvironmentMissing(
             f"cannot write {path}: {error.strerror}; make room there, or choose another --out"
         ) from error

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _remember(registry: SceneRegistry, arguments: argparse.Namespace) -> None:
     """Keep what the command line says about the scene's film, work folder and corrections."""
-    from studio.correcting.session import remember
+    from studio.remembered import remember
 
     remember(
         registry.root, arguments.scene, video=arguments.video, work_dir=arguments.work_dir,

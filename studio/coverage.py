@@ -6,7 +6,6 @@ that a plane completed agrees with it; *guessed* where no frame has it: symmetry
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from studio.picking import Geometry, read_geometry
 
 if TYPE_CHECKING:
     from reconstruction.core.types import AssetSet, Camera, DepthMaps
+    from reconstruction.measure.stage_results import StageResults
 
 CLASSES = ("guessed", "completed", "seen")
 COLORS = np.array([[214, 104, 83], [233, 190, 96], [62, 150, 136]], np.uint8)  # a row a class
@@ -66,16 +66,10 @@ class Coverage:
         )
 
 
-def measure_coverage(bundle: SceneBundle, registry_root: Path) -> Coverage:
+def measure_coverage(bundle: SceneBundle, stages: "StageResults") -> Coverage:
     """Class all surfaces of a bundle by the depth maps of its run, or by its own shares where those are gone."""
-    from reconstruction.measure.stage_results import StageResults
-
-    stages = StageResults.find(bundle, registry_root)
-    posed, depth = (
-        stages.refined_in_world()[1] is not None and stages.in_world()[0],
-        stages.refined_in_world()[1],
-    )
-    if not posed or depth is None:
+    posed, depth = stages.in_world()[0], stages.refined_in_world()[1]
+    if posed is None or depth is None:
         return Coverage({key: _by_share(mesh, share) for key, mesh, _, share in _meshes(bundle, None)}, False)
     assets = stages.get("assets")
     surfaces = {}

@@ -49,7 +49,9 @@ def export_html(registry: SceneRegistry, scene_id: str) -> str:
         recording.insert_sleep(_START_S)
         for number, step in enumerate(assembly_steps(page.bundle)):
             for share in np.linspace(0, 1, round(_STEP_S * _FPS) + 1)[1:]:
-                page.set_pose(step.object_id, pose_at(step, number, number + share))
+                pose = pose_at(step, number, number + share)
+                assert pose is not None  # share > 0
+                page.set_pose(step.object_id, pose)
                 page.show_object(step.object_id, True)
                 recording.insert_sleep(1 / _FPS)
             recording.insert_sleep(_PAUSE_S)

@@ -30,7 +30,7 @@ _STAY_M, _STAY_DEG = 0.01, 1.0  # a viewer farther from the camera than this has
 
 @dataclass
 class Comparison:
-    """What a viewer who stands at a camera sees of its photograph."""
+    """State of one viewer at a camera: frame, opacity and columns of the photograph shown."""
 
     frame: int
     opacity: float  # 0 scene, 1 photograph
@@ -210,12 +210,10 @@ class Frames:
     @cached_property
     def _photographs(self) -> dict:
         """Photographs by frame: those of the stage cache, else the few that the bundle keeps."""
-        from reconstruction.measure.stage_results import StageResults
-
         bundle = self._page.bundle
         kept = bundle.scene.get("instances", {"frames": []})["frames"]
         found: dict = {f["index"]: partial(_read_picture, bundle.resolve(f["image"])) for f in kept}
-        posed = StageResults.find(bundle, self._page.registry.root).get("poses")
+        posed = self._page.stage_results.get("poses")
         if posed is not None:
             found |= dict(zip(posed.indices.tolist(), posed.images))
             found |= dict(zip(posed.held_out_indices.tolist(), posed.held_out_images))

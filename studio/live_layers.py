@@ -1,4 +1,4 @@
-"""What each stage of a reconstruction adds to the live page: cameras, points, depth, surface, things.
+"""Scene nodes that each stage of a reconstruction adds to the live page: cameras, points, depth, surface, things.
 
 Before the world frame is known, a similarity from the cameras alone puts the scene upright and near the origin; the
 stage `world` replaces it. Nodes are `/live/<layer>/...`.

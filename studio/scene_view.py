@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import viser
@@ -22,10 +23,14 @@ from studio.as_filmed import as_filmed
 from studio.frames import Frames
 from studio.parts import Part
 from studio.picking import Pickable
+from studio.remembered import find_stage_results
 from studio.same_origin import same_origin_only
 from studio.selection import Click, Listeners, Selection
 from studio.start_view import start_view
 from studio.text import bare
+
+if TYPE_CHECKING:
+    from reconstruction.measure.stage_results import StageResults
 
 logger = logging.getLogger(__name__)
 
@@ -72,6 +77,7 @@ class StudioPage:
         self._grabbed: Callable[[Click], object] | None = None
         self._swallow_until = 0.0
         self._unpickable: dict[str, frozenset[int]] = {}  # ids that are not shown, by who hid them
+        self._stages: tuple[str, StageResults | None] = ("", None)
         self._nodes: list[viser.SceneNodeHandle] = []
         self._frames_of: dict[int, viser.FrameHandle] = {}
         self._meshes: dict[int, viser.GlbHandle] = {}
@@ -96,6 +102,15 @@ class StudioPage:
     def revision(self) -> str:
         """Revision shown."""
         return self.bundle.revision
+
+    @property
+    def stage_results(self) -> "StageResults":
+        """Stage results of the revision shown; the first access imports the pipeline (seconds)."""
+        revision, results = self._stages
+        if results is None or revision != self.revision:
+            results = find_stage_results(self.bundle, self.registry.root)
+            self._stages = self.revision, results
+        return results
 
     # ---- Objects.
 

@@ -1,4 +1,4 @@
-"""What the user points at: the selected objects, and clicks into the scene."""
+"""Selected objects of a page, and clicks into its scene."""
 
 import logging
 from collections.abc import Callable, Iterable

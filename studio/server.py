@@ -10,7 +10,7 @@ import hmac
 import logging
 import secrets
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
@@ -65,7 +65,6 @@ class StudioServer:
         self._parts, self._wanted_port = tuple(parts), port
         self.port = 0
         self._pages: dict[str, StudioPage] = {}
-        self._mounted: dict[str, Callable[[], int]] = {}
         self._opening = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
@@ -80,10 +79,6 @@ class StudioServer:
             if scene_id not in self._pages:
                 self._pages[scene_id] = StudioPage(self.registry, scene_id, parts=self._parts)
             return self._pages[scene_id]
-
-    def mount(self, name: str, port: Callable[[], int]) -> None:
-        """Serve another viser server of this process at `/s/<name>/`; `port()` is its port."""
-        self._mounted[name] = port
 
     def url(self, scene_id: str | None = None) -> str:
         """Return the address of a page (None: of the gallery), with the token if there is one."""
@@ -166,7 +161,7 @@ class StudioServer:
             await asyncio.gather(carry(browser, page), carry(page, browser))
 
     def _port_of(self, name: str) -> int:
-        return self._mounted[name]() if name in self._mounted else self.open(name).port
+        return self.open(name).port
 
     # ---- Requests.
 

@@ -56,12 +56,12 @@ class Overrides:
         return loaded
 
     def of_stage(self, stage: str) -> list[dict]:
-        """Return what the entries say to this stage: address and actions of each that has any."""
+        """Return address and actions of each entry that has actions for this stage."""
         parts = (part_of_stage(entry, stage) for entry in self.entries)
         return [part for part in parts if part]
 
     def scene_entries(self) -> SceneEntries:
-        """Return what the file says about the whole scene: scale, up, floor."""
+        """Return the entries about the whole scene: scale, up, floor."""
         return parse_scene_entries(self.of_stage("world"), "overrides")
 
     def check_lengths(self, config: "PipelineConfig") -> None:

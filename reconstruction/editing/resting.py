@@ -18,7 +18,7 @@ _SAME_M = 0.01  # cells within this distance of contact tell what carries the ob
 
 @dataclass(frozen=True)
 class Rest:
-    """Where an object comes to rest."""
+    """Vertical shift that lets an object rest, and its carrier."""
 
     shift_m: float  # along +z
     carrier: int  # id of an object or of the floor

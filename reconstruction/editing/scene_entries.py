@@ -35,7 +35,7 @@ class KnownUp:
 
 @dataclass(frozen=True)
 class SceneEntries:
-    """What an overrides file says about the whole scene; None: nothing."""
+    """Entries of an overrides file about the whole scene; None: no such entry."""
 
     scale: KnownLength | None = None
     up: KnownUp | None = None

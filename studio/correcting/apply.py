@@ -17,7 +17,7 @@ from pathlib import Path
 
 from registry import SceneRegistry
 from registry.errors import UsageError
-from studio.correcting.journal import write_whole
+from registry.files import write_whole
 from studio.correcting.origin import Origin
 
 KEPT_RESULTS = 3  # of each stage: uncorrected, before and after, so that an undo is applied at once
@@ -28,7 +28,7 @@ _ENDED = "studio: exit code "
 
 @dataclass(frozen=True)
 class ApplyState:
-    """How far a run is."""
+    """Progress of a run."""
 
     running: bool
     stage: str = ""

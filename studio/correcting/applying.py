@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from registry import SceneBundle
 from registry.errors import UsageError
 from studio.correcting.apply import ApplyRun, ApplyState
-from studio.correcting.session import remember
+from studio.remembered import remember
 from studio.text import plain_markdown
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class Applying:
 
 
 def summary(before: SceneBundle, after: SceneBundle) -> str:
-    """Return what changed between two revisions of a scene, in one line."""
+    """Return the differences between two revisions of a scene, in one line."""
     said = [f"{len(before.objects)} things before, {len(after.objects)} now"]
     old = {item["id"]: item["label"] for item in before.scene["objects"]}
     new = {item["id"]: item["label"] for item in after.scene["objects"]}

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from registry.errors import EnvironmentMissing, UsageError
+from registry.files import write_whole
 from registry.locks import file_lock
 from studio.correcting import yaml_text
-from studio.correcting.journal import History, Journal, write_whole
+from studio.correcting.journal import History, Journal
 
 
 @dataclass(frozen=True)

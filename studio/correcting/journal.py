@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from registry.files import write_whole
+
 _KEPT = 500  # states; a longer history loses its oldest ones when the file is opened
 BY_HAND = "edit by hand"
 
@@ -142,16 +144,3 @@ class Journal:
         found = self.path.stat()
         self._identity, self._read = (found.st_dev, found.st_ino), len(raw)
         self.history = History(states, now)
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Replace a file at once: readers see the old content or the new, also after a power cut."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with partial.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    if path.exists():
-        partial.chmod(path.stat().st_mode & 0o777)
-    partial.replace(path)

@@ -15,7 +15,7 @@ _FOUND_AGAIN = ("object_measured_height_m",)  # of `world`: the passes of `--sca
 
 @dataclass(frozen=True)
 class Origin:
-    """What `simrecon reconstruct` needs to make a scene again."""
+    """Arguments of `simrecon reconstruct` that make a scene again."""
 
     scene_id: str
     registry_root: Path

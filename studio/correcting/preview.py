@@ -1,4 +1,4 @@
-"""What acts that are not applied yet do to the scene, as far as it is known without a run."""
+"""Predicted effect of acts that are not applied yet: ids, poses and split parts, without a run."""
 
 from typing import Any
 
@@ -57,7 +57,7 @@ class Previewer:
         return out
 
     def pointer(self) -> Pointer | None:
-        """Return what resolves addresses in this revision; None if its stage results are gone."""
+        """Return the resolver of addresses in this revision; None if its stage results are gone."""
         if self._pointer is None:
             read = ("instances", "surface", "poses", "world", "gaussians")
             results = {name: result for name in read if (result := self._results.get(name)) is not None}

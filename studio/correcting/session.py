@@ -1,7 +1,6 @@
 """The corrections of one scene: overrides file, acts, previews, Apply; a page or a script drives it."""
 
 import contextlib
-import json
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,35 +13,14 @@ from studio.correcting.acts import Act, Acts, perform
 from studio.correcting.anchoring import Anchors
 from studio.correcting.apply import ApplyRun
 from studio.correcting.document import Document, DocumentState
-from studio.correcting.journal import write_whole
 from studio.correcting.origin import Origin, find_origin, work_folder
 from studio.correcting.pending import Preview, pending_entries
 from studio.correcting.yaml_text import appended
+from studio.remembered import FOLDER, find_stage_results, remembered
 
 if TYPE_CHECKING:
     from reconstruction.measure.stage_results import StageResults
     from studio.correcting.preview import Previewer
-
-FOLDER = "corrections"  # beside the registry
-
-
-def remember(
-    registry_root: Path, scene_id: str, *, video: Path | None = None, work_dir: Path | None = None,
-    overrides: Path | None = None,
-) -> None:  # fmt: skip
-    """Keep what the user says about a scene: where its film, its work folder and its file of corrections are.
-
-    Raises:
-        UsageError: the film or the work folder does not exist.
-    """
-    said = {"video": video, "work_dir": work_dir, "overrides": overrides}
-    new = {name: str(path.absolute()) for name, path in said.items() if path is not None}
-    for name in ("video", "work_dir"):
-        if name in new and not Path(new[name]).exists():
-            raise UsageError(f"--{name.replace('_', '-')} {said[name]}: no such file or folder")
-    if new:
-        path = _said_file(registry_root, scene_id)
-        write_whole(path, json.dumps({**_said(registry_root, scene_id), **new}).encode())
 
 
 class Session:
@@ -75,10 +53,7 @@ class Session:
     @cached_property
     def results(self) -> "StageResults":
         """Stage results of the revision."""
-        from reconstruction.measure.stage_results import StageResults  # the whole pipeline: seconds
-
-        work_dir = _said(self.registry.root, self.scene_id).get("work_dir")
-        return StageResults.find(self.bundle, self.registry.root, Path(work_dir) if work_dir else None)
+        return find_stage_results(self.bundle, self.registry.root)
 
     @cached_property
     def anchors(self) -> Anchors:
@@ -113,7 +88,7 @@ class Session:
         return pending_entries(state.entries, self.bundle)
 
     def preview(self, state: DocumentState) -> Preview:
-        """Return what the pending acts change, as far as ids and anchors say."""
+        """Return the changes of the pending acts, as far as ids and anchors tell them."""
         pending, taken_back = self.pending(state)
         return self.previewer.quick(state.entries) if pending else Preview(0, taken_back)
 
@@ -123,7 +98,7 @@ class Session:
         Raises:
             UsageError: the film is not found.
         """
-        said = {name: Path(path) for name, path in _said(self.registry.root, self.scene_id).items()}
+        said = remembered(self.registry.root, self.scene_id)
         return find_origin(
             self.bundle, self.registry.root, video=said.get("video"), work_dir=said.get("work_dir")
         )
@@ -149,11 +124,12 @@ class Session:
 
     def _overrides_file(self) -> Path:
         """Return the file that the user said, else that of the last run, else one beside the registry."""
-        said = _said(self.registry.root, self.scene_id)
+        said = remembered(self.registry.root, self.scene_id)
         if "overrides" in said:
-            return Path(said["overrides"])
-        work_dir = Path(said["work_dir"]) if "work_dir" in said else None
-        noted = read_made_by(work_folder(self.bundle, self.registry.root, work_dir), self.scene_id)
+            return said["overrides"]
+        noted = read_made_by(
+            work_folder(self.bundle, self.registry.root, said.get("work_dir")), self.scene_id
+        )
         if noted is not None and noted.overrides is not None and noted.overrides.is_file():
             return noted.overrides
         return self.folder / f"{self.scene_id}.yaml"
@@ -168,15 +144,3 @@ def _first_text(bundle: SceneBundle) -> str:
     for entry in bundle.scene["report"].get("overrides", []):
         text = appended(text, entry)
     return text
-
-
-def _said_file(registry_root: Path, scene_id: str) -> Path:
-    return registry_root.parent / FOLDER / f"{scene_id}.json"
-
-
-def _said(registry_root: Path, scene_id: str) -> dict[str, str]:
-    try:
-        said = json.loads(_said_file(registry_root, scene_id).read_text())
-    except (OSError, ValueError):
-        return {}
-    return {str(k): str(v) for k, v in said.items()} if isinstance(said, dict) else {}

@@ -16,7 +16,7 @@ _LIFT_M = 0.03  # of a name over its thing
 
 
 class Shown:
-    """What a page shows of a preview."""
+    """Draws previews in a page: hides, moves, paints and renames objects."""
 
     def __init__(self, page: "StudioPage") -> None:
         self._page = page

@@ -87,7 +87,7 @@ def _flow(value: Any) -> str:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the list of a file and its items are in the text, as indices of characters."""
+    """Spans of the list of a file and of its items in the text, as indices of characters."""
 
     brackets: bool  # the list is written [...], not with dashes
     column: int  # of the list

@@ -1,4 +1,4 @@
-"""How the surfaces look: textures, Gaussians, what was seen of them, or their collision parts. One at a time."""
+"""Forms of the surfaces, one at a time: textures, Gaussians, coverage colors, or collision parts."""
 
 import threading
 from typing import TYPE_CHECKING, Any
@@ -106,7 +106,7 @@ class Appearance:
         return nodes[:1], nodes[1:]
 
     def _coverages(self) -> tuple[list[Any], list[Any]]:
-        self._coverage = measure_coverage(self._page.bundle, self._page.registry.root)
+        self._coverage = measure_coverage(self._page.bundle, self._page.stage_results)
         objects, room = [], []
         for key, surface in self._coverage.surfaces.items():
             is_object = key in self._page.object_handles()

@@ -20,10 +20,8 @@ class FreeSpaceLayer(Layer):
         """Add a point at every k-th free voxel, k so that there are at most 40,000."""
         import matplotlib
 
-        from reconstruction.measure.stage_results import StageResults
-
         self._text = "The stage cache of this scene is gone, and free space with it."
-        surface = StageResults.find(self.page.bundle, self.page.registry.root).get("surface")
+        surface = self.page.stage_results.get("surface")
         if surface is None:
             return []
         space = surface.space

@@ -16,7 +16,8 @@ from registry import SceneRegistry
 from registry.errors import UsageError
 from studio.correcting.apply import ApplyRun, ApplyState
 from studio.correcting.origin import Origin, find_origin, options_of
-from studio.correcting.session import Session, remember
+from studio.correcting.session import Session
+from studio.remembered import remember
 
 _OPTIONS = (
     "depth.depth_side_px=640", "world.marker_size_m=0.1", "world.scale=camera-height=1.5", "gaussians.backend=cpu",

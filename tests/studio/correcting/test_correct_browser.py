@@ -12,8 +12,8 @@ from rooms.demo_room import fast_demo
 
 from registry import SceneRegistry
 from registry.geometry import invert_rigid, matrix_from_quat, rigid
-from studio.correcting.session import remember
 from studio.correcting.tab import CorrectPart
+from studio.remembered import remember
 from studio.scene_view import StudioPage
 
 pytestmark = [pytest.mark.browser, pytest.mark.end_to_end, pytest.mark.timeout(3600)]
