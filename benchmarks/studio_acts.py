@@ -149,21 +149,32 @@ class User:
         return [_click(thing, self.points[row]) for row in chosen]
 
     def split(self, thing: int, entities: list[TrueEntity]) -> None:
-        """Split a thing into true objects by a click each; by more if that looks wrong, most on the largest."""
+        """Split a thing into true objects: by a click each, then by more clicks on the largest, then by outlines.
+
+        A try whose preview looks wrong is undone. Outlines go around all but the largest part, one frame each.
+        """
         sizes = [int(((self.owner == thing) & (self.true == e.id)).sum()) for e in entities]
         largest = int(np.argmax(sizes))
-        for on_largest, on_others in ((1, 1), (3, 1), (5, 2)):
+
+        def good(after: np.ndarray) -> bool:
+            return self._pure(after, thing, entities) >= _RIGHT
+
+        for on_largest in (1, 3):
             parts = [
-                self.clicks_on(thing, entity, on_largest if k == largest else on_others)
+                self.clicks_on(thing, entity, on_largest if k == largest else 1)
                 for k, entity in enumerate(entities)
             ]
-            last = on_largest == 5
-
-            def good(after: np.ndarray, last: bool = last) -> bool:
-                return last or self._pure(after, thing, entities) >= _RIGHT
-
             if self.do(lambda parts=parts: self.session.acts.split(parts), 2 + sum(map(len, parts)), good):
                 return
+        for k, entity in enumerate(entities):
+            if k != largest:
+                self.add(entity, 1)
+
+    def add(self, entity: TrueEntity, frames: int) -> None:
+        """Outline a true object in one or two frames: it becomes a thing of its own."""
+        outlines = self.outline(entity, frames)
+        points = sum(len(o.pixels) for o in outlines)
+        self.do(lambda: self.session.acts.add(entity.label, outlines), 3 + frames + points)
 
     def _pure(self, after: np.ndarray, thing: int, entities: list[TrueEntity]) -> float:
         """Return the least share of a true object's vertices in a thing that stay together after a split of it."""
@@ -217,9 +228,7 @@ class User:
             held = np.bincount(self.owner[rows], minlength=1) if len(rows) else np.zeros(1, int)
             holders = [t for t in self.things if t < len(held) and held[t] >= max(_LEAST, _PART * len(rows))]
             if not holders:
-                outlines = self.outline(entity, 2)
-                points = sum(len(o.pixels) for o in outlines)
-                self.do(lambda o=outlines, e=entity: self.session.acts.add(e.label, o), 5 + points)
+                self.add(entity, 2)
                 continue
             pieces = [
                 t for t in self.things if t < len(held) and held[t] >= _LEAST and self._mostly(t, entity.id)
