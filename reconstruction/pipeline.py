@@ -185,7 +185,8 @@ DEFAULT_STAGE_NAMES = tuple(stage.name for stage in STAGES if not stage.on_deman
 def in_world(results: Mapping[str, Any]) -> tuple[PosedFrames, DepthMaps]:
     """Return the posed frames and the corrected depth maps, in world space, metres."""
     world, scene = results["world"], results["gaussians"]
-    return world.apply_to(scene.posed(results["poses"])), world.scale_depth(scene.depth)
+    posed = world.apply_to(scene.posed(results["poses"]))
+    return posed, world.depth_in_world(scene.depth, posed)
 
 
 def view_scene(results: Mapping[str, Any]) -> ViewScene:

@@ -5,7 +5,7 @@ per sample (`shading`); what the phone makes of it is in `sensor`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from reconstruction.core.types import Camera
 from registry.geometry import invert_rigid
 from synthetic.lighting import Light, bake_light, mirrored_lamps, mirrored_windows, usual_lamps
 from synthetic.materials import Finish
+from synthetic.mirrors import GLASS, Mirror, reflected_points
 from synthetic.room import WALL_HEIGHT_M, Room
 from synthetic.sensor import Electronics, Sensor, expose
 from synthetic.shading import into_camera, paint, see, shade
@@ -45,6 +46,7 @@ class FilmSet:
     windows: np.ndarray  # float64 (k, 9) axis, plane, low and high along, low and high up, color
     box: np.ndarray  # float64 (6,) west, east, south, north, floor, ceiling: what reflections hit
     background: tuple[float, float, float] = _BACKGROUND  # color where nothing stands, 0 to 255
+    mirror: Mirror | None = None
 
 
 def _pack_textures(looks: list[Texture]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -69,6 +71,7 @@ def prepare(
     light: Light | None = None,
     finishes: Mapping[str, Finish] | None = None,
     background: tuple[float, float, float] = _BACKGROUND,
+    mirror: np.ndarray | None = None,
 ) -> FilmSet:
     """Gather the room's surface, pack its textures, bake its light.
 
@@ -78,6 +81,7 @@ def prepare(
         light: What lights it; None: as every room.
         finishes: Of textures that shine, by name; see `materials.repaint`.
         background: Color where nothing stands, 0 to 255.
+        mirror: Plane (4,) of `mirrors.GLASS`, which reflects the room; None: no mirror.
     """
     light, finishes = light or Light(), finishes or {}
     names = sorted(room.textures)
@@ -115,6 +119,27 @@ def prepare(
         windows=mirrored_windows(light, vertices),
         box=np.array([*room.extent, 0.0, WALL_HEIGHT_M]),
         background=background,
+        mirror=None if mirror is None else Mirror(number_of[GLASS], mirror),
+    )
+
+
+def reflected(film_set: FilmSet) -> FilmSet:
+    """Return the image of a film set in its mirror: what stands before the mirror, behind it."""
+    mirror = film_set.mirror
+    assert mirror is not None
+    before = film_set.vertices @ mirror.plane[:3] + mirror.plane[3] > 1e-3
+    kept = before[film_set.faces].all(axis=1)
+    flip = (np.eye(3) - 2 * np.outer(mirror.plane[:3], mirror.plane[:3])).astype(np.float32)
+    return replace(
+        film_set,
+        vertices=reflected_points(mirror.plane, film_set.vertices),
+        normals=film_set.normals @ flip,
+        faces=np.ascontiguousarray(film_set.faces[kept][:, ::-1]),
+        face_texture=film_set.face_texture[kept],
+        face_entity=film_set.face_entity[kept],
+        face_normal=film_set.face_normal[kept] @ flip,
+        face_patch=film_set.face_patch[kept],
+        mirror=None,
     )
 
 
@@ -135,6 +160,8 @@ def render_color(
         quick: Several times as fast and nearly the same picture: `supersample` smooths outlines only (textures
             are smooth by their mip levels), and back sides are left out.
     """
+    if film_set.mirror is not None:
+        return _with_reflection(film_set, camera, world_from_camera, supersample, quick)
     pose = np.ascontiguousarray(world_from_camera, np.float64)
     shining = film_set.normals, film_set.finish, film_set.mirrored, film_set.windows, film_set.box
     background = np.array(film_set.background, np.float32)
@@ -164,6 +191,23 @@ def render_color(
         if supersample > 1
         else out
     )
+
+
+def _with_reflection(
+    film_set: FilmSet, camera: Camera, world_from_camera: np.ndarray, supersample: int, quick: bool
+) -> np.ndarray:
+    """Draw a frame, and the reflected room over the pixels of the mirror."""
+    mirror = film_set.mirror
+    assert mirror is not None
+    color = render_color(replace(film_set, mirror=None), camera, world_from_camera, supersample, quick)
+    large = camera.resized(camera.width * supersample, camera.height * supersample)
+    face = rasterize_mesh(film_set.vertices, film_set.faces, large, world_from_camera).face
+    glass = (face >= 0) & (film_set.face_texture[np.maximum(face, 0)] == mirror.texture)
+    if not glass.any():
+        return color
+    share = cv2.resize(glass.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    image = render_color(reflected(film_set), camera, world_from_camera, supersample, quick)
+    return color + share[..., None] * (image - color)
 
 
 def render_truth(

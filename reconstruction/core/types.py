@@ -13,7 +13,8 @@ from typing import Annotated
 import numpy as np
 
 from reconstruction.core.checked_arrays import CheckedArrays
-from registry.geometry import split_similarity
+from reconstruction.core.reflections import without_reflections
+from registry.geometry import split_similarity, transform_points
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,21 @@ class ScaleEstimate:
 
 
 @dataclass(frozen=True)
+class Plane(CheckedArrays):
+    """A bounded plane n . x + d = 0; n is unit and points towards free space. In world space, unless said otherwise."""
+
+    plane: Annotated[np.ndarray, "float64 4"]  # nx, ny, nz, d in metres
+    polygon: Annotated[np.ndarray, "float64 k 3"]  # outline, metres, k >= 3
+
+    def moved(self, b_from_a: np.ndarray) -> "Plane":
+        """Return the plane in space b, for a similarity (4, 4) and this plane in space a."""
+        scale, rotation, shift = split_similarity(b_from_a)
+        normal = rotation @ self.plane[:3]
+        polygon = transform_points(b_from_a, self.polygon)
+        return Plane(np.append(normal, scale * self.plane[3] - normal @ shift), polygon)
+
+
+@dataclass(frozen=True)
 class WorldFrame(CheckedArrays):
     """Stage 4: the similarity transform from `sfm` to `world`, and how it was estimated."""
 
@@ -169,6 +185,7 @@ class WorldFrame(CheckedArrays):
     gravity_sigma_deg: float  # standard deviation of the up direction
     floor_observed: bool  # False: the floor is assumed below all seen surface
     yaw_snapped: bool  # walls (or furniture faces) are parallel to x and y
+    mirrors: tuple[Plane, ...] = ()  # glass of mirrors, rectangles, in `sfm` space
 
     def apply_to(self, posed: PosedFrames) -> PosedFrames:
         """Return the frames with cameras and points in world space, in metres."""
@@ -188,9 +205,14 @@ class WorldFrame(CheckedArrays):
             points=posed.points @ m[:3, :3].T + m[:3, 3],
         )
 
-    def scale_depth(self, depth: DepthMaps) -> DepthMaps:
-        """Return the depth maps in metres."""
-        return replace(depth, depth=depth.depth * np.float32(split_similarity(self.world_from_sfm)[0]))
+    def depth_in_world(self, depth: DepthMaps, posed: PosedFrames) -> DepthMaps:
+        """Return the depth maps in metres, with mirrors at their glass; `posed`: their frames in world space."""
+        scaled = replace(depth, depth=depth.depth * np.float32(split_similarity(self.world_from_sfm)[0]))
+        return without_reflections(scaled, posed.world_from_camera, self.mirrors_in_world())
+
+    def mirrors_in_world(self) -> tuple[Plane, ...]:
+        """Return the glass of the mirrors in world space, metres."""
+        return tuple(glass.moved(self.world_from_sfm) for glass in self.mirrors)
 
 
 @dataclass(frozen=True)
@@ -209,14 +231,6 @@ class SpaceGrid(CheckedArrays):
         i, j, k = cell[inside].T
         out[inside] = self.state[i, j, k]
         return out
-
-
-@dataclass(frozen=True)
-class Plane(CheckedArrays):
-    """A bounded plane n . x + d = 0 in world space; n is unit and points towards free space."""
-
-    plane: Annotated[np.ndarray, "float64 4"]  # nx, ny, nz, d in metres
-    polygon: Annotated[np.ndarray, "float64 k 3"]  # outline, metres, k >= 3
 
 
 @dataclass(frozen=True)

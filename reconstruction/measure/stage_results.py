@@ -73,14 +73,15 @@ class StageResults:
         posed, depth = self.get("poses"), self.get("depth")
         if world is None:
             return None, None
-        return posed and world.apply_to(posed), depth and world.scale_depth(depth)
+        placed = posed and world.apply_to(posed)
+        return placed, depth and placed and world.depth_in_world(depth, placed)
 
     def refined_in_world(self) -> tuple[Gaussians | None, DepthMaps | None]:
         """Return the Gaussians and the depth maps refined by them, in world space, in metres; None if missing."""
-        world, scene = self.get("world"), self.get("gaussians")
-        if world is None or scene is None:
+        world, scene, posed = self.get("world"), self.get("gaussians"), self.get("poses")
+        if world is None or scene is None or posed is None:
             return None, None
-        return scene.in_world(world), world.scale_depth(scene.depth)
+        return scene.in_world(world), world.depth_in_world(scene.depth, world.apply_to(scene.posed(posed)))
 
 
 def _latest_keys(folder: Path, bundle: SceneBundle) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """The world stage: compose gravity, yaw, floor and scale into one similarity transform."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +10,14 @@ from reconstruction.core.types import DepthMaps, PosedFrames, ScaleEstimate, Wor
 from reconstruction.world.config import WorldConfig
 from reconstruction.world.floor import Floor, find_floor, lowest_height
 from reconstruction.world.gravity import Gravity, find_gravity
-from reconstruction.world.planes import fit_planes
+from reconstruction.world.mirrors import find_mirrors
+from reconstruction.world.planes import FittedPlane, fit_planes
 from reconstruction.world.request import parse_scale
 from reconstruction.world.samples import SurfaceSamples, sample_surface
 from reconstruction.world.scale import Metres, camera_heights, find_scale
 from reconstruction.world.yaw import find_yaw, level_rotation, turn_about_z
 from registry.errors import UsageError
+from registry.geometry import split_similarity
 
 _USER_OBJECT_SIGMA = 0.03  # relative standard deviation of a scale from `--scale object`
 _CLEARANCE_M = 0.05  # an unseen floor is assumed at least this far below all seen surface
@@ -88,8 +91,27 @@ def find_world(
         floor.observed,
         yaw_snapped=snapped,
     )
+    world = _with_mirrors(world, posed, depth, gravity.planes, progress)
     progress.advance()
     return _apply_object_request(world, config, progress)
+
+
+def _with_mirrors(
+    world: WorldFrame, posed: PosedFrames, depth: DepthMaps, planes: Sequence[FittedPlane], progress: Progress
+) -> WorldFrame:
+    """Return the world with the mirrors on the upright planes (`sfm` space)."""
+    scale, rotation, shift = split_similarity(world.world_from_sfm)
+    moved = [(n := rotation @ plane.normal, scale * plane.offset + float(n @ shift)) for plane in planes]
+    placed = world.apply_to(posed)
+    found = find_mirrors(placed, world.depth_in_world(depth, placed), moved)
+    for glass in found:
+        wide, high = (np.linalg.norm(glass.polygon[k] - glass.polygon[0]) for k in (1, 3))
+        progress.note(
+            f"world: a mirror of {wide:.1f} x {high:.1f} m: what seems to be behind it is the reflected room, and gets "
+            "the depth of its glass"
+        )
+    sfm_from_world = np.linalg.inv(world.world_from_sfm)
+    return replace(world, mirrors=tuple(glass.moved(sfm_from_world) for glass in found))
 
 
 def _given_gravity(known: Known, up: np.ndarray, samples: SurfaceSamples) -> Gravity:

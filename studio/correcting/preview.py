@@ -64,7 +64,8 @@ class Previewer:
             if len(results) < len(read):
                 return None
             found, surface, posed, world, scene = (results[name] for name in read)
-            placed, depth = world.apply_to(scene.posed(posed)), world.scale_depth(scene.depth)
+            placed = world.apply_to(scene.posed(posed))
+            depth = world.depth_in_world(scene.depth, placed)
             self._pointer = Pointer(found, surface, Footage(placed, depth, Lens.of(posed), surface))
         return self._pointer
 
