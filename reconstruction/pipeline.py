@@ -96,7 +96,10 @@ def _surface(call: Call) -> Surface:
 
 
 def _instances(call: Call) -> InstanceSet:
-    return make_instances(*call.in_world(), call["surface"], call.options, progress=call.progress)
+    mirrors = call["world"].mirrors_in_world()
+    return make_instances(
+        *call.in_world(), call["surface"], call.options, mirrors=mirrors, progress=call.progress
+    )
 
 
 def _views(call: Call) -> SceneViews:

@@ -219,6 +219,17 @@ def render_truth(
     return raster.depth, ids
 
 
+def render_stereo_depth(film_set: FilmSet, camera: Camera, world_from_camera: np.ndarray) -> np.ndarray:
+    """Return the z-depth float32 (h, w) that stereo sees: the true one, and behind a mirror that of its image."""
+    depth, _ = render_truth(film_set, camera, world_from_camera)
+    if film_set.mirror is None:
+        return depth
+    face = rasterize_mesh(film_set.vertices, film_set.faces, camera, world_from_camera).face
+    glass = (face >= 0) & (film_set.face_texture[np.maximum(face, 0)] == film_set.mirror.texture)
+    image, _ = render_truth(reflected(film_set), camera, world_from_camera)
+    return np.where(glass, image, depth)
+
+
 def film_room(
     film_set: FilmSet,
     camera: Camera,

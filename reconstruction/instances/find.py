@@ -1,11 +1,12 @@
 """The instances stage: base planes, segmentation, boxes and labels, id maps, names."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from reconstruction.core.progress import Progress
-from reconstruction.core.types import DepthMaps, InstanceSet, PosedFrames, Surface
+from reconstruction.core.types import DepthMaps, InstanceSet, Plane, PosedFrames, Surface
 from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.cut import Cut, Shell
 from reconstruction.instances.describe import describe
@@ -13,6 +14,7 @@ from reconstruction.instances.id_maps import render_id_maps, without_unseen
 from reconstruction.instances.mask_cut import cut_by_masks
 from reconstruction.instances.masks import load_mask_backend
 from reconstruction.instances.masks.base import FrameMasks
+from reconstruction.instances.mirrors import hang_mirrors
 from reconstruction.instances.naming import load_namer, name_instances
 from reconstruction.instances.outlined import add_outlined
 from reconstruction.instances.partition import cut_by_partition
@@ -20,14 +22,16 @@ from reconstruction.instances.sightings import sightings
 
 
 def make_instances(
-    posed: PosedFrames, depth: DepthMaps, surface: Surface, config: InstancesConfig, *, progress: Progress
-) -> InstanceSet:
-    """Segment the surface and name the objects; see `find_instances` and `load_namer`.
+    posed: PosedFrames, depth: DepthMaps, surface: Surface, config: InstancesConfig, *, mirrors: Sequence[Plane] = (),
+    progress: Progress,
+) -> InstanceSet:  # fmt: skip
+    """Segment the surface and name the objects; see `find_instances`, `hang_mirrors` and `load_namer`.
 
     The namer is loaded first, so that its errors come before any work.
     """
     namer = load_namer(config)
     found = find_instances(posed, depth, surface, config, progress=progress)
+    found = hang_mirrors(found, mirrors, surface, posed, depth)
     return found if namer is None else name_instances(namer, found, posed, progress=progress)
 
 

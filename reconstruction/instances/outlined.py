@@ -72,7 +72,7 @@ def add_outlined(
         old = objects[own] if own < len(objects) else None
         number = max([*(o.id for o in objects), len(found.base)]) + 1 if old is None else old.id
         objects[own : own + 1] = [_instance_on_wall(number, box, wall, old)]
-        _draw_box(maps, number, box, wall, posed, depth)
+        draw_box(maps, number, box, wall, posed, depth)
         count += 1
     if not count:
         return found
@@ -205,7 +205,7 @@ def _instance_on_wall(number: int, box: WallBox, wall: Wall, old: Instance | Non
     return Instance(number, label, confidence, center, wall.yaw, extents, wall.id, True)
 
 
-def _draw_box(
+def draw_box(
     maps: np.ndarray, number: int, box: WallBox, wall: Wall, posed: PosedFrames, depth: DepthMaps
 ) -> None:
     """Render a box into the id maps (n, h, w), in place, where no other object and no measured depth is in front."""
