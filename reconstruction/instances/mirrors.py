@@ -72,7 +72,7 @@ def _hung(
     owner = np.array(found.vertex_instance)
     parts = [o for o in found.objects if near[owner == o.id].sum() >= _WITHIN * max((owner == o.id).sum(), 1)]
     names = [o.id for o in parts]
-    framed = near & np.isin(owner, names)
+    framed = near & np.isin(owner, names) & (away > 0.5 * front)  # without the wall's surface beside it
     if framed.any():
         edges = np.percentile(along[framed], [1, 99], axis=0)
         low, high = np.minimum(low, edges[0]), np.maximum(high, edges[1])
