@@ -11,11 +11,40 @@ import pytest
 from registry import seal_bundle
 
 
-def _glb_bytes(document: dict | None = None) -> bytes:
-    """Return a binary glTF file with only a JSON chunk."""
-    text = json.dumps(document or {"asset": {"version": "2.0"}}).encode()
+def triangle_document() -> dict:
+    """Return the JSON of a glTF file with one triangle; `TRIANGLE` is its binary chunk."""
+    return {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 12},
+        ],
+        "buffers": [{"byteLength": 48}],
+    }
+
+
+TRIANGLE = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4").tobytes() + np.array([0, 1, 2], "<u4").tobytes()
+
+
+def pack_glb(document: dict | str, binary: bytes = TRIANGLE) -> bytes:
+    """Return a binary glTF file of a JSON document (or its text) and a binary chunk."""
+    text = (document if isinstance(document, str) else json.dumps(document)).encode()
     text += b" " * (-len(text) % 4)
-    return struct.pack("<5I", 0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A) + text
+    binary += b"\0" * (-len(binary) % 4)
+    head = struct.pack("<5I", 0x46546C67, 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
+    return head + text + struct.pack("<2I", len(binary), 0x004E4942) + binary
+
+
+def _glb_bytes(document: dict | None = None) -> bytes:
+    return pack_glb(document or triangle_document())
 
 
 OBJ_TEXT = "o part\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
@@ -110,7 +139,7 @@ def scene() -> dict:
 
 @pytest.fixture
 def glb_bytes():
-    """Return a function that creates a binary glTF file from a JSON document."""
+    """Return a function that creates a binary glTF file, by default of one triangle."""
     return _glb_bytes
 
 
