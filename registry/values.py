@@ -151,7 +151,7 @@ def number(
     value = get(mapping, key, where)
     if not finite(value) or not low <= value <= high or (positive and value <= 0):
         kind = "a positive number" if positive else "a number"
-        if high < 1e300 and not (high > 1e5 and finite(value) and value < low):
+        if high < 1e300 and not (high > 1e5 and not positive and finite(value) and value < low):
             kind += f" of at most {high:g}" if positive else f" between {low:g} and {high:g}"
         elif low > -1e300 and not positive:
             kind += f" of at least {low:g}"
