@@ -324,7 +324,9 @@ def _manifest(folder: Path, sizes: dict[str, int]) -> tuple[str, Files]:
     for name, entry in as_object(manifest["files"]).items():
         digest, size = as_object(entry).get("sha256"), as_object(entry).get("bytes")
         if not isinstance(digest, str) or not _SHA256.fullmatch(digest) or type(size) is not int:
-            raise BundleError(f"bundle {folder}: manifest.json: files[{show(name)}]: expected sha256 and bytes")
+            raise BundleError(
+                f"bundle {folder}: manifest.json: files[{show(name)}]: expected sha256 and bytes"
+            )
         if name not in sizes:
             raise BundleError(f"bundle {folder}: {show(name)} is in the manifest but not in the folder")
         if sizes[name] != size:

@@ -212,7 +212,9 @@ class Index:
             except sqlite3.OperationalError as error:
                 if "UTF-8" not in str(error):
                     raise
-                connection.text_factory = _decoded  # a text that is not UTF-8 makes its row malformed, no other
+                connection.text_factory = (
+                    _decoded  # a text that is not UTF-8 makes its row malformed, no other
+                )
                 return connection.execute(query, values).fetchall()
 
     @contextlib.contextmanager

@@ -43,7 +43,9 @@ def read_glb(path: Path, name: str) -> tuple[dict[str, Any], memoryview]:
     rest = data[20 + length :]
     if len(rest):
         if len(rest) < 8 or struct.unpack("<2I", rest[:8]) != (len(rest) - 8, _BIN):
-            raise BundleError(f"{name}: expected one binary chunk of {max(len(rest) - 8, 0)} bytes after its JSON")
+            raise BundleError(
+                f"{name}: expected one binary chunk of {max(len(rest) - 8, 0)} bytes after its JSON"
+            )
         rest = rest[8:]
     return cast("dict[str, Any]", document), rest
 

@@ -98,7 +98,10 @@ class _Checked:
         if not drawn:
             self.fail("scene", "it has no mesh")
         if vertices > MAX_VERTICES or indices > MAX_INDICES:
-            self.fail("meshes", f"{vertices} vertices and {indices} indices, more than {MAX_VERTICES} and {MAX_INDICES}")
+            self.fail(
+                "meshes",
+                f"{vertices} vertices and {indices} indices, more than {MAX_VERTICES} and {MAX_INDICES}",
+            )
         return MeshSize(vertices, indices, pixels)
 
     # ---- Values.
@@ -132,7 +135,9 @@ class _Checked:
 
     def _numbers(self, place: str, value: Any, count: int) -> None:
         values = cast("list[Any]", value) if isinstance(value, list) else []
-        if len(values) != count or not all(type(x) in (int, float) and abs(x) <= MAX_COORDINATE for x in values):
+        if len(values) != count or not all(
+            type(x) in (int, float) and abs(x) <= MAX_COORDINATE for x in values
+        ):
             self.fail(place, f"expected {count} numbers within {MAX_COORDINATE:g}, got {ascii(value)[:60]}")
 
     # ---- Binary data.
@@ -141,7 +146,10 @@ class _Checked:
         for group in ("buffers", "images"):
             for i, item in enumerate(self.lists[group]):
                 if "uri" in item:
-                    self.fail(f"{group}[{i}].uri", f"it names another file, or holds data ({ascii(item['uri'])[:60]})")
+                    self.fail(
+                        f"{group}[{i}].uri",
+                        f"it names another file, or holds data ({ascii(item['uri'])[:60]})",
+                    )
         length = 0
         for item in self.lists["buffers"]:
             length = self._whole("buffers[0].byteLength", item.get("byteLength"), 1, len(self.binary))
@@ -162,7 +170,10 @@ class _Checked:
         view = self.views[self._index(f"{place}.bufferView", item.get("bufferView"), "bufferViews")]
         kind = _MIME.get(str(item.get("mimeType")))
         if kind is None:
-            self.fail(f"{place}.mimeType", f"expected image/png or image/jpeg, got {ascii(item.get('mimeType'))[:60]}")
+            self.fail(
+                f"{place}.mimeType",
+                f"expected image/png or image/jpeg, got {ascii(item.get('mimeType'))[:60]}",
+            )
         width, height = picture_size(view, f"{self.name}: {place}", kind)
         if self.decompress and kind == "png":
             check_png_data(view, f"{self.name}: {place}")
@@ -189,7 +200,9 @@ class _Checked:
         stride = self.lists["bufferViews"][view_number].get("byteStride", bytes_each)
         outside = start + (count - 1) * stride + bytes_each > len(view)
         if outside or stride < bytes_each or start % np.dtype(dtype).itemsize:
-            self.fail(place, f"{count} values of {bytes_each} bytes do not fit its buffer view of {len(view)}")
+            self.fail(
+                place, f"{count} values of {bytes_each} bytes do not fit its buffer view of {len(view)}"
+            )
         for key in ("min", "max"):
             if key in item:
                 self._limits(f"{place}.{key}", item[key], width)
@@ -210,7 +223,10 @@ class _Checked:
         primitives = item.get("primitives")
         if not isinstance(primitives, list) or not 1 <= len(cast("list[Any]", primitives)) <= _MOST["meshes"]:
             self.fail(f"{place}.primitives", f"expected a list of 1 to {_MOST['meshes']}")
-        sizes = [self._primitive(f"{place}.primitives[{k}]", p) for k, p in enumerate(cast("list[Any]", primitives))]
+        sizes = [
+            self._primitive(f"{place}.primitives[{k}]", p)
+            for k, p in enumerate(cast("list[Any]", primitives))
+        ]
         return sum(v for v, _ in sizes), sum(i for _, i in sizes)
 
     def _primitive(self, place: str, value: Any) -> tuple[int, int]:
@@ -264,7 +280,10 @@ class _Checked:
                 self._whole(f"{where}.texCoord", texture.get("texCoord", 0), 0, 7)
             elif key in ("baseColorFactor", "emissiveFactor"):
                 self._numbers(where, entry, 4 if key == "baseColorFactor" else 3)
-            elif key in ("metallicFactor", "roughnessFactor", "alphaCutoff") and type(entry) not in (int, float):
+            elif key in ("metallicFactor", "roughnessFactor", "alphaCutoff") and type(entry) not in (
+                int,
+                float,
+            ):
                 self.fail(where, "expected a number")
             elif key == "alphaMode" and entry not in ("OPAQUE", "MASK", "BLEND"):
                 self.fail(where, "expected OPAQUE, MASK or BLEND")

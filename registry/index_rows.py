@@ -17,7 +17,13 @@ _REVISION = re.compile(r"[0-9a-f]{16}")
 _SHA256 = re.compile(r"[0-9a-f]{1,64}")
 _STATUS = ("stable", "unstable", "unchecked")
 _MAX_TEXT, _MAX_METRICS, _MAX_OBJECTS = 4096, 100_000, 1_000_000
-_RATES = ("stable_rate", "stable_rate_10cm_0.1rad", "stable_rate_5cm_drop_5deg", "floating_rate", "at_rest_rate")
+_RATES = (
+    "stable_rate",
+    "stable_rate_10cm_0.1rad",
+    "stable_rate_5cm_drop_5deg",
+    "floating_rate",
+    "at_rest_rate",
+)
 _NUMBERS = ("scale_uncertainty", "spawn_penetration_mm", "n_dynamic", "n_base")
 _CLAUSES = re.compile(r"\b(CHECK|GENERATED|VIRTUAL|AS)\b", re.IGNORECASE)
 
@@ -62,7 +68,9 @@ def row_of(values: tuple[Any, ...]) -> SceneRow:
     for name, value, valid in checks:
         if not valid:
             raise BundleError(f"scene {scene_id}: its row of the index has the {name} {ascii(value)[:80]}")
-    return SceneRow(scene_id, revision, version, created, source, digest, count, status, _metrics(scene_id, metrics))
+    return SceneRow(
+        scene_id, revision, version, created, source, digest, count, status, _metrics(scene_id, metrics)
+    )
 
 
 def _metrics(scene_id: str, text: Any) -> dict[str, Any]:
@@ -82,7 +90,9 @@ def _metrics(scene_id: str, text: Any) -> dict[str, Any]:
         elif key in _NUMBERS:
             valid = value is None or number
         if not valid or not is_plain(key):
-            raise BundleError(f"scene {scene_id}: its row of the index has {ascii(key)[:80]}: {ascii(value)[:80]}")
+            raise BundleError(
+                f"scene {scene_id}: its row of the index has {ascii(key)[:80]}: {ascii(value)[:80]}"
+            )
     return cast("dict[str, Any]", found)
 
 

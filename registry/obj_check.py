@@ -64,7 +64,7 @@ def _check_lines(data: bytes, name: str) -> int:
                 largest, largest_line = index, number
         elif not (_OTHER_VERTEX.fullmatch(line) or _NAME.fullmatch(line)):
             word = (line.split(None, 1) or [b""])[0][:40].decode("utf-8", "replace")
-            _fail(name, number, f"{ascii(word)} is not allowed in a bundle's mesh, or is malformed")
+            _fail(name, number, f"{word!a} is not allowed in a bundle's mesh, or is malformed")
         _check_counts(count, faces, name)
     if largest > count:
         _fail(name, largest_line, f"a face with vertex {largest} of {count}")

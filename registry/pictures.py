@@ -48,7 +48,9 @@ def check_png_data(data: bytes | memoryview, name: str) -> None:
     depth, color = view[24], view[25]
     channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(color, 0)
     # Interlaced pictures have up to seven passes, each with a filter byte a row and a rounded-up row.
-    allowed = (width * channels * depth + 7) // 8 * height + height + (16 * (width + height) if view[28] else 0)
+    allowed = (
+        (width * channels * depth + 7) // 8 * height + height + (16 * (width + height) if view[28] else 0)
+    )
     inflater, found, at = zlib.decompressobj(), 0, 8
     try:
         while at + 12 <= len(view):
@@ -61,7 +63,9 @@ def check_png_data(data: bytes | memoryview, name: str) -> None:
                     found += len(inflater.decompress(rest, _CHUNK_BYTES))
                     rest = inflater.unconsumed_tail
                     if found > allowed:
-                        raise BundleError(f"{name}: its compressed data holds more than {width} x {height} pixels")
+                        raise BundleError(
+                            f"{name}: its compressed data holds more than {width} x {height} pixels"
+                        )
             if kind == b"IEND":
                 break
             at += 12 + length

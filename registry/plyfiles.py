@@ -48,8 +48,10 @@ def check_ply(path: Path, name: str) -> int:
     with file:
         head = file.read(_MAX_HEADER_BYTES)
     end = head.find(_END)
-    if end < 0 or not head.isascii() and not head[:end].isascii():
-        raise BundleError(f"{name}: not a PLY file, or its header is longer than {_MAX_HEADER_BYTES >> 10} KiB")
+    if end < 0 or (not head.isascii() and not head[:end].isascii()):
+        raise BundleError(
+            f"{name}: not a PLY file, or its header is longer than {_MAX_HEADER_BYTES >> 10} KiB"
+        )
     lines = [x for x in head[:end].decode("ascii").split("\n") if not x.startswith(("comment ", "obj_info "))]
     match = re.fullmatch(r"element vertex (\d{1,9})", lines[2]) if len(lines) > 2 else None
     if lines[:2] != ["ply", "format binary_little_endian 1.0"] or match is None:
@@ -57,10 +59,14 @@ def check_ply(path: Path, name: str) -> int:
     properties = [_PROPERTY.fullmatch(line) for line in lines[3:]]
     known = [found for found in properties if found is not None and found.group(1) in _TYPES]
     if not 1 <= len(known) == len(properties) <= _MAX_PROPERTIES:
-        raise BundleError(f"{name}: expected 1 to {_MAX_PROPERTIES} scalar properties of the vertices, nothing else")
+        raise BundleError(
+            f"{name}: expected 1 to {_MAX_PROPERTIES} scalar properties of the vertices, nothing else"
+        )
     if len({found.group(2) for found in known}) != len(known):
         raise BundleError(f"{name}: a property is there twice")
     count, row = int(match.group(1)), sum(np.dtype(_TYPES[found.group(1)]).itemsize for found in known)
     if count > MAX_PLY_VERTICES or end + len(_END) + count * row != size:
-        raise BundleError(f"{name}: {size} bytes do not hold the {count} vertices of {row} bytes that it claims")
+        raise BundleError(
+            f"{name}: {size} bytes do not hold the {count} vertices of {row} bytes that it claims"
+        )
     return count

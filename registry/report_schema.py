@@ -10,10 +10,22 @@ from registry.values import JsonObject
 
 MAX_FIGURE = 1e12  # bounds times, sizes, energies and counts
 _HEX = re.compile(r"[0-9a-f]{8,64}")
-_RATES = ("stable_rate", "stable_rate_10cm_0.1rad", "stable_rate_5cm_drop_5deg", "floating_rate", "at_rest_rate")
+_RATES = (
+    "stable_rate",
+    "stable_rate_10cm_0.1rad",
+    "stable_rate_5cm_drop_5deg",
+    "floating_rate",
+    "at_rest_rate",
+)
 _SIZES = ("spawn_penetration_mm", "energy_at_rest_j", "duration_s")
 _COUNTS = ("dynamic_objects", "fixed_objects")
-_CARD = (*_RATES[:4], "spawn_penetration_mm", "duration_s", "timestep_s", *_COUNTS)  # read where `objects` is there
+_CARD = (
+    *_RATES[:4],
+    "spawn_penetration_mm",
+    "duration_s",
+    "timestep_s",
+    *_COUNTS,
+)  # read where `objects` is there
 _OBJECT_NUMBERS = ("moved_m", "turned_deg", "drop_m")
 _OBJECT_FLAGS = ("stable", "stable_10cm_0.1rad", "stable_5cm_drop_5deg", "floating")
 _CONTACT_COUNTS = ("support_edges", "support_edges_real", "attached_edges", "attached_edges_real")

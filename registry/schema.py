@@ -16,7 +16,16 @@ from registry.primitives import SIZES
 from registry.report_schema import check_report
 from registry.values import JsonObject, as_object, check_relative_path
 
-__all__ = ["SCHEMA", "JsonObject", "as_object", "check_relative_path", "check_scene_id", "is_scene_id", "referenced_files", "validate_scene"]
+__all__ = [
+    "SCHEMA",
+    "JsonObject",
+    "as_object",
+    "check_relative_path",
+    "check_scene_id",
+    "is_scene_id",
+    "referenced_files",
+    "validate_scene",
+]
 
 SCHEMA = "simrecon.scene/1"
 _SCHEMA_PATTERN = re.compile(r"simrecon\.scene/(\d+)(\.\d+)?")
@@ -162,7 +171,9 @@ def _cameras(cameras: JsonObject) -> None:
 
 def _instance_views(views: JsonObject) -> None:
     seen: set[int] = set()
-    for i, frame in enumerate(values.sequence(values.get(views, "frames", "instances"), "instances.frames", MAX_VIEWS)):
+    for i, frame in enumerate(
+        values.sequence(values.get(views, "frames", "instances"), "instances.frames", MAX_VIEWS)
+    ):
         where = f"instances.frames[{i}]"
         values.mapping(frame, where)
         values.unique(values.integer(frame, "index", where, low=0), seen, f"{where}.index")
@@ -220,7 +231,9 @@ def _objects(items: list[Any], base_ids: set[int]) -> set[int]:
         for key in ("geometry", "appearance", "physics"):
             values.text(provenance, key, f"{where}.provenance")
         values.number(provenance, "observed_fraction", f"{where}.provenance", low=0, high=1)
-        _views(values.sequence(values.get(item, "views", where), f"{where}.views", MAX_FRAMES), f"{where}.views")
+        _views(
+            values.sequence(values.get(item, "views", where), f"{where}.views", MAX_FRAMES), f"{where}.views"
+        )
         if "assembly" in item:
             values.mapping(item["assembly"], f"{where}.assembly")
         if "anchor" in item:

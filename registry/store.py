@@ -448,7 +448,9 @@ class SceneRegistry:
                 rows[scene_id] = row
         return rows, problems
 
-    def _row_from_folder(self, scene_id: str, stored: tuple[Any, ...] | None) -> tuple[SceneRow | None, Names]:
+    def _row_from_folder(
+        self, scene_id: str, stored: tuple[Any, ...] | None
+    ) -> tuple[SceneRow | None, Names]:
         current = None
         if stored is not None:
             with contextlib.suppress(BundleError):

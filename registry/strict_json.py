@@ -97,11 +97,15 @@ def _check_strings(value: Any, where: str, place: str = "", depth: int = 0) -> N
         raise BundleError(f"{where}: nested too deeply")
     if isinstance(value, str):
         if not is_plain(value, lines=True):
-            raise BundleError(f"{where}: {place or 'it'}: a control character in the text {ascii(value)[:80]}")
+            raise BundleError(
+                f"{where}: {place or 'it'}: a control character in the text {ascii(value)[:80]}"
+            )
     elif isinstance(value, dict):
         for key, item in cast("dict[str, Any]", value).items():
             if not is_plain(key):
-                raise BundleError(f"{where}: {place or 'it'}: a control character in the key {ascii(key)[:80]}")
+                raise BundleError(
+                    f"{where}: {place or 'it'}: a control character in the key {ascii(key)[:80]}"
+                )
             _check_strings(item, where, f"{place}.{key}" if place else key, depth + 1)
     elif isinstance(value, list):
         for number, item in enumerate(cast("list[Any]", value)):

@@ -39,7 +39,11 @@ def show(value: Any) -> str:
         return "nothing"
     if isinstance(value, str | list | dict | int) and not isinstance(value, bool):
         value, cut = _cut(value)
-        text = value if isinstance(value, str) and value.startswith("a ") and is_plain(value) else ascii_text(value)
+        text = (
+            value
+            if isinstance(value, str) and value.startswith("a ") and is_plain(value)
+            else ascii_text(value)
+        )
         return text if len(text) <= 80 and not cut else text[:77] + "..."
     return ascii_text(value)[:80]
 

@@ -348,7 +348,9 @@ def test_a_lost_index_is_rebuilt_from_the_folders(reg, make_staging):
         path.unlink()
     assert reg.next_free_id() == "scene0002"
     for read in (reg.list, reg.revisions, lambda: reg.get("kitchen"), lambda: reg.load("kitchen")):
-        with pytest.raises(BundleError, match=r"is lost.*damaged, kitchen, scene0001; .*simrecon registry rebuild"):
+        with pytest.raises(
+            BundleError, match=r"is lost.*damaged, kitchen, scene0001; .*simrecon registry rebuild"
+        ):
             read()
     del before["damaged"]
     assert {r.scene_id: r.revision for r in reg.rebuild_index()} == before
