@@ -330,8 +330,8 @@ class SceneRegistry:
             shown = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if len(lost) > 5 else "")
             what = "is empty" if self._index.exists() else "is lost"
             raise BundleError(
-                f"registry: the index {self._index.path} {what}, but there are scenes in {self.scenes_folder}: {shown}; "
-                f"{REPAIR}"
+                f"registry: the index {self._index.path} {what}, but there are scenes in {self.scenes_folder}: "
+                f"{shown}; {REPAIR}"
             )
 
     def _check_links(self) -> None:
