@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from registry.errors import SimReconError
+from registry.plain_text import plain
 
 _EPILOG = """exit codes:
   0  done
@@ -35,6 +36,7 @@ def build_parser() -> argparse.ArgumentParser:
         export,
         marker,
         reconstruct,
+        registry_verbs,
         report,
         scenes,
         studio,
@@ -53,6 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
         check,
         reconstruct,
         scenes,
+        registry_verbs,
         studio,
         evaluate,
         report,
@@ -104,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(verb: str, message: str, exit_code: int) -> int:
-    print(f"simrecon {verb}: {message}", file=sys.stderr)
+    print(f"simrecon {verb}: {plain(message, lines=True)}", file=sys.stderr)
     return exit_code
 
 

@@ -30,7 +30,7 @@ def cost_rows(report: dict) -> list[CostRow]:
     Args:
         report: `report` of a `scene.json`; those of earlier versions lack some figures.
     """
-    times, volatile = report["timings_s"], report.get("volatile", {})
+    times, volatile = report.get("timings_s", {}), report.get("volatile", {})
     order = [*STAGE_NAMES, PUBLISH, OTHER]
     names = sorted(times, key=lambda name: order.index(name) if name in order else len(order))
     return [

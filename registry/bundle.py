@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import stat
 import weakref
 from dataclasses import dataclass
@@ -18,19 +19,24 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from registry.errors import BundleError
+from registry.errors import BundleError, EnvironmentMissing
 from registry.locks import lease_folder
-from registry.meshfiles import check_mesh_file
+from registry.meshfiles import check_mesh_files
+from registry.regular_files import open_regular, read_regular
 from registry.schema import JsonObject, as_object, check_relative_path, referenced_files, validate_scene
+from registry.strict_json import parse_json
+from registry.values import show
 
 MANIFEST_FORMAT = "simrecon.manifest/1"
 # Limits of a bundle; exceeding one raises BundleError.
 MAX_FILE_BYTES = 256 << 20
 MAX_TOTAL_BYTES = 4 << 30
-MAX_SCENE_JSON_BYTES = 64 << 20
+MAX_SCENE_JSON_BYTES = 32 << 20
 MAX_FILES = 20_000  # files and folders
 MAX_DEPTH = 8  # nested folders
 Files: TypeAlias = dict[str, tuple[str, int]]  # {path: (SHA-256, bytes)}
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+REVISION = re.compile(r"[0-9a-f]{16}")
 _VOLATILE_REPORT_KEYS = ("timings_s", "peak_memory_mb", "volatile")
 
 
@@ -117,15 +123,19 @@ class SceneBundle:
 
         Args:
             folder: The bundle's folder.
-            check_hashes: Compare the SHA-256 of every file. If false, only the schema, the list of files, their
-                sizes and the hash of scene.json are checked.
+            check_hashes: Compare the SHA-256 of every file, and decompress every PNG texture once. If false, the
+                schema, the list of files, their sizes, the hash of scene.json, and every mesh and picture header are
+                checked.
 
         Raises:
             BundleError: The bundle is malformed, unsafe or damaged.
+            EnvironmentMissing: This user may not read it.
         """
         folder = Path(folder)
         if not folder.is_dir():
             raise BundleError(f"bundle {folder}: no such folder")
+        if folder.is_symlink():
+            raise BundleError(f"bundle {folder}: a symbolic link, not a folder")
         lease = None
         try:
             lease = lease_folder(folder)
@@ -133,6 +143,10 @@ class SceneBundle:
         except BaseException as error:
             if lease is not None:
                 os.close(lease)
+            if isinstance(error, PermissionError):
+                raise EnvironmentMissing(
+                    f"bundle {folder}: this user may not read {error.filename or 'it'}; fix its permissions"
+                ) from error
             if isinstance(error, OSError):
                 raise BundleError(f"bundle {folder}: cannot be read ({error})") from error
             raise
@@ -232,15 +246,14 @@ def seal_bundle(folder: Path, scene: JsonObject) -> str:
         text = json.dumps(scene, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
     except (TypeError, ValueError) as error:
         raise BundleError(f"scene.json: only finite JSON values can be written ({error})") from error
-    scene = _parse(text.encode(), "scene.json")
+    scene = parse_json(text.encode("utf-8", "surrogatepass"), "scene.json")
     validate_scene(scene)
     (folder / "scene.json").write_text(text + "\n", encoding="utf-8")
     with contextlib.suppress(FileNotFoundError):
         (folder / "manifest.json").unlink()
     sizes = _list_files(folder)
     _check_references(scene, sizes)
-    for name in sizes:
-        check_mesh_file(folder / name, name)
+    check_mesh_files(folder, sizes)
     files = {name: (hash_file(folder / name), size) for name, size in sizes.items()}
     revision = content_revision(scene, files)
     listed = {name: {"sha256": digest, "bytes": size} for name, (digest, size) in files.items()}
@@ -265,9 +278,9 @@ def content_revision(scene: JsonObject, files: Files) -> str:
 
 
 def hash_file(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal."""
+    """Return the SHA-256 of a regular file, in hexadecimal."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with open_regular(path, path.name)[0] as file:
         while chunk := file.read(1 << 20):
             digest.update(chunk)
     return digest.hexdigest()
@@ -279,44 +292,50 @@ def _read(folder: Path, check_hashes: bool) -> tuple[JsonObject, str, Files]:
         if required not in sizes:
             raise BundleError(f"bundle {folder}: {required} is missing")
         if sizes[required] > MAX_SCENE_JSON_BYTES:
-            raise BundleError(f"bundle {folder}: {required} has {sizes[required]} bytes, more than 64 MiB")
+            raise BundleError(f"bundle {folder}: {required} has {sizes[required]} bytes, more than 32 MiB")
     claimed_revision, files = _manifest(folder, sizes)
-    data = (folder / "scene.json").read_bytes()
+    data = read_regular(folder / "scene.json", f"bundle {folder}: scene.json", MAX_SCENE_JSON_BYTES)
     if hashlib.sha256(data).hexdigest() != files["scene.json"][0]:
         raise BundleError(f"bundle {folder}: scene.json does not match its SHA-256 in the manifest")
     try:
-        scene = _parse(data, "scene.json")
+        scene = parse_json(data, "scene.json")
         validate_scene(scene)
         _check_references(scene, sizes)
         if content_revision(scene, files) != claimed_revision:
-            raise BundleError(f"manifest.json: revision {claimed_revision} is not that of the content")
+            raise BundleError(f"manifest.json: revision {show(claimed_revision)} is not that of the content")
         for name, (digest, _) in files.items() if check_hashes else ():
             if name != "scene.json" and hash_file(folder / name) != digest:
                 raise BundleError(f"{name}: does not match its SHA-256 in the manifest")
-            check_mesh_file(folder / name, name)
+        check_mesh_files(folder, files, decompress=check_hashes)
     except BundleError as error:
         raise BundleError(f"bundle {folder}: {error}") from error
     return scene, claimed_revision, files
 
 
 def _manifest(folder: Path, sizes: dict[str, int]) -> tuple[str, Files]:
-    manifest = as_object(_parse((folder / "manifest.json").read_bytes(), f"bundle {folder}: manifest.json"))
+    data = read_regular(folder / "manifest.json", f"bundle {folder}: manifest.json", MAX_SCENE_JSON_BYTES)
+    manifest = as_object(parse_json(data, f"bundle {folder}: manifest.json"))
     if manifest.get("format") != MANIFEST_FORMAT or not isinstance(manifest.get("files"), dict):
         raise BundleError(f"bundle {folder}: manifest.json is not a {MANIFEST_FORMAT} file")
+    revision = manifest.get("revision")
+    if not isinstance(revision, str) or not REVISION.fullmatch(revision):
+        raise BundleError(f"bundle {folder}: manifest.json: revision: expected 16 hexadecimal digits")
     files: Files = {}
     for name, entry in as_object(manifest["files"]).items():
         digest, size = as_object(entry).get("sha256"), as_object(entry).get("bytes")
-        if not isinstance(digest, str) or not isinstance(size, int):
-            raise BundleError(f"bundle {folder}: manifest.json: files[{name!r}]: expected sha256 and bytes")
+        if not isinstance(digest, str) or not _SHA256.fullmatch(digest) or type(size) is not int:
+            raise BundleError(
+                f"bundle {folder}: manifest.json: files[{show(name)}]: expected sha256 and bytes"
+            )
         if name not in sizes:
-            raise BundleError(f"bundle {folder}: {name!r} is in the manifest but not in the folder")
+            raise BundleError(f"bundle {folder}: {show(name)} is in the manifest but not in the folder")
         if sizes[name] != size:
             raise BundleError(f"bundle {folder}: {name} has {sizes[name]} bytes, the manifest says {size}")
         files[name] = (digest, size)
     extra = sorted(sizes.keys() - files.keys() - {"manifest.json"})
     if extra:
         raise BundleError(f"bundle {folder}: {extra[0]!r} is not in the manifest")
-    return str(manifest.get("revision")), files
+    return revision, files
 
 
 def _check_references(scene: JsonObject, sizes: dict[str, int]) -> None:
@@ -354,33 +373,3 @@ def _list_files(folder: Path) -> dict[str, int]:
     if sum(sizes.values()) > MAX_TOTAL_BYTES:
         raise BundleError(f"bundle {folder}: {sum(sizes.values())} bytes in all, more than 4 GiB")
     return dict(sorted(sizes.items()))
-
-
-def _parse(data: bytes, where: str) -> Any:
-    """Parse strict JSON: UTF-8, no NaN or infinity, no duplicate key, bounded nesting."""
-
-    def constant(name: str) -> None:
-        raise BundleError(f"{where}: {name} is not strict JSON")
-
-    def number(text: str) -> float:
-        value = float(text)
-        if value in (float("inf"), float("-inf")):
-            raise BundleError(f"{where}: {text} is not a finite number")
-        return value
-
-    def pairs(items: list[tuple[str, Any]]) -> JsonObject:
-        found = dict(items)
-        if len(found) != len(items):
-            keys = sorted(key for key, _ in items)[:8]
-            raise BundleError(f"{where}: a key appears twice in one object ({keys})")
-        return found
-
-    try:
-        text = data.decode("utf-8")
-        return json.loads(text, parse_constant=constant, parse_float=number, object_pairs_hook=pairs)
-    except BundleError:
-        raise
-    except RecursionError as error:
-        raise BundleError(f"{where}: nested too deeply") from error
-    except ValueError as error:
-        raise BundleError(f"{where}: not JSON ({error})") from error

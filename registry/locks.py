@@ -7,10 +7,11 @@ path.
 
 import contextlib
 import os
+import stat
 from collections.abc import Generator
 from pathlib import Path
 
-from registry.errors import EnvironmentMissing
+from registry.errors import BundleError, EnvironmentMissing
 
 try:
     import fcntl
@@ -38,11 +39,16 @@ def file_lock(path: Path, blocking: bool = True) -> Generator[None, None, None]:
 
     Raises:
         LockHeld: The lock is taken and `blocking` is false.
+        BundleError: The lock file or its folder is a link, or it is no plain file: something else would be written.
         OSError: The lock file cannot be created.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    if path.parent.is_symlink() or path.is_symlink():
+        raise BundleError(f"registry: the lock {path} is a symbolic link; remove it")
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise BundleError(f"registry: the lock {path} is not a plain file; remove it")
         try:
             _flock(descriptor, blocking=blocking)
         except BlockingIOError:
@@ -53,6 +59,26 @@ def file_lock(path: Path, blocking: bool = True) -> Generator[None, None, None]:
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"pid {os.getpid()}\n".encode(), 0)
         yield
+    finally:
+        os.close(descriptor)
+
+
+def is_locked(path: Path) -> bool:
+    """Return whether any process holds the lock on the file `path`; creates nothing."""
+    if fcntl is None:  # pragma: no cover - Windows
+        return False
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        _flock(descriptor, shared=True)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    else:
+        return False
     finally:
         os.close(descriptor)
 

@@ -17,10 +17,12 @@ def moving_ids(bundle: SceneBundle) -> set[int]:
     attached = _attached(bundle)
     dynamic = {item.id: item.dynamic for item in bundle.objects}
 
-    def moves(key: int) -> bool:
-        return moves(attached[key]) if key in attached else dynamic.get(key, False)
+    def root(key: int) -> int:
+        while key in attached:
+            key = attached[key]
+        return key
 
-    return {key for key in dynamic if moves(key)}
+    return {key for key in dynamic if dynamic.get(root(key), False)}
 
 
 def welded_to(bundle: SceneBundle) -> dict[int, int]:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from registry.bundle import SceneBundle, seal_bundle
-from registry.db import Index, SceneRow, utc_text
+from registry.db import REPAIR, Index, SceneRow, StoredRows, utc_text
 from registry.errors import (
     BundleError,
     EnvironmentMissing,
@@ -34,10 +34,11 @@ from registry.errors import (
     UsageError,
     did_you_mean,
 )
-from registry.locks import LockHeld, file_lock, is_leased
-from registry.schema import check_scene_id
+from registry.index_rows import is_revision, row_of
+from registry.locks import LockHeld, file_lock, is_leased, is_locked
+from registry.plain_text import is_plain
+from registry.schema import check_scene_id, is_scene_id
 
-_REVISION = re.compile(r"[0-9a-f]{16}")
 _TEMPORARY = (".publishing-", ".removing-")
 _CAUSES = {
     errno.ENOSPC: "the disk is full",
@@ -82,7 +83,6 @@ class VerifyReport:
 
 # `SceneRegistry.list` hides the built-in name inside the class, so annotations use these.
 Records = list[SceneRecord]
-Rows = list[SceneRow]
 Names = list[str]
 
 
@@ -109,20 +109,48 @@ class SceneRegistry:
         return self.root / "scenes"
 
     def list(self) -> Records:
-        """Return all scenes, ordered by id. Opens no bundle."""
-        return [self._record(row) for row in self._index.rows()]
+        """Return all scenes, ordered by id. Opens no bundle; scenes with a malformed row are left out.
+
+        Raises:
+            BundleError: The index is damaged, or is lost while there are scenes.
+        """
+        return self.list_with_problems()[0]
+
+    def list_with_problems(self) -> tuple[Records, Names]:
+        """Return all scenes as `list` does, and one line about each malformed row of the index."""
+        self._check_links()
+        rows, problems = self._index.read()
+        if not rows and not problems:
+            self._check_lost()
+            rows, problems = self._index.read()
+        return [self._record(row) for row in rows], problems
 
     def revisions(self) -> dict[str, str]:
-        """Return {scene id: current revision} of all scenes, ordered by id; cheaper than `list`."""
-        return self._index.revisions()
+        """Return {scene id: current revision} of all scenes, ordered by id; cheaper than `list`.
+
+        Raises:
+            BundleError: As `list`.
+        """
+        self._check_links()
+        found = self._index.revisions()
+        if not found:
+            self._check_lost()
+            found = self._index.revisions()
+        return found
 
     def get(self, scene_id: str) -> SceneRecord:
         """Return the record of a scene.
 
         Raises:
             SceneNotFound: The scene does not exist; names the closest match and the existing scenes.
+            BundleError: Its row of the index is malformed, or the index is damaged or lost.
         """
-        row = self._index.row(check_scene_id(scene_id))
+        check_scene_id(scene_id)
+        self._check_links()
+        row = self._index.row(scene_id)
+        if row is None:
+            self._check_lost()
+            row = self._index.row(scene_id)
         if row is None:
             raise SceneNotFound(self._not_found(scene_id))
         return self._record(row)
@@ -211,7 +239,7 @@ class SceneRegistry:
         """
         check_scene_id(scene_id)
         SceneBundle.open(staging, check_hashes=False)  # before anything is created
-        folder = self.scenes_folder / scene_id
+        folder = self._scene_folder(scene_id)
         with _disk_errors(f"publish scene {scene_id} to {self.root}"):
             self._create_index()
             with file_lock(self.lock_path(scene_id, "publish")):
@@ -227,9 +255,15 @@ class SceneRegistry:
         return self._record(row)
 
     def remove(self, scene_id: str) -> None:
-        """Remove a scene: its row first, then its files."""
-        record = self.get(scene_id)
-        folder = record.path.parent
+        """Remove a scene: its row first, then its files; never anything outside `scenes/<scene id>/`.
+
+        Raises:
+            SceneNotFound: The scene does not exist.
+            BundleError: The scene's folder is a symbolic link.
+        """
+        if not self._index.has(check_scene_id(scene_id)):
+            self.get(scene_id)  # says why
+        folder = self._scene_folder(scene_id)
         with (
             _disk_errors(f"remove scene {scene_id} from {self.root}"),
             file_lock(self.lock_path(scene_id, "publish")),
@@ -244,12 +278,21 @@ class SceneRegistry:
     def rebuild_index(self) -> Records:
         """Rebuild a lost or damaged index from the folders; return the scenes found.
 
-        Of several valid revisions of a scene, the last written is current. Invalid folders are kept but not indexed.
+        The current revision of the index is kept where its bundle is valid; otherwise the last written of several is
+        current. Invalid folders are kept but not indexed. The rows change in one transaction. A scene that is published
+        or removed meanwhile keeps its newer state, and readers see the old rows or the new ones.
         """
+        return self.rebuild()[0]
+
+    def rebuild(self) -> tuple[Records, Names]:
+        """Rebuild the index as `rebuild_index` does; return the scenes, and one line about each folder left out."""
+        self._check_links()
         with _disk_errors(f"rebuild the index of {self.root}"):
             self.scenes_folder.mkdir(parents=True, exist_ok=True)
-            self._index.replace_all(self._rows_from_folders())
-        return self.list()
+            before = self._index.stored()
+            found, problems = self._rows_from_folders(before or {})
+            self._index.merge(before, found)
+        return [self._record(row) for row in self._index.rows()], problems
 
     # ---- Reading.
 
@@ -261,16 +304,52 @@ class SceneRegistry:
         known = [row.scene_id for row in self._index.rows()]
         if not known:
             hint = "the registry is empty; make a scene with `simrecon reconstruct VIDEO`"
-            if not self._index.exists() and self._folder_ids():
-                hint = "its index is lost; recover it with `registry.SceneRegistry(root).rebuild_index()`"
             return f"scene {scene_id!r} is not in {self.root}: {hint}"
         shown = ", ".join(known[:10]) + (f" and {len(known) - 10} more" if len(known) > 10 else "")
         return f"scene {scene_id!r} is not in {self.root}.{did_you_mean(scene_id, known)} There are: {shown}"
 
     def _folder_ids(self) -> Names:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            return [f.name for f in sorted(self.scenes_folder.iterdir()) if f.is_dir() and any(_revisions(f))]
+            folders = (f for f in sorted(self.scenes_folder.iterdir()) if is_scene_id(f.name))
+            return [f.name for f in folders if any(_revisions(f))]
         return []
+
+    def _lost_ids(self) -> Names:
+        """Return the scenes with folders, without those that are being published for the first time."""
+        return [key for key in self._folder_ids() if not is_locked(self.lock_path(key, "publish"))]
+
+    def _check_lost(self) -> None:
+        """Raise BundleError if the index has no row while there are scenes; the caller found no row.
+
+        A publisher writes its row before it releases its lock: the index is asked again after the locks.
+        """
+        if not self._index.is_empty():
+            return
+        lost = self._lost_ids()
+        if lost and self._index.is_empty():
+            shown = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if len(lost) > 5 else "")
+            what = "is empty" if self._index.exists() else "is lost"
+            raise BundleError(
+                f"registry: the index {self._index.path} {what}, but there are scenes in {self.scenes_folder}: "
+                f"{shown}; {REPAIR}"
+            )
+
+    def _check_links(self) -> None:
+        """Raise BundleError if a folder of the registry is a symbolic link: it could lead to anything."""
+        for name in ("scenes", "locks"):
+            if (self.root / name).is_symlink():
+                raise BundleError(
+                    f"registry: {self.root / name} is a symbolic link; a registry holds its own folders. Put a real "
+                    "folder there, or choose another registry with --registry"
+                )
+
+    def _scene_folder(self, scene_id: str) -> Path:
+        """Return the folder of a scene, which is no link."""
+        self._check_links()
+        folder = self.scenes_folder / check_scene_id(scene_id)
+        if folder.is_symlink():
+            raise BundleError(f"scene {scene_id}: its folder {folder} is a symbolic link; remove the link")
+        return folder
 
     def _highest_number(self) -> int:
         names = [row.scene_id for row in self._index.rows()] + self._folder_ids()
@@ -284,8 +363,8 @@ class SceneRegistry:
         return self.root / "locks" / f"{check_scene_id(scene_id)}.{purpose}.lock"
 
     def _create_index(self) -> None:
-        """Create the index; rebuild it from the folders if it was lost."""
-        if not self._index.exists() and self._folder_ids():
+        """Create the index; rebuild it from the folders if it was lost or emptied."""
+        if self._index.is_empty() and self._lost_ids():
             self.rebuild_index()
         self._index.create()
 
@@ -308,9 +387,12 @@ class SceneRegistry:
                 temporary.replace(final)
                 placed = final
                 _flush(folder)
-            row = self._index.row(scene_id)
-            if row is None or row.revision != bundle.revision:
-                row = _row_of(SceneBundle.open(final, check_hashes=False), scene_id, utc_text())
+            row = self._valid_row(scene_id)
+            # A new folder always gets its row: a rebuild of the index may have missed it.
+            if row is None or row.revision != bundle.revision or placed is not None:
+                same = row is not None and row.revision == bundle.revision
+                created = row.created_utc if row is not None and same else utc_text()
+                row = _row_of(SceneBundle.open(final, check_hashes=False), scene_id, created)
                 self._index.put(row)
             return row
         except BaseException:
@@ -320,6 +402,12 @@ class SceneRegistry:
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
+    def _valid_row(self, scene_id: str) -> SceneRow | None:
+        try:
+            return self._index.row(scene_id)
+        except BundleError:  # malformed: it is written anew
+            return None
+
     def _remove_superseded(self, folder: Path, current: str) -> None:
         for revision in _revisions(folder):
             if revision.name != current and not is_leased(revision):
@@ -327,15 +415,18 @@ class SceneRegistry:
 
     def _sweep(self, folder: Path) -> None:
         """Remove temporary folders of dead processes; the caller holds the scene's publish lock."""
-        if folder.is_dir():
+        if folder.is_dir() and not folder.is_symlink():
             for item in folder.iterdir():
                 if item.name.startswith(_TEMPORARY):
                     shutil.rmtree(item, ignore_errors=True)
 
     def _sweep_others(self, but: Path) -> None:
         for folder in self.scenes_folder.iterdir():
-            if folder == but or not any(i.name.startswith(_TEMPORARY) for i in folder.iterdir()):
+            if folder == but or folder.is_symlink() or not folder.is_dir():
                 continue
+            with contextlib.suppress(OSError):
+                if not any(i.name.startswith(_TEMPORARY) for i in folder.iterdir()):
+                    continue
             # Skip folders in use by another process (LockHeld) and folders that are no scenes (UsageError).
             with (
                 contextlib.suppress(LockHeld, UsageError),
@@ -345,19 +436,41 @@ class SceneRegistry:
                 with contextlib.suppress(OSError):
                     folder.rmdir()
 
-    def _rows_from_folders(self) -> Rows:
-        rows: Rows = []
+    def _rows_from_folders(self, before: StoredRows) -> tuple[dict[str, SceneRow], Names]:
+        """Return a row for each scene with a valid bundle, and one line about each folder that has none."""
+        rows: dict[str, SceneRow] = {}
+        problems: Names = []
         for scene_id in self._folder_ids():
-            found: list[tuple[float, str, SceneRow]] = []
-            for revision in _revisions(self.scenes_folder / scene_id):
-                with contextlib.suppress(BundleError):
-                    bundle = SceneBundle.open(revision, check_hashes=True)
-                    written = (revision / "manifest.json").stat().st_mtime
-                    if bundle.revision == revision.name and bundle.scene["id"] == scene_id:
-                        found.append((written, revision.name, _row_of(bundle, scene_id, utc_text(written))))
-            if found:
-                rows.append(max(found, key=lambda item: item[:2])[2])
-        return rows
+            with file_lock(self.lock_path(scene_id, "publish")):  # see no half of a publication
+                row, found = self._row_from_folder(scene_id, before.get(scene_id))
+            problems += found
+            if row is not None:
+                rows[scene_id] = row
+        return rows, problems
+
+    def _row_from_folder(
+        self, scene_id: str, stored: tuple[Any, ...] | None
+    ) -> tuple[SceneRow | None, Names]:
+        current = None
+        if stored is not None:
+            with contextlib.suppress(BundleError):
+                current = row_of(stored)
+        found: list[tuple[bool, float, SceneRow]] = []
+        problems: Names = []
+        for revision in _revisions(self.scenes_folder / scene_id):
+            try:
+                bundle = SceneBundle.open(revision, check_hashes=True)
+                written = (revision / "manifest.json").stat().st_mtime
+                if bundle.revision != revision.name or bundle.scene["id"] != scene_id:
+                    raise BundleError(f"bundle {revision}: it belongs to another scene or revision")
+            except BundleError as error:
+                problems.append(f"scene {scene_id}: {error}")
+                continue
+            is_current = current is not None and current.revision == revision.name
+            created = current.created_utc if current is not None and is_current else utc_text(written)
+            found.append((is_current, written, _row_of(bundle, scene_id, created)))
+        best = max(found, key=lambda item: (*item[:2], item[2].revision), default=None)
+        return None if best is None else best[2], problems
 
 
 @contextlib.contextmanager
@@ -379,9 +492,11 @@ def _scene_name(number: int) -> str:
 
 
 def _revisions(folder: Path) -> Iterator[Path]:
-    with contextlib.suppress(FileNotFoundError):
+    if folder.is_symlink():
+        return
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
         for item in sorted(folder.iterdir()):
-            if _REVISION.fullmatch(item.name) and item.is_dir():
+            if is_revision(item.name) and item.is_dir() and not item.is_symlink():
                 yield item
 
 
@@ -414,12 +529,19 @@ def _flush_tree(folder: Path) -> None:
         _flush(Path(parent))
 
 
+def _fits_index(key: str, value: Any) -> bool:
+    """Return whether a value of the physics report is one that the index takes."""
+    if not is_plain(key) or len(key) > 100:
+        return False
+    return isinstance(value, bool | float | str) or (isinstance(value, int) and abs(value) < 2**53)
+
+
 def _row_of(bundle: SceneBundle, scene_id: str, created_utc: str) -> SceneRow:
     scene = bundle.scene
     physics = scene["report"].get("physics", {})
     rate = physics.get("stable_rate")
     known = isinstance(rate, int | float) and not isinstance(rate, bool)
-    metrics = {key: value for key, value in physics.items() if isinstance(value, int | float | str | bool)}
+    metrics = {key: value for key, value in physics.items() if _fits_index(key, value)}
     metrics["scale_method"] = scene["scale"]["method"]
     metrics["scale_uncertainty"] = scene["scale"].get("uncertainty")
     metrics["n_dynamic"] = sum(item["dynamic"] for item in scene["objects"])

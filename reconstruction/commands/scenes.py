@@ -9,6 +9,7 @@ from pathlib import Path
 from reconstruction.commands.options import add_common, add_scene, add_verb, output_errors
 from registry import SceneBundle, SceneRecord, SceneRegistry
 from registry.errors import UsageError
+from registry.plain_text import plain
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
@@ -72,14 +73,16 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
 def run_list(arguments: argparse.Namespace) -> int:
     """Print one line for each scene."""
     registry = SceneRegistry(arguments.registry)
-    records = registry.list()
+    records, problems = registry.list_with_problems()
+    for problem in problems:
+        print(f"simrecon list: {plain(problem)}", file=sys.stderr)
     if arguments.json:
         print(json.dumps([_record_json(r) for r in records], indent=2))
         return 0
-    if not records:
+    if not records and not problems:
         print(f"no scenes in {registry.root} yet; make one with: simrecon reconstruct VIDEO")
         return 0
-    width = max(len(r.scene_id) for r in records)
+    width = max((len(r.scene_id) for r in records), default=0)
     for record in records:
         stable = record.metrics.get("stable_rate")
         shown = "" if stable is None else f"  stable {stable:.0%}"
@@ -187,17 +190,19 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
             f"{relation:<32} seen {item['provenance']['observed_fraction']:.0%}"
         )
     scale = scene["scale"]
-    lines.append(
-        f"scale: {scale['method']}, 1 sigma {100 * scale['uncertainty']:.0f} %. {scale.get('detail', '')}"
-    )
-    physics = scene["report"]["physics"]
-    if "stable_rate" in physics:
-        lines.append(
-            f"physics: {physics['stable_rate']:.0%} of the movable objects stay at rest for 10 s; deepest overlap "
-            f"{physics['spawn_penetration_mm']:.1f} mm; {physics['floating_rate']:.0%} float"
-        )
+    sigma = "unknown" if scale.get("uncertainty") is None else f"{100 * scale['uncertainty']:.0f} %"
+    lines.append(f"scale: {scale['method']}, 1 sigma {sigma}. {scale.get('detail', '')}")
+    physics = scene["report"].get("physics", {})
+    found = {
+        "stable_rate": "{:.0%} of the movable objects stay at rest for 10 s",
+        "spawn_penetration_mm": "deepest overlap {:.1f} mm",
+        "floating_rate": "{:.0%} float",
+    }
+    figures = [text.format(physics[key]) for key, text in found.items() if key in physics]
+    if figures:
+        lines.append(f"physics: {'; '.join(figures)}")
     lines += [f"note: {note}" for note in scene["report"].get("notes", [])]
-    if scene["report"]["timings_s"]:
+    if scene["report"].get("timings_s"):
         lines.append(describe_costs(scene["report"]))
     lines.append(f"files: {record.path}")
     return "\n".join(lines)
@@ -218,7 +223,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
         print(json.dumps(result, indent=2, default=str))
     else:
         for problem in report.problems:
-            print(problem)
+            print(plain(problem))
         print(
             f"{arguments.scene}: {'all files are intact' if report.ok else 'damaged; reconstruct it again'}"
         )

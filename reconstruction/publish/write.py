@@ -38,6 +38,7 @@ from reconstruction.scene_graph import backend_name
 from reconstruction.scene_graph.publishing import graph_of_bundle
 from registry import SceneRecord, SceneRegistry, seal_bundle
 from registry.errors import EnvironmentMissing, SimReconError
+from registry.plain_text import plain_strings
 from registry.primitives import primitive_of
 from registry.report_card import failures
 
@@ -70,7 +71,7 @@ def publish_scene(run: "Run", registry: SceneRegistry, scene_id: str, *, require
         with UsageMeter() as meter:
             scene = write_bundle(run, scene_id, staging)
         _add_costs(scene["report"], run, meter.usage)
-        seal_bundle(staging, scene)
+        seal_bundle(staging, plain_strings(scene))
         return registry.publish(staging, scene_id)
     except OSError as error:
         raise EnvironmentMissing(

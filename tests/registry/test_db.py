@@ -75,7 +75,7 @@ def test_a_newer_index_is_refused(tmp_path):
 def test_a_damaged_index_says_how_to_recover(tmp_path):
     SceneRegistry(tmp_path / "registry", create=True)
     (tmp_path / "registry" / "index.sqlite").write_bytes(b"this is no database" * 500)
-    with pytest.raises(BundleError, match="rebuild_index"):
+    with pytest.raises(BundleError, match="simrecon registry rebuild"):
         SceneRegistry(tmp_path / "registry").list()
 
 

@@ -31,7 +31,7 @@ _THRESHOLDS = (
 
 def physics_section(g: Gathered) -> Section:
     """Return the physics report, overall and per object."""
-    physics = g.scene["report"]["physics"]
+    physics = g.scene["report"].get("physics", {})
     if "objects" not in physics:
         return Section("physics", "Physics", [left_out("The report card", "the bundle has none")])
     rates = {"stable": "stable_rate", **{key: f"stable_rate_{key[7:]}" for key, _ in _THRESHOLDS[1:]}}
@@ -95,7 +95,7 @@ def cost_section(g: Gathered) -> Section:
     from reconstruction.pipeline import STAGE_NAMES
 
     report = g.scene["report"]
-    wall, volatile = report["timings_s"], report.get("volatile", {})
+    wall, volatile = report.get("timings_s", {}), report.get("volatile", {})
     names = [name for name in STAGE_NAMES if name in wall] + sorted(set(wall) - set(STAGE_NAMES))
     svgs = [plots.bars(names, [wall[n] for n in names], "wall time", "s", "#4f86e3", "wall")]
     for key, title, unit, color in (
@@ -113,7 +113,7 @@ def cost_section(g: Gathered) -> Section:
         f"{name} {version}" for name, version in sorted(volatile.get("versions", {}).items())
     )
     rows = [(name, volatile[name]) for name in ("machine", "commit") if volatile.get(name)]
-    backends = ", ".join(f"{stage}: {name}" for stage, name in sorted(report["backends"].items()))
+    backends = ", ".join(f"{stage}: {name}" for stage, name in sorted(report.get("backends", {}).items()))
     rows += [("versions", versions)] if versions else []
     rows += [("backends", backends)] if backends else []
     if rows:

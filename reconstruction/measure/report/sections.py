@@ -44,7 +44,7 @@ def all_sections(g: Gathered) -> list[Section]:
 def summary_tiles(g: Gathered) -> Tiles:
     """Return the highlighted figures at the top of the page."""
     scene, report = g.scene, g.scene["report"]
-    physics, scale = report["physics"], scene["scale"]
+    physics, scale = report.get("physics", {}), scene["scale"]
     tiles = [Tile(str(len(scene["objects"])), "objects", detail=f"{len(scene['base'])} base surfaces")]
     if "stable_rate" in physics:
         rate = physics["stable_rate"]
@@ -53,7 +53,7 @@ def summary_tiles(g: Gathered) -> Tiles:
     if "spawn_penetration_mm" in physics:
         depth = physics["spawn_penetration_mm"]
         tiles.append(Tile(f"{depth:.1f} mm", "deepest contact at spawn", graded(-depth, -1.0, -5.0)))
-    sigma = scale["uncertainty"]
+    sigma = scale.get("uncertainty")
     status = "bad" if sigma is None else graded(-sigma, -0.05, -0.2)
     tiles.append(Tile(_uncertainty(scale), "scale", status, scale["method"].replace("-", " ")))
     if "registration" in report:
@@ -61,15 +61,16 @@ def summary_tiles(g: Gathered) -> Tiles:
         share = found["registered"] / max(found["keyframes"], 1)
         text = f"{found['registered']} of {found['keyframes']}"
         tiles.append(Tile(text, "keyframes registered", graded(share, 0.95, 0.7)))
-    total = sum(report["timings_s"].values())
-    memory = f"peak {report['peak_memory_mb'] / 1024:.1f} GB"
+    total = sum(report.get("timings_s", {}).values())
+    peak_mb = report.get("peak_memory_mb")
+    memory = "" if peak_mb is None else f"peak {peak_mb / 1024:.1f} GB"
     tiles.append(Tile(f"{total / 60:.1f} min" if total >= 90 else f"{total:.0f} s", "time", detail=memory))
     return Tiles(tiles)
 
 
 def _uncertainty(scale: dict) -> str:
     """Format the relative uncertainty of the metric scale."""
-    return "unknown" if scale["uncertainty"] is None else f"± {scale['uncertainty']:.0%}"
+    return "unknown" if scale.get("uncertainty") is None else f"± {scale['uncertainty']:.0%}"
 
 
 def cameras_section(g: Gathered) -> Section:
@@ -94,7 +95,7 @@ def cameras_section(g: Gathered) -> Section:
     rows.append(("camera", f"{c.width}×{c.height}, focal length {c.fx:.0f} px, field of view {_fov(c):.0f}°"))
     scale = scene["scale"]
     detail = f"; {scale['detail']}" if scale.get("detail") else ""
-    spread = "" if scale["uncertainty"] is None else f", {_uncertainty(scale)} (1 σ)"
+    spread = "" if scale.get("uncertainty") is None else f", {_uncertainty(scale)} (1 σ)"
     rows.append(("scale", f"{scale['method']}{spread}{detail}"))
     world = scene.get("world")
     if world:

@@ -1,0 +1,123 @@
+# pyright: strict
+"""Check the rows and the tables of an index that someone else may have written."""
+
+import json
+import math
+import re
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from registry.errors import BundleError
+from registry.plain_text import is_plain
+from registry.schema import is_scene_id
+
+_REVISION = re.compile(r"[0-9a-f]{16}")
+_SHA256 = re.compile(r"[0-9a-f]{1,64}")
+_STATUS = ("stable", "unstable", "unchecked")
+_MAX_TEXT, _MAX_METRICS, _MAX_OBJECTS = 4096, 100_000, 1_000_000
+_RATES = (
+    "stable_rate",
+    "stable_rate_10cm_0.1rad",
+    "stable_rate_5cm_drop_5deg",
+    "floating_rate",
+    "at_rest_rate",
+)
+_NUMBERS = ("scale_uncertainty", "spawn_penetration_mm", "n_dynamic", "n_base")
+_CLAUSES = re.compile(r"\b(CHECK|GENERATED|VIRTUAL|AS)\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class SceneRow:
+    """A row of the index; the fields are the columns, in order. `SceneRecord` adds the path."""
+
+    scene_id: str
+    revision: str
+    schema_version: str
+    created_utc: str  # ISO 8601, seconds, with offset
+    source_file: str
+    source_sha256: str
+    n_objects: int
+    status: str  # "stable" | "unstable" | "unchecked"
+    metrics: dict[str, Any]  # JSON values
+
+
+def is_revision(value: Any) -> bool:
+    """Return whether a value is a revision: 16 hexadecimal digits."""
+    return isinstance(value, str) and _REVISION.fullmatch(value) is not None
+
+
+def row_of(values: tuple[Any, ...]) -> SceneRow:
+    """Return the row of nine stored columns.
+
+    Raises:
+        BundleError: A value is not of its kind; names the scene and the column.
+    """
+    scene_id, revision, version, created, source, digest, count, status, metrics = values
+    if not is_scene_id(scene_id):
+        raise BundleError(f"registry: a row of the index has the scene id {ascii(scene_id)[:80]}")
+    texts = (version, created, source)
+    checks = (
+        ("revision", revision, is_revision(revision)),
+        *((name, x, _is_line(x)) for name, x in zip(("schema_version", "created_utc", "source_file"), texts)),
+        ("source_sha256", digest, isinstance(digest, str) and _SHA256.fullmatch(digest) is not None),
+        ("n_objects", count, type(count) is int and 0 <= count <= _MAX_OBJECTS),
+        ("status", status, status in _STATUS),
+    )
+    for name, value, valid in checks:
+        if not valid:
+            raise BundleError(f"scene {scene_id}: its row of the index has the {name} {ascii(value)[:80]}")
+    return SceneRow(
+        scene_id, revision, version, created, source, digest, count, status, _metrics(scene_id, metrics)
+    )
+
+
+def _metrics(scene_id: str, text: Any) -> dict[str, Any]:
+    found: Any = None
+    if isinstance(text, str) and len(text) <= _MAX_METRICS:
+        try:
+            found = json.loads(text, parse_constant=_no_constant)
+        except (ValueError, RecursionError):
+            found = None
+    if not isinstance(found, dict):
+        raise BundleError(f"scene {scene_id}: the metrics in its row of the index are no JSON object")
+    for key, value in cast("dict[str, Any]", found).items():
+        number = _is_number(value)
+        valid = value is None or isinstance(value, bool) or number or _is_line(value)
+        if key in _RATES:
+            valid = value is None or (number and 0 <= value <= 1)
+        elif key in _NUMBERS:
+            valid = value is None or number
+        if not valid or not is_plain(key):
+            raise BundleError(
+                f"scene {scene_id}: its row of the index has {ascii(key)[:80]}: {ascii(value)[:80]}"
+            )
+    return cast("dict[str, Any]", found)
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(name)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= 1e300 and math.isfinite(value)
+
+
+def _is_line(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= _MAX_TEXT and is_plain(value)
+
+
+def check_schema(connection: sqlite3.Connection, path: Path) -> None:
+    """Check that an index has plain tables only: a view or an expression could run without end or hold anything.
+
+    Raises:
+        BundleError: It has a view, a trigger, a virtual table, or a column that is computed or checked.
+    """
+    for kind, name, sql in connection.execute("SELECT type, name, sql FROM sqlite_master LIMIT 1000"):
+        # SQLite's own indexes of primary keys and unique columns have no text.
+        if kind not in ("table", "index") or (sql is not None and _CLAUSES.search(str(sql))):
+            raise BundleError(
+                f"registry: the index {path} has {ascii(kind)[:20]} {ascii(name)[:60]}, which simrecon never writes; "
+                "rename it and run `simrecon registry rebuild`"
+            )
