@@ -8,6 +8,7 @@ import os
 import stat
 import struct
 import unicodedata
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -19,6 +20,7 @@ from registry.schema import check_relative_path
 SUFFIX = ".simrecon"
 CARD = "README.md"
 MAX_PACK_BYTES = (4 << 30) - 1  # what a zip without 64-bit extensions can hold
+_MAX_LISTS = 1_000_000  # lists and objects in a JSON file: a parsed one takes 60 bytes and more
 _MAX_BYTES = {CARD: 1 << 20, "manifest.json": 8 << 20, "scene.json": 16 << 20}
 _END, _CENTRAL, _LOCAL = b"PK\x05\x06", b"PK\x01\x02", b"PK\x03\x04"
 _END_FORMAT, _CENTRAL_FORMAT, _LOCAL_FORMAT = "<4s4H2IH", "<4s6H3I5H2I", "<4s5H3I2H"
@@ -76,27 +78,28 @@ def extract_members(stream: BinaryIO, members: list[Member], folder: Path, name:
     """Write the files of a checked pack, the card excepted, to an empty folder.
 
     Raises:
-        BundleError: An entry does not match its CRC-32.
+        BundleError: An entry does not match its CRC-32, or has too many JSON values.
         OSError: The folder cannot be written.
     """
-    import zlib
-
     for member in members:
         if member.name == CARD:
             continue
         target = folder / member.name
         target.parent.mkdir(parents=True, exist_ok=True)
         stream.seek(member.offset)
-        left, crc = member.size, 0
+        left, crc, lists = member.size, 0, 0
         with target.open("xb") as file:
             while left:
                 chunk = stream.read(min(left, _CHUNK))
                 if not chunk:
                     raise BundleError(f"pack {name}: {member.name} ends too early")
                 left, crc = left - len(chunk), zlib.crc32(chunk, crc)
+                lists += chunk.count(b"[") + chunk.count(b"{")
                 file.write(chunk)
         if crc != member.crc:
             raise BundleError(f"pack {name}: {member.name} is damaged (CRC-32)")
+        if member.name in _MAX_BYTES and lists > _MAX_LISTS:
+            raise BundleError(f"pack {name}: {member.name} has {lists} lists and objects, more than {_MAX_LISTS}")
 
 
 def check_pack_sizes(sizes: dict[str, int]) -> None:
