@@ -4,6 +4,7 @@ Writing needs neither a lock nor a rename: an object store shows an object when 
 are renamed into place. Keys are always relative, checked paths below the place.
 """
 
+import asyncio
 import contextlib
 import re
 from collections.abc import Generator
@@ -172,8 +173,12 @@ def place_errors(url: str, doing: str) -> Generator[None, None, None]:
     """Turn the errors of fsspec's clients into EnvironmentMissing; FileNotFoundError passes."""
     try:
         yield
-    except (SimReconError, FileNotFoundError):
+    except SimReconError:
         raise
+    except FileNotFoundError as error:
+        if (cause := _unreachable(error)) is None:
+            raise
+        raise _failed(url, doing, cause) from error
     except PermissionError as error:
         raise EnvironmentMissing(
             f"{url}: cannot {doing}: permission denied. Check the credentials (docs/sharing.md#credentials)"
@@ -182,14 +187,26 @@ def place_errors(url: str, doing: str) -> Generator[None, None, None]:
         raise EnvironmentMissing(f"{url}: cannot {doing}: {_line(error)}") from error
     except Exception as error:
         if (
-            not isinstance(error, OSError | TimeoutError)
+            not isinstance(error, OSError | asyncio.TimeoutError)
             and type(error).__module__.split(".")[0] not in _CLIENTS
         ):
             raise
-        raise EnvironmentMissing(
-            f"{url}: cannot {doing}: {_line(error)}. Check the address, the network and the credentials "
-            "(docs/sharing.md#credentials); run it again, nothing is left half done"
-        ) from error
+        raise _failed(url, doing, error) from error
+
+
+def _failed(url: str, doing: str, error: BaseException) -> EnvironmentMissing:
+    return EnvironmentMissing(
+        f"{url}: cannot {doing}: {_line(error)}. Check the address, the network and the credentials "
+        "(docs/sharing.md#credentials); run it again, nothing is left half done"
+    )
+
+
+def _unreachable(error: FileNotFoundError) -> BaseException | None:
+    """Return why a server could not be asked: fsspec reports every failure over HTTP as a missing file."""
+    cause = error.__cause__
+    if cause is None or not (isinstance(cause, TimeoutError | asyncio.TimeoutError) or type(cause).__module__.startswith("aiohttp")):
+        return None
+    return None if getattr(cause, "status", None) in (404, 410) else cause
 
 
 def _file_system(url: str) -> tuple[Any, str]:
