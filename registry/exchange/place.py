@@ -77,25 +77,23 @@ class Place:
         """Write an object at once.
 
         Raises:
-            UsageError: The place is read-only.
+            UsageError: The place is read-only, or its bucket does not exist.
             EnvironmentMissing: It cannot be written.
         """
-        self._need_writable()
-        with place_errors(self.url, f"write {key}"):
+        with self._writing(f"write {key}"):
             if _is_local(self.fs):
-                with whole_file(Path(self._path(key))) as stream:
+                with whole_file(Path(self._path(key)), sweep="*") as stream:
                     stream.write(data)
             else:
                 self.fs.pipe_file(self._path(key), data)
 
     def upload(self, key: str, source: Path) -> None:
         """Upload a local file as one object; errors as of `write`."""
-        self._need_writable()
-        with place_errors(self.url, f"upload {key}"):
+        with self._writing(f"upload {key}"):
             if not _is_local(self.fs):
                 self.fs.put_file(str(source), self._path(key))
                 return
-            with whole_file(Path(self._path(key))) as stream, source.open("rb") as file:
+            with whole_file(Path(self._path(key)), sweep="*") as stream, source.open("rb") as file:
                 while chunk := file.read(_CHUNK):
                     stream.write(chunk)
 
@@ -126,11 +124,19 @@ class Place:
     def _path(self, key: str) -> str:
         return f"{self.root.rstrip('/')}/{key}"
 
-    def _need_writable(self) -> None:
+    @contextlib.contextmanager
+    def _writing(self, doing: str) -> Generator[None, None, None]:
         if self.read_only:
             raise UsageError(
                 f"{self.url} is read-only: scenes are pulled over HTTP, and pushed to a folder, s3://, gs:// or hf://"
             )
+        try:
+            with place_errors(self.url, doing):
+                yield
+        except FileNotFoundError as error:
+            raise UsageError(
+                f"{self.url}: cannot {doing}: {_line(error)}. Make the bucket or repository first, or check its name"
+            ) from error
 
 
 def open_place(address: str | Path) -> Place:
@@ -240,7 +246,9 @@ def _options(protocol: str) -> dict[str, Any]:
         wait = aiohttp.ClientTimeout(total=None, sock_connect=_CONNECT_S, sock_read=_READ_S)
         options["client_kwargs"] = {"timeout": wait}
     elif protocol in ("s3", "s3a"):
-        options["config_kwargs"] = {"connect_timeout": _CONNECT_S, "read_timeout": _READ_S}
+        # s3fs itself tries again, too.
+        retries = {"max_attempts": 2, "mode": "standard"}
+        options["config_kwargs"] = {"connect_timeout": _CONNECT_S, "read_timeout": _READ_S, "retries": retries}
     return options
 
 

@@ -22,17 +22,20 @@ _GRACE_S = 60.0  # a temporary file or folder this young may belong to a writer 
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Generator[BinaryIO, None, None]:
+def whole_file(path: Path, *, sweep: str | None = None) -> Generator[BinaryIO, None, None]:
     """Open a temporary file beside `path` for writing; at the end of the block flush it to disk and rename it.
 
-    The temporary file is locked while it is written. Unlocked ones for the same path are removed first: their
-    writers were killed.
+    The temporary file is locked while it is written. Unlocked ones are removed first: their writers were killed.
+
+    Args:
+        path: The file.
+        sweep: Pattern of the file names whose temporary files are removed; None for that of `path` only.
 
     Raises:
         OSError: The file cannot be written; `path` is as it was.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    _sweep_files(path)
+    _sweep_files(path.parent, glob.escape(path.name) if sweep is None else sweep)
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with partial.open("xb") as stream:
@@ -71,8 +74,8 @@ def scratch_folder(prefix: str) -> Generator[Path, None, None]:
                 os.close(lease)
 
 
-def _sweep_files(path: Path) -> None:
-    for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+def _sweep_files(folder: Path, names: str) -> None:
+    for old in folder.glob(f".{names}.*-????????.tmp"):
         with contextlib.suppress(OSError):
             if not _is_abandoned(old) or old.is_symlink():
                 continue

@@ -5,6 +5,7 @@
 """
 
 import itertools
+import os
 import sys
 from pathlib import Path
 
@@ -29,7 +30,8 @@ def forever(verb: str, folder: Path) -> None:
         elif verb == "add":
             add_scene(folder / f"{name}.simrecon", SceneRegistry(folder / "registry"), replace=True)
         else:
-            push_scene(SceneBundle.open(folder / name), open_place(folder / "place"))
+            place = folder / "places" / f"{os.getpid()}_{number // 2}"  # a new one for every two revisions
+            push_scene(SceneBundle.open(folder / name), open_place(place))
         print(number, flush=True)
 
 

@@ -216,10 +216,13 @@ def test_extras_and_protocols_are_named(monkeypatch):
 
 
 def test_a_bucket_that_does_not_exist_or_answers_is_an_error_of_one_line(s3, bundles, monkeypatch):
-    with pytest.raises(EnvironmentMissing, match="nobody"):
+    with pytest.raises(UsageError, match=r"nobody-made-this/x: cannot upload.* Make the bucket"):
         push_scene(bundles[0], open_place("s3://nobody-made-this/x"))
     with pytest.raises(SceneNotFound, match="has no scenes"):
         pull_scene(open_place("s3://lab/empty"), "room")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    with pytest.raises(EnvironmentMissing, match=r"s3://lab/dead: cannot list index/room: .*credentials"):
+        push_scene(bundles[0], open_place("s3://lab/dead"))
 
 
 @pytest.mark.parametrize(
