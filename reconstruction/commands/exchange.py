@@ -284,9 +284,8 @@ def _list(place: "Place", arguments: argparse.Namespace) -> int:
     width = max(map(len, found), default=0)
     for name, shared in found.items():
         p = shared.pushed
-        print(
-            f"{name:<{width}}  {shared.revision}  {p[:4]}-{p[4:6]}-{p[6:8]} {p[9:11]}:{p[11:13]}{_details(entries.get(name))}"
-        )
+        when = f"{p[:4]}-{p[4:6]}-{p[6:8]} {p[9:11]}:{p[11:13]}"
+        print(f"{name:<{width}}  {shared.revision}  {when}{_details(entries.get(name))}")
     if not found:
         print(f"no scenes in {place.url}; push one with: simrecon push SCENE {place.url}")
     return 0

@@ -17,9 +17,34 @@ PRIVACY = (
 _MAX_LICENCE = 120
 # Identifiers that Hugging Face knows; others are written as `license: other` with a name.
 _LICENCES = frozenset(
-    "apache-2.0 mit bsd-2-clause bsd-3-clause cc cc0-1.0 cc-by-2.0 cc-by-3.0 cc-by-4.0 cc-by-sa-3.0 cc-by-sa-4.0 "
-    "cc-by-nc-3.0 cc-by-nc-4.0 cc-by-nc-sa-3.0 cc-by-nc-sa-4.0 cc-by-nd-4.0 cc-by-nc-nd-4.0 gpl-3.0 odbl pddl "
-    "odc-by cdla-permissive-1.0 cdla-permissive-2.0 cdla-sharing-1.0 unlicense wtfpl".split()
+    [
+        "apache-2.0",
+        "mit",
+        "bsd-2-clause",
+        "bsd-3-clause",
+        "cc",
+        "cc0-1.0",
+        "cc-by-2.0",
+        "cc-by-3.0",
+        "cc-by-4.0",
+        "cc-by-sa-3.0",
+        "cc-by-sa-4.0",
+        "cc-by-nc-3.0",
+        "cc-by-nc-4.0",
+        "cc-by-nc-sa-3.0",
+        "cc-by-nc-sa-4.0",
+        "cc-by-nd-4.0",
+        "cc-by-nc-nd-4.0",
+        "gpl-3.0",
+        "odbl",
+        "pddl",
+        "odc-by",
+        "cdla-permissive-1.0",
+        "cdla-permissive-2.0",
+        "cdla-sharing-1.0",
+        "unlicense",
+        "wtfpl",
+    ]
 )
 _TAGS = ("simrecon", "robotics", "simulation", "gymnasium", "maniskill", "sapien", "real2sim", "3d")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")

@@ -99,7 +99,9 @@ def extract_members(stream: BinaryIO, members: list[Member], folder: Path, name:
         if crc != member.crc:
             raise BundleError(f"pack {name}: {member.name} is damaged (CRC-32)")
         if member.name in _MAX_BYTES and lists > _MAX_LISTS:
-            raise BundleError(f"pack {name}: {member.name} has {lists} lists and objects, more than {_MAX_LISTS}")
+            raise BundleError(
+                f"pack {name}: {member.name} has {lists} lists and objects, more than {_MAX_LISTS}"
+            )
 
 
 def check_pack_sizes(sizes: dict[str, int]) -> None:

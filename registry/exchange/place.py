@@ -216,7 +216,9 @@ def _failed(url: str, doing: str, error: BaseException) -> EnvironmentMissing:
 def _unreachable(error: FileNotFoundError) -> BaseException | None:
     """Return why a server could not be asked: fsspec reports every failure over HTTP as a missing file."""
     cause = error.__cause__
-    if cause is None or not (isinstance(cause, TimeoutError | asyncio.TimeoutError) or type(cause).__module__.startswith("aiohttp")):
+    if cause is None or not (
+        isinstance(cause, TimeoutError | asyncio.TimeoutError) or type(cause).__module__.startswith("aiohttp")
+    ):
         return None
     return None if getattr(cause, "status", None) in (404, 410) else cause
 
@@ -233,7 +235,7 @@ def _file_system(url: str) -> tuple[Any, str]:
         raise EnvironmentMissing(f"{shown(url)}: {protocol}:// needs more packages: {advice}") from error
     except ValueError as error:
         raise UsageError(
-            f"{shown(url)}: {_line(error)}. Places are folders, s3://, gs://, hf://, http(s):// and what else fsspec knows"
+            f"{shown(url)}: {_line(error)}. Places are folders, s3://, gs://, hf://, https:// or others of fsspec"
         ) from error
 
 
@@ -248,7 +250,11 @@ def _options(protocol: str) -> dict[str, Any]:
     elif protocol in ("s3", "s3a"):
         # s3fs itself tries again, too.
         retries = {"max_attempts": 2, "mode": "standard"}
-        options["config_kwargs"] = {"connect_timeout": _CONNECT_S, "read_timeout": _READ_S, "retries": retries}
+        options["config_kwargs"] = {
+            "connect_timeout": _CONNECT_S,
+            "read_timeout": _READ_S,
+            "retries": retries,
+        }
     return options
 
 

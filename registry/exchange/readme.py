@@ -1,7 +1,7 @@
 """README.md of a place: the listing of its scenes -> Markdown that the Hugging Face Hub shows as the dataset's card.
 
-Nothing reads it back. The last push writes it, so two pushes at once may leave one that names only some scenes until the
-next push.
+Nothing reads it back. The last push writes it, so two pushes at once may leave one that names only some scenes until
+the next push.
 """
 
 from registry.errors import BundleError

@@ -150,8 +150,8 @@ def pull_scene(
         return AddedScene(registry.get(mine), False, licence_of(registry.load(mine).scene))
     if there is not None and there != revision and not replace:
         raise UsageError(
-            f"the registry {registry.root} has scene {mine} already, with revision {there}; {place.url} has {revision}. "
-            "Pull it under another id with --as NAME, or replace yours with --replace"
+            f"the registry {registry.root} has scene {mine} already, with revision {there}; {place.url} has "
+            f"{revision}. Pull it under another id with --as NAME, or replace yours with --replace"
         )
     with scratch_folder("simrecon-pull-") as folder:
         pack = folder / f"{name}{SUFFIX}"
@@ -286,4 +286,4 @@ def _no_revision(place: Place, scene_id: str, revision: str) -> str:
     if not known:
         current(place, scene_id)  # raises with what there is
     others = ", ".join(dict.fromkeys(shared.revision for shared in reversed(known)))
-    return f"{place.url} has no pack of scene {scene_id}, revision {revision}; its revisions, the newest first: {others}"
+    return f"{place.url} has no pack of {scene_id}, revision {revision}; its revisions, the newest first: {others}"

@@ -1,7 +1,7 @@
 """A process of the sharing tests: pushes, packs or adds what it is told.
 
-    python exchange_worker.py push PLACE BUNDLE...      until all are pushed
-    python exchange_worker.py pack|add|push FOLDER      forever, in one folder, until it is killed
+python exchange_worker.py push PLACE BUNDLE...      until all are pushed
+python exchange_worker.py pack|add|push FOLDER      forever, in one folder, until it is killed
 """
 
 import itertools
@@ -32,7 +32,8 @@ def forever(verb: str, folder: Path) -> None:
         else:
             place = folder / "places" / f"{os.getpid()}_{number // 2}"  # a new one for every two revisions
             push_scene(SceneBundle.open(folder / name), open_place(place))
-        print(number, flush=True)
+        sys.stdout.write(f"{number}\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Hostile packs: each case writes one; run as a program, it tries to add each and prints what happened as JSON.
 
-    python hostile_packs.py PACK.simrecon FOLDER
+python hostile_packs.py PACK.simrecon FOLDER
 """
 
 import hashlib
@@ -87,10 +87,9 @@ def _overlapping(path: Path, files: Files) -> None:
     name, data = "a", bytes(200_000)
     head = struct.pack("<4s5H3I2H", b"PK\3\4", 20, 0, 0, 0, 33, zlib.crc32(data), len(data), len(data), 5, 0)
     local = head + b"a0000" + data
-    central = b"".join(
-        struct.pack("<4s6H3I5H2I", b"PK\1\2", 0x314, 20, 0, 0, 0, 33, zlib.crc32(data), len(data), len(data), 5, 0, 0, 0,
-                    0, (stat.S_IFREG | 0o644) << 16, 0) + f"{name}{number:04d}".encode() for number in range(10_000)
-    )  # fmt: skip
+    numbers = (0x314, 20, 0, 0, 0, 33, zlib.crc32(data), len(data), len(data), 5, 0, 0, 0, 0)
+    fields = struct.pack("<4s6H3I5H2I", b"PK\1\2", *numbers, (stat.S_IFREG | 0o644) << 16, 0)
+    central = b"".join(fields + f"{name}{number:04d}".encode() for number in range(10_000))
     end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 10_000, 10_000, len(central), len(local), 0)
     path.write_bytes(local + central + end)
 
@@ -116,6 +115,10 @@ def _encrypted(data: bytearray, end: int) -> None:
 def _huge_size(data: bytearray, end: int) -> None:
     at = data.index(b"PK\1\2")
     struct.pack_into("<2I", data, at + 20, 0xFFFFFFFE, 0xFFFFFFFE)
+
+
+def _prefix(data: bytearray, end: int) -> None:
+    data[:0] = b"#!/bin/sh\n"
 
 
 def _changed(path: Path, files: Files) -> None:
@@ -189,7 +192,7 @@ CASES: dict[str, tuple[Callable[[Path, Files], None], str]] = {
     "a file of 4 GB claimed": (patched(_huge_size), "does not end before"),
     "another name before the content": (patched(_local_name), "described differently"),
     "an encrypted file": (patched(_encrypted), "encrypted"),
-    "bytes before the first file": (patched(lambda data, _: data.__setitem__(slice(0, 0), b"#!/bin/sh\n")), "not where"),
+    "bytes before the first file": (patched(_prefix), "not where"),
     "bytes after the end": (patched(lambda data, _: data.extend(b"more")), "not a zip file"),
     "cut off": (patched(lambda data, _: data.__delitem__(slice(len(data) // 2, None))), "cut off"),
     "empty": (lambda path, _: path.write_bytes(b""), "no zip file"),
@@ -212,7 +215,7 @@ CASES: dict[str, tuple[Callable[[Path, Files], None], str]] = {
 
 
 def main(pack: Path, folder: Path) -> None:
-    """Try every case; print {case: {error, seconds, peak_mb}}."""
+    """Try every case; write {case: {error, seconds, peak_mb}}."""
     from registry import SceneRegistry, SimReconError
     from registry.exchange import add_scene
 
@@ -242,7 +245,7 @@ def main(pack: Path, folder: Path) -> None:
         os.waitpid(child, 0)
         said[case]["written"] = registry.root.exists()
         path.unlink()
-    print(json.dumps(said))
+    sys.stdout.write(json.dumps(said))
 
 
 if __name__ == "__main__":

@@ -85,7 +85,8 @@ def _next_run_works_and_cleans(folder: Path, verb: str) -> None:
             assert path.read_bytes() == (folder / "two.simrecon").read_bytes()
         elif verb == "add":
             registry = SceneRegistry(folder / "registry")
-            assert add_scene(folder / "two.simrecon", registry, replace=True).record.revision == bundle.revision
+            for name in ("one", "two"):  # publishing removes what a killed publish of the scene left
+                add_scene(folder / f"{name}.simrecon", registry, replace=True)
             assert sorted(p.name for p in (registry.scenes_folder / "room").iterdir()) == [bundle.revision]
         else:
             for root in sorted((folder / "killed").iterdir()):

@@ -161,13 +161,18 @@ def test_a_damaged_scene_is_not_packed(mine, pack, tmp_path):
         pack_scene(mine.load("room"), pack / "below_a_file.simrecon")
 
 
-HOSTILE = "<script>alert(1)</script> [x](http://evil) | `a` \x1b[31m\n# head\u202e\ndone: ![i](http://evil/i.png)"
+HOSTILE = (
+    "<script>alert(1)</script> [x](http://evil) | `a` \x1b[31m\n# head\u202e\ndone: ![i](http://evil/i.png)"
+)
 
 
 def test_cards_show_foreign_texts_as_texts(scene, tmp_path, write_files):
     scene["source"]["file"] = f"/home/alice/secret folder/{HOSTILE.replace('/', '')}"
     scene["objects"][0]["label"] = HOSTILE
-    scene["report"]["volatile"] = {"licence": f'my "own": {HOSTILE}', "created_utc": "2026-11-26T08:00:00+00:00"}
+    scene["report"]["volatile"] = {
+        "licence": f'my "own": {HOSTILE}',
+        "created_utc": "2026-11-26T08:00:00+00:00",
+    }
     write_files(tmp_path)
     revision = seal_bundle(tmp_path, scene)
     card = scene_card(scene, revision)

@@ -80,7 +80,10 @@ def test_pushed_scenes_are_listed_and_pulled(address, mine, bundles):
         assert push_scene(bundle, place).new
     assert not push_scene(bundles[1], place).new
     first, second, hall = (bundle.revision for bundle in bundles)
-    assert [(s.scene_id, s.revision) for s in list_place(open_place(address))] == [("hall", hall), ("room", second)]
+    assert [(s.scene_id, s.revision) for s in list_place(open_place(address))] == [
+        ("hall", hall),
+        ("room", second),
+    ]
     assert [s.revision for s in revisions_of(place, "room")] == [first, second]
     assert [s.scene_id for s in list_place(place, "r*")] == ["room"]
     assert read_entry(place, list_place(place, "room")[0])["objects"] == 2
@@ -242,7 +245,13 @@ def test_many_processes_push_and_lose_nothing(kind, processes, each, request, tm
     bundles = [make_bundle(name, f"revision {number}") for number, name in enumerate(names)]
     running = [
         subprocess.Popen(
-            [sys.executable, exchange_worker.__file__, "push", address, *map(str, bundles[n * each : (n + 1) * each])],
+            [
+                sys.executable,
+                exchange_worker.__file__,
+                "push",
+                address,
+                *map(str, bundles[n * each : (n + 1) * each]),
+            ],
             env={**os.environ, "PYTHONPATH": str(ROOT)},
             stderr=subprocess.PIPE,
             text=True,
