@@ -18,6 +18,7 @@ from registry.exchange.wholefile import whole_file
 _CHUNK = 1 << 20
 _BLOCK = 8 << 20  # bytes of a ranged request
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs", "hf": "hub"}
+_DEPTH = 2  # folders below `index` and `packs`, their files included
 _HTTP = ("http", "https")
 _CONNECT_S, _READ_S = 15, 60
 # Packages of fsspec's clients, the errors of which are no OSErrors.
@@ -111,7 +112,11 @@ class Place:
             prefix: Hint that only names with this beginning are needed; object stores list no others.
         """
         path = self._path(folder)
-        options = {"prefix": prefix} if prefix and _protocol(self.fs) in ("s3", "s3a", "gs", "gcs") else {}
+        options: dict[str, Any] = {}
+        if self.read_only:
+            options = {"maxdepth": _DEPTH}  # a server could list folders without end
+        elif prefix and _protocol(self.fs) in ("s3", "s3a", "gs", "gcs"):
+            options = {"prefix": prefix}
         with place_errors(self.url, f"list {folder}"):
             self.fs.invalidate_cache()
             try:

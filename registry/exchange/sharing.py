@@ -32,7 +32,7 @@ _CATALOG_FORMAT, _ENTRY_FORMAT = "simrecon.catalog/1", "simrecon.entry/1"
 _SCENE = r"[a-z0-9_]{1,64}"
 _KEY = re.compile(rf"(?P<scene>{_SCENE})/(?P<pushed>\d{{8}}T\d{{12}}Z)-(?P<revision>[0-9a-f]{{16}})\.json")
 _WANTED = re.compile(rf"(?P<scene>{_SCENE})(@(?P<revision>[0-9a-f]{{16}}))?")
-_MAX_CATALOG_BYTES, _MAX_ENTRY_BYTES = 256 << 20, 64 << 10
+_MAX_CATALOG_BYTES, _MAX_ENTRY_BYTES = 32 << 20, 64 << 10
 
 
 @dataclass(frozen=True, order=True)

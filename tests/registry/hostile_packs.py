@@ -179,6 +179,8 @@ CASES: dict[str, tuple[Callable[[Path, Files], None], str]] = {
     "an absolute path": (renamed("/tmp/evil.txt"), "not a plain relative path"),
     "a path of Windows": (renamed("C:\\evil.txt"), "not a plain relative path"),
     "a control character in a name": (renamed("a\x1b[2Jb"), "not a plain relative path"),
+    "a C1 control character in a name": (renamed("a\x9b2Jb"), "cannot be shown"),
+    "letters that run backwards": (renamed("a\u202etxt.exe"), "cannot be shown"),
     "a symbolic link": (attributes("link", stat.S_IFLNK | 0o777), "a link, folder or device"),
     "a device": (attributes("null", stat.S_IFCHR | 0o666), "a link, folder or device"),
     "a folder": (attributes("folder", stat.S_IFDIR | 0o755), "a link, folder or device"),

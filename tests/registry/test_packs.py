@@ -5,6 +5,8 @@ import http.server
 import json
 import threading
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import fsspec
 import pytest
@@ -116,6 +118,19 @@ def test_another_revision_needs_a_name_or_replace(theirs, pack, other_pack):
     assert theirs.verify("room_2").ok
     with pytest.raises(UsageError, match="small letters"):
         add_scene(pack, theirs, scene_id="../x")
+
+
+def test_adding_at_once_agrees_on_one_scene(theirs, pack, other_pack):
+    def add(file: Path) -> str:
+        try:
+            return "new" if add_scene(file, theirs).new else "there"
+        except UsageError:
+            return "taken"
+
+    with ThreadPoolExecutor(8) as pool:
+        said = list(pool.map(add, [pack] * 4 + [other_pack] * 4))
+    assert sorted(said) == ["new", *["taken"] * 4, *["there"] * 3]
+    assert theirs.verify("room").ok
 
 
 def test_folders_and_urls_are_added_like_files(theirs, pack, make_bundle, served):

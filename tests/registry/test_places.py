@@ -12,6 +12,7 @@ import uuid
 from pathlib import Path
 
 import exchange_worker
+import fsspec
 import pytest
 
 from registry import BundleError, EnvironmentMissing, SceneBundle, SceneNotFound, SceneRegistry, UsageError
@@ -206,16 +207,22 @@ def test_an_http_mirror_is_read_with_and_without_listings(tmp_path, bundles, min
 def test_extras_and_protocols_are_named(monkeypatch):
     with pytest.raises(UsageError, match=r"nope://.*Places are"):
         open_place("nope://x/y")
-    import fsspec
-
-    for protocol, extra in (("s3", "s3"), ("gs", "gs"), ("hf", "hub")):
-
-        def missing(*_: object, **__: object) -> None:
-            raise ImportError("no such package")
-
-        monkeypatch.setattr(fsspec.core, "url_to_fs", missing)
+    known = sys.modules["fsspec.registry"]._registry
+    for protocol, extra, package in (
+        ("s3", "s3", "s3fs"),
+        ("gs", "gs", "gcsfs"),
+        ("hf", "hub", "huggingface_hub"),
+    ):
+        monkeypatch.delitem(known, protocol, raising=False)
+        monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
         with pytest.raises(EnvironmentMissing, match=rf"pip install 'simrecon\[{extra}\]'"):
             open_place(f"{protocol}://bucket/x")
+
+
+def test_the_hub_is_opened_by_its_client():
+    pytest.importorskip("huggingface_hub", reason="the extra hub is not installed")
+    place = open_place("hf://datasets/me/my-rooms")
+    assert (place.root, place.read_only) == ("datasets/me/my-rooms", False)
 
 
 def test_a_bucket_that_does_not_exist_or_answers_is_an_error_of_one_line(s3, bundles, monkeypatch):
@@ -223,9 +230,12 @@ def test_a_bucket_that_does_not_exist_or_answers_is_an_error_of_one_line(s3, bun
         push_scene(bundles[0], open_place("s3://nobody-made-this/x"))
     with pytest.raises(SceneNotFound, match="has no scenes"):
         pull_scene(open_place("s3://lab/empty"), "room")
+    client = fsspec.get_filesystem_class("s3")
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    client.clear_instance_cache()  # a client keeps the address that it was made with
     with pytest.raises(EnvironmentMissing, match=r"s3://lab/dead: cannot list index/room: .*credentials"):
         push_scene(bundles[0], open_place("s3://lab/dead"))
+    client.clear_instance_cache()
 
 
 @pytest.mark.parametrize(
