@@ -11,6 +11,7 @@ from registry.bundle import SceneBundle
 from registry.errors import BundleError, EnvironmentMissing, SceneBusy, SceneNotFound, UsageError
 from registry.exchange.card import licence_of
 from registry.exchange.layout import MAX_PACK_BYTES, extract_members, open_pack, read_members
+from registry.exchange.place import download, local_path, shown
 from registry.exchange.wholefile import scratch_folder
 from registry.schema import check_scene_id
 from registry.store import SceneRecord, SceneRegistry
@@ -64,11 +65,12 @@ def add_scene(
     registry = SceneRegistry() if registry is None else registry
     if scene_id is not None:
         check_scene_id(scene_id)
-    with _bundle_of(source) as bundle:
+    label = shown(str(source))
+    with _bundle_of(source, label) as bundle:
         found = (bundle.scene["id"], bundle.revision)
         if expected is not None and found != expected:
             raise BundleError(
-                f"{source}: holds scene {found[0]}, revision {found[1]}; expected {expected[0]}, {expected[1]}"
+                f"{label}: holds scene {found[0]}, revision {found[1]}; expected {expected[0]}, {expected[1]}"
             )
         name = scene_id or found[0]
         with _held(registry, name):
@@ -84,13 +86,11 @@ def add_scene(
 
 
 @contextlib.contextmanager
-def _bundle_of(source: Path | str) -> Generator[SceneBundle, None, None]:
+def _bundle_of(source: Path | str, label: str) -> Generator[SceneBundle, None, None]:
     """Open the bundle of a source with all hashes checked, in place or in a temporary folder."""
     with contextlib.ExitStack() as stack:
         path = Path(source).expanduser() if isinstance(source, Path) or not _URL.match(source) else None
         if path is None:
-            from registry.exchange.place import download, local_path
-
             path = local_path(str(source))
             if path is None:
                 with _scratch_errors():
@@ -101,10 +101,10 @@ def _bundle_of(source: Path | str) -> Generator[SceneBundle, None, None]:
             yield SceneBundle.open(path, check_hashes=True)
             return
         if not path.exists():
-            raise UsageError(f"{source}: there is no such file or folder")
+            raise UsageError(f"{label}: there is no such file or folder")
         with _scratch_errors():
             folder = stack.enter_context(scratch_folder(_SCRATCH))
-        yield unpack(path, folder / "bundle", str(source))
+        yield unpack(path, folder / "bundle", label)
 
 
 def unpack(path: Path, folder: Path, name: str) -> SceneBundle:

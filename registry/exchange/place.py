@@ -182,7 +182,7 @@ def local_path(url: str) -> Path | None:
 
 def shown(url: str) -> str:
     """Return a URL without user, password and query, for messages."""
-    return re.sub(r"//[^/@\s]*@", "//", url.split("?")[0])
+    return re.sub(r"//[^/@\s]*@", "//", url.split("?")[0]) if "://" in url else url
 
 
 @contextlib.contextmanager

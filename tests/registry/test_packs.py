@@ -143,12 +143,16 @@ def test_folders_and_urls_are_added_like_files(theirs, pack, make_bundle, served
 
 
 def test_missing_sources_are_named(theirs, tmp_path, served):
+    (tmp_path / "none.txt").write_text("none")
     for source in (tmp_path / "none.simrecon", f"{served}/none.simrecon", "memory://none", "zzz://a/b"):
         with pytest.raises(UsageError, match=r"none|zzz"):
             add_scene(source, theirs)
     with pytest.raises(EnvironmentMissing, match=r"cannot download it.*docs/sharing.md#credentials") as error:
         add_scene("http://user:secret@127.0.0.1:9/room.simrecon?token=secret", theirs)
     assert "secret" not in str(error.value)
+    with pytest.raises(BundleError) as error:
+        add_scene(f"{served}/none.txt?token=secret", theirs)
+    assert str(error.value).startswith(f"pack {served}/none.txt: 4 bytes are no zip file")
     assert not theirs.root.exists()
 
 
