@@ -187,7 +187,7 @@ def _read_entry(directory: bytes, at: int, content: int) -> tuple[Member, int]:
         raise BundleError("a file's name is not UTF-8") from error
     check_relative_path(name, "name of a file")
     if not name.isprintable():  # C1 controls and bidirectional marks would reach terminals
-        raise BundleError(f"a file's name has characters that cannot be shown: {name!r}")
+        raise BundleError(f"name of a file: {name!r} is not a plain relative path: it cannot be shown")
     if flags & _ENCRYPTED:
         raise BundleError(f"{name}: encrypted")
     if method or packed != size:

@@ -1,25 +1,45 @@
 """A sealed bundle of a box on a base surface, small enough to make by the dozen."""
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
 
 from registry import seal_bundle
+from registry.glb import write_glb_chunks
 
 _OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+_POINTS, _CORNERS = np.eye(3, dtype="<f4").tobytes(), np.arange(3, dtype="<u4").tobytes()
+_TRIANGLE = {
+    "asset": {"version": "2.0"},
+    "scene": 0,
+    "scenes": [{"nodes": [0]}],
+    "nodes": [{"mesh": 0}],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    "accessors": [
+        {
+            "bufferView": 0,
+            "componentType": 5126,
+            "count": 3,
+            "type": "VEC3",
+            "min": [0, 0, 0],
+            "max": [1, 1, 1],
+        },
+        {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"},
+    ],
+    "bufferViews": [
+        {"buffer": 0, "byteOffset": 0, "byteLength": 36},
+        {"buffer": 0, "byteOffset": 36, "byteLength": 12},
+    ],
+    "buffers": [{"byteLength": 48}],
+}
 
 
 def write_bundle(folder: Path, scene_id: str, label: str = "floor") -> Path:
     """Write and seal a bundle; `label` is that of its base surface."""
-    text = json.dumps({"asset": {"version": "2.0"}}).encode()
-    text += b" " * (-len(text) % 4)
     folder.mkdir(parents=True)
     for name in ("base.glb", "box.glb"):
-        (folder / name).write_bytes(
-            struct.pack("<5I", 0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A) + text
-        )
+        write_glb_chunks(folder / name, _TRIANGLE, _POINTS + _CORNERS)
     (folder / "box.obj").write_text(_OBJ)
     pose = np.eye(4).tolist()
     sources = {"geometry": "made", "appearance": "made", "physics": "made", "observed_fraction": 0.5}
