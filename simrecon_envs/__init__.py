@@ -6,6 +6,7 @@ registry's index:
     import gymnasium as gym, simrecon_envs
     env = gym.make("SimRecon/scene0001")         # batched torch tensors, as in ManiSkill
     env = gym.make("SimRecon/scene0001-pick_mug-v0")          # a task from `list_tasks("scene0001")`
+    env = gym.make(simrecon_envs.add("room.simrecon"))        # a scene from elsewhere, verified first
     env = simrecon_envs.make_cpu("scene0001")    # unbatched NumPy, e.g. for stable-baselines3
 
 torch, sapien and mani_skill are loaded by the first `make`.
@@ -13,6 +14,7 @@ torch, sapien and mani_skill are loaded by the first `make`.
 
 from typing import TYPE_CHECKING, Any
 
+from simrecon_envs.adding import add
 from simrecon_envs.catalog import TaskEntry, list_scenes, list_tasks
 from simrecon_envs.errors import EnvNotFound, SceneAssetsMissing
 from simrecon_envs.registration import (
@@ -39,6 +41,7 @@ __all__ = [
     "SceneAssetsMissing",
     "SceneEnv",
     "TaskEntry",
+    "add",
     "env_id",
     "list_scenes",
     "list_tasks",

@@ -165,6 +165,12 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
     add("--kinds", type=_words, default=(), help="only these kinds, separated by commas")
     add("--robots", type=_words, default=(), help="only these robots, separated by commas")
     add("--episodes", type=int, metavar="N", help="maximum number of episodes of a task (default: all)")
+    add(
+        "--fetch-from",
+        metavar="PLACE",
+        help="pull scenes that the registry lacks, by the suite's revisions, from a folder, s3://, hf:// or others "
+        "(default: $SIMRECON_SCENES_FROM; docs/sharing.md)",
+    )
     add("--any-revision", action="store_true", help="accept scenes of another revision, with a note")
 
 

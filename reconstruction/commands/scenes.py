@@ -26,6 +26,11 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     add("list", "list the scenes of the registry", run_list, scene=False)
     show = add("show", "show objects, relations, scale, stability and files of a scene", run_show)
     show.add_argument(
+        "--card",
+        action="store_true",
+        help="print the scene's card, as `simrecon pack` writes it (Markdown): source, licence, figures, warning",
+    )
+    show.add_argument(
         "--instances",
         action="store_true",
         help="list every object with an anchor for --overrides, and write contact sheets: frames with outlined, "
@@ -99,6 +104,11 @@ def run_show(arguments: argparse.Namespace) -> int:
     record = registry.get(arguments.scene)
     bundle = registry.load(arguments.scene)
     _check_show_flags(arguments)
+    if arguments.card:
+        from registry.exchange.card import scene_card
+
+        print(scene_card(bundle.scene, bundle.revision), end="")
+        return 0
     if arguments.instances:
         return _show_instances(arguments, bundle)
     if arguments.views:
@@ -121,9 +131,11 @@ def run_show(arguments: argparse.Namespace) -> int:
 
 def _check_show_flags(arguments: argparse.Namespace) -> None:
     """Raise `UsageError` for flags of `show` that do not go together."""
-    asked = [flag for flag in ("instances", "views", "graph") if getattr(arguments, flag)]
+    asked = [flag for flag in ("card", "instances", "views", "graph") if getattr(arguments, flag)]
     if len(asked) > 1:
-        raise UsageError("--instances, --views and --graph write different pictures; give only one of them")
+        raise UsageError(
+            "--card, --instances, --views and --graph print different things; give only one of them"
+        )
     for flag, partners in (
         ("set", ("views",)),
         ("work_dir", ("views", "graph")),
@@ -170,6 +182,7 @@ def _show_instances(arguments: argparse.Namespace, bundle: SceneBundle) -> int:
 def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
     """Return a text with the objects, scale, physics, notes, costs and files of a scene."""
     from reconstruction.costs import describe_costs
+    from registry.exchange.card import licence_of
 
     scene = bundle.scene
     names = {b["id"]: b["label"] for b in scene["base"]} | {o["id"]: o["label"] for o in scene["objects"]}
@@ -204,6 +217,9 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
     lines += [f"note: {note}" for note in scene["report"].get("notes", [])]
     if scene["report"].get("timings_s"):
         lines.append(describe_costs(scene["report"]))
+    lines.append(
+        f"licence: {licence_of(scene)}; the pictures are of a real room (card: simrecon show {record.scene_id} --card)"
+    )
     lines.append(f"files: {record.path}")
     return "\n".join(lines)
 

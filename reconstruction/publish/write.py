@@ -37,6 +37,7 @@ from reconstruction.publish.preview import render_preview
 from reconstruction.scene_graph import backend_name
 from reconstruction.scene_graph.publishing import graph_of_bundle
 from registry import SceneRecord, SceneRegistry, seal_bundle
+from registry.db import utc_text
 from registry.errors import EnvironmentMissing, SimReconError
 from registry.plain_text import plain_strings
 from registry.primitives import primitive_of
@@ -255,6 +256,7 @@ def _report(run: "Run") -> dict:
         "volatile": {
             "cpu_s": {name: round(usage.cpu_s, 3) for name, usage in run.usage.items()},
             "stage_peak_memory_mb": {n: round(usage.peak_memory_mb, 1) for n, usage in run.usage.items()},
+            "created_utc": utc_text(),
             "machine": f"{platform.machine()} {platform.system()}",
             "versions": _versions(),
             "commit": _commit(),

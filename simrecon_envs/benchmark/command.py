@@ -9,6 +9,7 @@ from typing import Any
 
 from registry import UsageError
 from simrecon_envs.benchmark.compare import Difference, compare_results
+from simrecon_envs.benchmark.fetching import default_place, fetch_scenes
 from simrecon_envs.benchmark.generate import GenerateConfig, generate_suite
 from simrecon_envs.benchmark.policies import PolicySpec
 from simrecon_envs.benchmark.records import Records
@@ -61,6 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `simrecon benchmark run`."""
     suite = load_suite(arguments.suite)
     tasks, selection = _choose(suite, arguments)
+    reporter = Reporter(arguments.quiet)
+    _fetch(tasks, arguments, reporter)
     settings = RunSettings(
         episodes=arguments.episodes,
         fresh=arguments.fresh_seeds,
@@ -81,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         settings,
         jobs=arguments.jobs,
         records=records,
-        reporter=Reporter(arguments.quiet),
+        reporter=reporter,
         suite_name=arguments.suite.name,
         selection=selection,
     )
@@ -125,10 +128,17 @@ def demos(arguments: argparse.Namespace) -> int:
         raise UsageError("name an output folder: --maniskill DIR, --lerobot DIR, or both")
     suite = load_suite(arguments.suite)
     tasks, _ = _choose(suite, arguments)
-    _record_demos(
-        arguments, suite, tasks, arguments.episodes, Reporter(arguments.quiet), arguments.any_revision
-    )
+    reporter = Reporter(arguments.quiet)
+    _fetch(tasks, arguments, reporter)
+    _record_demos(arguments, suite, tasks, arguments.episodes, reporter, arguments.any_revision)
     return 0
+
+
+def _fetch(tasks: list[SuiteTask], arguments: argparse.Namespace, reporter: Reporter) -> None:
+    """Pull missing scenes if a place is named."""
+    place = arguments.fetch_from or default_place()
+    if place is not None:
+        fetch_scenes(tasks, place, arguments.registry, reporter)
 
 
 def _record_demos(

@@ -9,6 +9,7 @@ import numpy as np
 
 from registry import SceneRegistry, UsageError
 from simrecon_envs.benchmark.episodes import Episode, run_episode
+from simrecon_envs.benchmark.fetching import how_to_get, wanted_scenes
 from simrecon_envs.benchmark.parallel import Workers
 from simrecon_envs.benchmark.policies import PolicySpec
 from simrecon_envs.benchmark.records import Records
@@ -118,7 +119,7 @@ def check_revisions(tasks: list[SuiteTask], settings: RunSettings) -> list[str]:
     """
     catalog = SceneRegistry(None if settings.registry is None else Path(settings.registry))
     known = catalog.revisions()
-    wanted = {task.scene: task.revision for task in tasks}
+    wanted = wanted_scenes(tasks)
     missing = [scene for scene in wanted if scene not in known]
     other = [scene for scene, revision in wanted.items() if known.get(scene, revision) != revision]
     changed = [f"{scene} is {known[scene]}, the suite's is {wanted[scene]}" for scene in other]
@@ -127,12 +128,14 @@ def check_revisions(tasks: list[SuiteTask], settings: RunSettings) -> list[str]:
         raise UsageError(
             f"{len(missing)} of the suite's {len(wanted)} scenes are not in the registry {catalog.root}: "
             f"{', '.join(f'{scene} (revision {wanted[scene]})' for scene in missing)}{more}. Name another registry "
-            "with --registry, or choose tasks of the scenes that are here with --tasks 'SCENE-*'"
+            "with --registry, or choose tasks of the scenes that are here with --tasks 'SCENE-*'; "
+            f"{how_to_get({scene: wanted[scene] for scene in missing}, replace=False)}"
         )
     if changed and not settings.any_revision:
         raise UsageError(
             f"the registry {catalog.root} has other revisions of scenes than the suite was proven in: "
-            f"{'; '.join(changed)}. Generate the suite again, or accept them with --any-revision; the results note it"
+            f"{'; '.join(changed)}. Generate the suite again, or accept them with --any-revision; the results note it. "
+            f"Or {how_to_get({scene: wanted[scene] for scene in other}, replace=True)}"
         )
     return [f"scene {text}" for text in changed]
 

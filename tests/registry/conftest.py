@@ -51,3 +51,16 @@ def _write_files(folder: Path, marker: str = "") -> None:
         (folder / name).write_bytes(_glb_bytes())
     for name in ("base/floor_000.obj", "objects/002/collision_000.obj", "objects/003/collision_000.obj"):
         (folder / name).write_text(f"# {marker}\n{OBJ_TEXT}")
+
+
+@pytest.fixture(scope="session")
+def make_bundle(tmp_path_factory):
+    """Return a function that seals a tiny bundle in a new folder: `make_bundle(scene id, marker)`."""
+
+    def make(scene_id: str = "room", marker: str = "") -> Path:
+        folder = tmp_path_factory.mktemp("bundle")
+        _write_files(folder, marker)
+        seal_bundle(folder, copy.deepcopy(SCENE) | {"id": scene_id})
+        return folder
+
+    return make
