@@ -70,7 +70,7 @@ def _tiles(
 def _card(out: Path, scene: dict[str, Any]) -> dict[str, Any]:
     """Return what is shown of a scene: its links only where the files are there."""
     scene_id = scene["scene"]
-    preview, report = f"previews/{scene_id}.png", f"reports/{scene_id}.html"
+    preview, report = f"previews/{scene_id}.jpg", f"reports/{scene_id}.html"
     figures = [(label, form.format(scene[key])) for label, key, form in _SHOWN if _number(scene.get(key))]
     return {
         "scene": scene_id,

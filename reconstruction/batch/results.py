@@ -2,10 +2,11 @@
 
 import csv
 import io
-import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 from reconstruction.batch.figures import object_figures, scene_figures
 from reconstruction.batch.journal import VideoState
@@ -27,6 +28,7 @@ FIRST = (
     "revision",
     "env_id",
 )
+_PREVIEW_PX = 480
 Table = list[dict[str, Any]]
 
 
@@ -65,9 +67,11 @@ class Results:
     def _copy_preview(self, folder: Path, scene_id: str) -> None:
         source = folder / "preview.png"
         if source.is_file():
-            target = self._out / "previews" / f"{scene_id}.png"
+            target = self._out / "previews" / f"{scene_id}.jpg"
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
+            with Image.open(source) as picture:
+                picture.thumbnail((_PREVIEW_PX, _PREVIEW_PX))
+                picture.convert("RGB").save(target, quality=85)
 
     def write(self, scenes: Table, objects: Table) -> list[str]:
         """Write the tables; return notes about what could not be written."""

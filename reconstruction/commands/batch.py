@@ -15,11 +15,13 @@ if TYPE_CHECKING:
     from reconstruction.batch.rows import VideoRow
     from registry import SceneRegistry
 
+_SHOWN_OPTIONS = 100  # characters in the table of --dry-run
+
 _DESCRIPTION = """Reconstruct every video of a folder or of a list, several at once. Each video runs
 `simrecon reconstruct` in its own process. A journal on the disk records every start and end: after Ctrl-C, a crash or
-a power cut, the same command does what is missing, and finished stages are not done again. A video that ended is run again
-only if its options or its files changed. Tables of all figures and a page with all scenes are written beside the
-journal."""
+a power cut, the same command does what is missing, and finished stages are not done again. A video that ended is run
+again only if its options or its files changed. Tables of all figures and a page with all scenes are written beside
+the journal."""
 
 _EPILOG = """a folder: each video in it, and each folder of images in it; scene ids come from the file names.
 a list: CSV with a row for each video. Only `path` is needed; paths count from the list's folder:
@@ -282,7 +284,9 @@ def _print_plan(steps: "list[Step]", listing: "Listing", journal: "Journal") -> 
         said += [f"scale {row.scale}"] if row.scale else []
         said += [f"overrides {row.overrides.name}"] if row.overrides else []
         does = f"run ({step.reason})" if step.runs else f"keep ({step.reason})"
-        print(f"{row.scene_id:<{width}}  {does:<24} {plain(row.video.name)}  {plain(' '.join(said))}")
+        told = plain(" ".join(said))
+        told = told if len(told) <= _SHOWN_OPTIONS else f"{told[: _SHOWN_OPTIONS - 1]}…"
+        print(f"{row.scene_id:<{width}}  {does:<24} {plain(row.video.name)}  {told}")
     runs = [step for step in steps if step.runs]
     print(f"{len(steps)} videos: {len(runs)} would run, {len(steps) - len(runs)} would not")
     if listing.left_out:
