@@ -189,7 +189,7 @@ def measure(options: argparse.Namespace, home: Path) -> dict[str, Any]:
     chance = random.Random(options.seed)
     with Killer(options.kill_every, options.seed) as killer:
         for _ in range(options.driver_kills):
-            code, _ = run_batch(
+            code = run_batch(
                 films, home, arguments, kill_after_s=chance.uniform(0.5, 1.5) * options.driver_life
             )
             drivers += code == -signal.SIGKILL
