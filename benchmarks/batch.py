@@ -194,9 +194,7 @@ def measure(options: argparse.Namespace, home: Path) -> dict[str, Any]:
             )
             drivers += code == -signal.SIGKILL
         code = run_batch(films, home, arguments)
-        if (
-            code == 4
-        ):  # a video was killed more often than it is retried: the machine's fault, so it runs again
+        if code == 4:  # a video was killed more often than it is retried
             code = run_batch(films, home, arguments)
     seconds = time.monotonic() - began
     found = judge(home, expected)

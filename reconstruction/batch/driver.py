@@ -27,7 +27,8 @@ class Policy:
     """When an attempt is repeated."""
 
     retries: int = 3  # further attempts after a transient failure
-    pause_s: float = 5.0  # before the second attempt; doubled for each further one
+    pause_s: float = 2.0  # before the second attempt; doubled for each further one,
+    longest_pause_s: float = 60.0  # up to this
 
 
 @dataclass(frozen=True)
@@ -203,7 +204,7 @@ class Driver:
             self._waiting.append((0.0, task))
             return "interrupted", ""
         if outcome.transient and task.job.attempt <= self._policy.retries:
-            pause = self._policy.pause_s * 2 ** (task.job.attempt - 1)
+            pause = min(self._policy.pause_s * 2 ** (task.job.attempt - 1), self._policy.longest_pause_s)
             avoid = task.job.avoid
             if outcome.kind in MACHINE and outcome.node:
                 avoid = (*avoid, outcome.node)
