@@ -14,7 +14,7 @@ from typing import Protocol
 from reconstruction.batch.attempt import Job
 from reconstruction.batch.engines import Engine
 from reconstruction.batch.journal import Journal
-from reconstruction.batch.outcomes import MACHINE, Outcome
+from reconstruction.batch.outcomes import MACHINE, Outcome, plain
 from registry import SceneRegistry
 from registry.errors import SimReconError
 
@@ -166,7 +166,8 @@ class Driver:
 
     def _end(self, job: Job, outcome: Outcome) -> None:
         task = self._running.pop(job.scene_id)
-        result, revision = self._result(task, outcome)
+        outcome, revision = self._checked(task, outcome)
+        result = self._result(task, outcome)
         self._journal.append(
             "ended",
             scene=job.scene_id,
@@ -194,15 +195,24 @@ class Driver:
         self._display.ended(job, outcome, result, self._counts)
         self._on_end()
 
-    def _result(self, task: Task, outcome: Outcome) -> tuple[str, str]:
-        """Return (result, revision); a transient failure is queued again."""
+    def _checked(self, task: Task, outcome: Outcome) -> tuple[Outcome, str]:
+        """Return (outcome, revision): published only if the registry has the scene."""
+        if outcome.kind != "published":
+            return outcome, ""
+        try:
+            return outcome, self._registry.get(task.job.scene_id).revision
+        except SimReconError as error:
+            cause = f"the run ended well, but {plain(str(error))}"
+            cure = "Check that --registry is the same folder on every machine."
+            return replace(outcome, kind="bug", cause=cause, cure=cure), ""
+
+    def _result(self, task: Task, outcome: Outcome) -> str:
+        """Return the result for the journal; a transient failure is queued again."""
         if outcome.kind == "published":
-            with contextlib.suppress(SimReconError):
-                return "published", self._registry.get(task.job.scene_id).revision
-            return "failed", ""
+            return "published"
         if outcome.kind == "interrupted" or (outcome.transient and self._stopping):
             self._waiting.append((0.0, task))
-            return "interrupted", ""
+            return "interrupted"
         if outcome.transient and task.job.attempt <= self._policy.retries:
             pause = min(self._policy.pause_s * 2 ** (task.job.attempt - 1), self._policy.longest_pause_s)
             avoid = task.job.avoid
@@ -210,8 +220,8 @@ class Driver:
                 avoid = (*avoid, outcome.node)
             again = replace(task.job, attempt=task.job.attempt + 1, avoid=avoid)
             self._waiting.insert(0, (time.monotonic() + pause, replace(task, job=again)))
-            return "retry", ""
-        return "failed", ""
+            return "retry"
+        return "failed"
 
     def _watch_machine(self, outcome: Outcome, result: str) -> None:
         if result == "published" or outcome.kind in ("video", "usage"):

@@ -5,6 +5,8 @@ from typing import Any
 from reconstruction.costs import cost_rows
 from registry import SceneBundle
 
+_OF_OBJECTS = ("objects", "fixed")  # parts of the report card with a row for each object
+
 
 def scene_figures(bundle: SceneBundle) -> dict[str, Any]:
     """Return every single figure of a bundle's report card, and of its scale, counts, source and costs.
@@ -26,7 +28,8 @@ def scene_figures(bundle: SceneBundle) -> dict[str, Any]:
     }
     for name in ("width", "height", "fps", "frame_count", "duration_s", "sha256"):
         found[f"source_{name}"] = scene["source"].get(name)
-    found |= _flat(report.get("physics", {}))
+    physics = report.get("physics", {})
+    found |= _flat({key: value for key, value in physics.items() if key not in _OF_OBJECTS})
     rows = cost_rows(report)
     found["time_s"] = sum(row.wall_s for row in rows)
     found["cpu_s"] = sum(row.cpu_s or 0.0 for row in rows) if any(row.cpu_s for row in rows) else None
