@@ -41,7 +41,7 @@ CHEAP = (
 )
 """The cheapest options of the real pipeline that still give a scene."""
 _BROKEN = ("not_a_video", "empty", "cut_before_index", "black")
-_WORKERS = ("reconstruction.batch.child", "ray::_run_on_node")
+_WORKERS = ("reconstruction.batch.child", "ray::simrecon")
 
 
 def make_films(folder: Path, videos: int, real: int) -> dict[str, str]:
