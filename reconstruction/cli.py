@@ -29,6 +29,7 @@ _AGAIN = "run the same command again: it resumes after the last finished stage"
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all verbs."""
     from reconstruction.commands import (
+        batch,
         benchmark,
         check,
         doctor,
@@ -55,6 +56,7 @@ def build_parser() -> argparse.ArgumentParser:
     for module in (
         check,
         reconstruct,
+        batch,
         scenes,
         registry_verbs,
         studio,
