@@ -1,8 +1,9 @@
 """Arguments that several verbs share, and the error of an output folder that cannot be written."""
 
 import argparse
+import math
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -35,6 +36,39 @@ def add_common(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
     parser.add_argument("--verbose", action="store_true", help="log the decisions of each stage")
     if json:
         parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
+
+
+SEEDS = (0, 2**32 - 1)
+
+
+def whole_number(low: int, high: int = 10**9) -> Callable[[str], int]:
+    """Return the `type` of an argument that is a whole number from `low` to `high`."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = None
+        if value is None or not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text[:80]!r} is not a whole number from {low} to {high}")
+        return value
+
+    return parse
+
+
+def number(low: float, high: float) -> Callable[[str], float]:
+    """Return the `type` of an argument that is a finite number from `low` to `high`."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text[:80]!r} is not a number from {low:g} to {high:g}")
+        return value
+
+    return parse
 
 
 @contextmanager
