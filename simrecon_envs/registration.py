@@ -76,7 +76,7 @@ def register_default_scenes() -> list[str]:
                                      disable_env_checker=True, order_enforce=False)  # fmt: skip
     try:
         return register_scenes()
-    except SimReconError as error:
+    except (SimReconError, RuntimeError) as error:  # RuntimeError: this user has no home folder
         warnings.warn(f"simrecon_envs: no scene was registered: {error}", RuntimeWarning, stacklevel=3)
         return []
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from registry.errors import EnvironmentMissing
+from registry.files import write_whole
 
 
 def add_verb(
@@ -72,11 +73,29 @@ def number(low: float, high: float) -> Callable[[str], float]:
 
 
 @contextmanager
-def output_errors() -> Iterator[None]:
+def output_errors(out: Path | None = None) -> Iterator[None]:
     """Turn an `OSError` from writing pictures into an `EnvironmentMissing` that names --out."""
     try:
         yield
     except OSError as error:
         raise EnvironmentMissing(
-            f"cannot write {error.filename}: {error.strerror}; choose another --out"
+            f"cannot write {error.filename or out or 'the output'}: {error.strerror}; choose another --out"
+        ) from error
+
+
+def write_output(path: Path, text: str, flag: str) -> None:
+    """Write a text file that the user named with `flag`: whole or not at all, unless it is a device or a pipe.
+
+    Raises:
+        EnvironmentMissing: it cannot be written.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            with path.open("w", encoding="utf-8", errors="backslashreplace") as stream:
+                stream.write(text)
+        else:
+            write_whole(path, text.encode("utf-8", "backslashreplace"))
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"{flag} {path}: cannot be written: {error.strerror}; nothing was written. Choose another place with {flag}"
         ) from error
