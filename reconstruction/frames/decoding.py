@@ -13,6 +13,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,8 @@ from reconstruction.phone_exports.exports import natural
 from registry.errors import EnvironmentMissing, InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-_PICTURE_FORMATS = (
-    "JPEG",
-    "MPO",
-    "PNG",
-    "WEBP",
-    "GIF",
-    "BMP",
-)  # by content: others run programs, or unpack far
+# By content, not by name: other formats run programs (EPS), or unpack far.
+_PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "GIF", "BMP")
 _FOCAL_35MM_KEYS = ("com.apple.quicktime.camera.focal_length.35mm_equivalent", "focal_length_35mm")
 _DIAGONAL_35MM = 43.2666  # of a 36 x 24 mm frame, mm
 _MOST_PIXELS = 64_000_000  # of a video frame, or of an image that is decoded whole
@@ -290,7 +285,7 @@ class ImageFolder:
 
         size = working_size(self.width, self.height, max_side_px)
         try:
-            with _without_warnings(), Image.open(self.files[number], formats=_PICTURE_FORMATS) as image:
+            with _without_warnings(), Image.open(self.files[number], formats=_picture_formats()) as image:
                 # JPEG can be decoded at reduced resolution.
                 image.draft("RGB", (2 * max(size), 2 * max(size)))
                 array = np.asarray(_to_rgb(ImageOps.exif_transpose(image)))
@@ -350,6 +345,15 @@ def _to_rgb(image):
     return image.convert("RGB")
 
 
+@cache
+def _picture_formats() -> tuple[str, ...]:
+    """Return the formats that this build of Pillow opens."""
+    from PIL import Image
+
+    Image.init()
+    return tuple(name for name in _PICTURE_FORMATS if name in Image.OPEN)
+
+
 def printable(name: str) -> str:
     """Return a file name with escapes in place of bytes that are not UTF-8, and of control characters."""
     text = name.encode("utf-8", "backslashreplace").decode()
@@ -369,7 +373,7 @@ def _read_header(path: Path) -> tuple[int, int, float] | str:
     from PIL import Image
 
     try:
-        with _without_warnings(), Image.open(path, formats=_PICTURE_FORMATS) as image:
+        with _without_warnings(), Image.open(path, formats=_picture_formats()) as image:
             width, height = image.size
             most = _MOST_JPEG_PIXELS if image.format in ("JPEG", "MPO") else _MOST_PIXELS
             if width * height > most:

@@ -113,7 +113,12 @@ def _is_zip(path: Path) -> bool:
 
 def _names_in(path: Path) -> list[str]:
     """List the relevant files of a folder; exports also hold thousands of depth maps."""
-    names = [f.name for f in path.iterdir() if f.is_file()]
+    try:
+        names = [f.name for f in path.iterdir() if f.is_file()]
+    except PermissionError as error:
+        raise EnvironmentMissing(
+            f"{path}: {error.strerror}. Make the folder readable (chmod u+rx) and run again."
+        ) from error
     for folder in ("rgb", "rgbd", *(f"keyframes/{x}" for x in _POLYCAM_FOLDERS)):
         if (path / folder).is_dir():
             names += [f"{folder}/{f.name}" for f in (path / folder).iterdir() if f.is_file()]
