@@ -291,17 +291,16 @@ class SceneEnv(BaseEnv):
                 closed.
         """
         self._require_open()
-        action = as_action(self, action)
-        numbers = isinstance(action, (np.ndarray, torch.Tensor))
+        given: Any = as_action(self, action)
+        numbers = isinstance(given, (np.ndarray, torch.Tensor))
         if self.gpu_sim_enabled:
             if numbers:
-                check_action(self, action)
-            return super().step(action)
+                check_action(self, given)
+            return super().step(given)
         stepper = self._stepper
         if stepper is None or not stepper.current:
             stepper = self._stepper = DirectStep(self)
-        action = stepper.simulate(action) if numbers else super()._step_action(action)
-        return stepper.outcome(action)
+        return stepper.outcome(stepper.simulate(given) if numbers else super()._step_action(given))
 
     def _clear_sim_state(self) -> None:
         if not self.gpu_sim_enabled:

@@ -68,10 +68,10 @@ def read_text_map(value: Any, where: str) -> dict[str, str]:
     }
 
 
-def _value(hint: Any, value: Any, where: str, negative: bool) -> Any:
+def _value(hint: Any, found: Any, where: str, negative: bool) -> Any:
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in typing.get_args(hint):
+        if found is None and type(None) in typing.get_args(hint):
             return None
         hint = next(one for one in typing.get_args(hint) if one is not type(None))
         origin = typing.get_origin(hint)
@@ -79,8 +79,9 @@ def _value(hint: Any, value: Any, where: str, negative: bool) -> Any:
         inner = typing.get_args(hint)[0]
         return tuple(
             _value(inner, one, f"{where}[{number}]", negative)
-            for number, one in enumerate(read_list(value, where))
+            for number, one in enumerate(read_list(found, where))
         )
+    value: Any = found
     kind = origin or hint
     if kind not in _NAMES:
         return read_record(kind, value, where)

@@ -151,7 +151,7 @@ class PolicySpec:
         """
         said = getattr(self._maker(), "policy_warning", None)
         try:
-            return [said(**self.arguments)] if callable(said) else []
+            return [str(said(**self.arguments))] if callable(said) else []
         except _ENDINGS as error:
             _fail(f"policy {self.name}: its policy_warning", error)
 
