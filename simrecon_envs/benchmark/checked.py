@@ -93,7 +93,7 @@ def _value(hint: Any, found: Any, where: str, negative: bool) -> Any:
             least = "" if negative else ", at least 0"
             raise ValueError(f"{where}: expected {_NAMES[kind]}{least}, found {_short(value)}")
         return kind(value)
-    if kind is str and (len(value) > _LONGEST_TEXT or not value.replace("\n", "").isprintable()):
+    if isinstance(value, str) and (len(value) > _LONGEST_TEXT or not value.replace("\n", "").isprintable()):
         raise ValueError(f"{where}: expected printable text, found {_short(value)}")
     return value
 
