@@ -1,6 +1,7 @@
 """The `simrecon` command: runs a verb, and reports expected errors as one message and an exit code."""
 
 import argparse
+import errno
 import logging
 import os
 import sys
@@ -84,6 +85,25 @@ def _version() -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line (default: `sys.argv`); return the exit code."""
+    from reconstruction.commands.streams import tolerant_streams
+
+    with tolerant_streams() as out:
+        code = _run(sys.argv[1:] if argv is None else list(argv))
+        out.flush()
+        if out.loss:
+            return _fail(
+                "", f"the output could not be written ({out.loss}); the work itself is not affected", 4
+            )
+    return code
+
+
+def _run(argv: list[str]) -> int:
+    for text in argv:
+        if not _is_utf8(text):
+            shown = text.encode("utf-8", "backslashreplace").decode()
+            return _fail(
+                "", f"the argument {shown!r} is not UTF-8. Rename the file or folder, and run again.", 2
+            )
     arguments = build_parser().parse_args(argv)
     level = logging.INFO if getattr(arguments, "verbose", False) else logging.WARNING
     logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
@@ -94,15 +114,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             raise
         return _fail(arguments.verb, str(error), error.exit_code)
-    except BrokenPipeError:  # the reader of a pipe has closed it
-        sys.stderr.close()
-        return 0
     except OSError as error:
         if debug or error.errno is None:
             raise
-        where = f" ({error.filename})" if error.filename else ""
-        advice = f"Check disk space and permissions, then {_AGAIN}."
-        return _fail(arguments.verb, f"{error.strerror}{where}. {advice}", 4)
+        return _fail(arguments.verb, describe_os_error(error), 4)
+    except RuntimeError as error:
+        if debug or "home directory" not in str(error):  # of `Path.home` and `Path.expanduser`
+            raise
+        advice = "Set HOME or SIMRECON_HOME to a folder, or give --registry DIR."
+        return _fail(arguments.verb, f"this user has no home folder ({error}). {advice}", 4)
     except MemoryError:
         return _fail(arguments.verb, "out of memory. Close other programs, or use --preset fast.", 4)
     except KeyboardInterrupt:
@@ -110,8 +130,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
+def describe_os_error(error: OSError) -> str:
+    """Return the message for an error of the file system: cause, file, and what to do."""
+    names = [str(name) for name in (error.filename, error.filename2) if name is not None]
+    where = f" ({' and '.join(names)})" if names else ""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        advice = f"Free some space on that disk, then {_AGAIN}."
+    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        advice = "Fix the permissions, or choose another place."
+    elif error.errno in (errno.EMFILE, errno.ENFILE):
+        advice = "Raise the limit of open files (ulimit -n)."
+    else:
+        advice = f"Check the file and its disk, then {_AGAIN}."
+    return f"{error.strerror}{where}. {advice}"
+
+
+def _is_utf8(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def _fail(verb: str, message: str, exit_code: int) -> int:
-    print(f"simrecon {verb}: {plain(message, lines=True)}", file=sys.stderr)
+    print(f"simrecon{f' {verb}' if verb else ''}: {plain(message, lines=True)}", file=sys.stderr)
     return exit_code
 
 

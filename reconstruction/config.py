@@ -20,6 +20,7 @@ from reconstruction.frames import FRAMES_PRESETS, FramesConfig
 from reconstruction.gaussians.config import GAUSSIANS_PRESETS, GaussiansConfig
 from reconstruction.instances import INSTANCES_PRESETS, InstancesConfig
 from reconstruction.poses import POSES_PRESETS, PosesConfig
+from reconstruction.ranges import check_ranges, numeric_options, range_of
 from reconstruction.scene_graph import SCENE_GRAPH_PRESETS, SceneGraphConfig
 from reconstruction.surface import SURFACE_PRESETS, SurfaceConfig
 from reconstruction.views.config import AVO_PRESETS, AvoConfig
@@ -45,6 +46,14 @@ class PipelineConfig:
     assets: AssetsConfig = field(default_factory=AssetsConfig)
     scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
     assembly: AssemblyConfig = field(default_factory=AssemblyConfig)
+
+    def __post_init__(self) -> None:
+        """Check all numbers.
+
+        Raises:
+            UsageError: a number is not finite or out of its range.
+        """
+        check_ranges(self)
 
     @classmethod
     def from_preset(cls, name: str) -> "PipelineConfig":
@@ -82,7 +91,7 @@ class PipelineConfig:
         """Return a copy with one option changed, given as `stage.field=value`.
 
         Raises:
-            UsageError: there is no such stage, option or backend, or the value cannot be parsed.
+            UsageError: there is no such stage, option or backend, or the value cannot be parsed or is out of range.
         """
         path, equals, value = text.partition("=")
         stage, dot, name = path.strip().partition(".")
@@ -105,7 +114,10 @@ class PipelineConfig:
             raise UsageError(f"--set {text}: {error}") from error
         if built_in_names(type(config), name):
             find_plugin(f"{stage}.{name}", getattr(changed, name), type(config))
-        return dataclasses.replace(self, **{stage: changed})
+        try:
+            return dataclasses.replace(self, **{stage: changed})
+        except UsageError as error:
+            raise UsageError(f"--set {text}: {error}") from error
 
     def plugins(self) -> list[Plugin]:
         """Return the backends of other packages that the options name.
@@ -138,21 +150,30 @@ def _parse(hint: Any, text: str) -> Any:
         if text.lower() not in ("true", "false"):
             raise ValueError(f"{text!r} is neither true nor false")
         return text.lower() == "true"
-    if hint in (int, float, str, Path):
+    if hint in (int, float):
+        try:
+            return hint(text)
+        except ValueError:
+            kind = "a whole number" if hint is int else "a number"
+            raise ValueError(f"{text[:80]!r} is not {kind}") from None
+    if hint in (str, Path):
         return hint(text)
     raise ValueError(f"options of type {hint} cannot be set from the command line")
 
 
 def describe_options() -> str:
-    """Return a text with every option, its default and its meaning."""
+    """Return a text with every option, its default, its meaning, and the range of a number."""
     lines = []
     for stage in dataclasses.fields(PipelineConfig):
         config = getattr(PipelineConfig(), stage.name)
         docs = _field_docs(type(config))
+        numbers = dict(numeric_options(stage.name, config))
         lines.append(f"{stage.name}:")
         for item in dataclasses.fields(config):
             text = " ".join(docs.get(item.name, "").split())
-            lines.append(f"  {stage.name}.{item.name}={getattr(config, item.name)}  {text}")
+            option = f"{stage.name}.{item.name}"
+            limits = f" ({range_of(option)})" if option in numbers else ""
+            lines.append(f"  {option}={getattr(config, item.name)}  {text}{limits}")
     return "\n".join(lines)
 
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reconstruction.cache import StageStore, digest_input, fingerprint
+from reconstruction.cache import DamagedResult, StageStore, digest_input, fingerprint
 from reconstruction.code_digest import code_digest, tree_digest
 from reconstruction.config import PipelineConfig
 from reconstruction.core.compiling import compilation_shown
@@ -122,28 +122,54 @@ class Run:
         number = STAGE_NAMES.index(stage.name) + 1  # prefix of its folder
         corrections = self.overrides.fingerprint_of_stage(stage.name)
         key = self.keys[stage.name] = self.key_of(stage, corrections)
-        kept = self.store.has(number, stage.name, key)
-        self.listener.begin_stage(stage.name, wanted.index(stage.name) + 1, len(wanted), kept)
-        if not kept:
+        kept, damage = self._find(number, stage, key)
+        self.listener.begin_stage(stage.name, wanted.index(stage.name) + 1, len(wanted), kept is not None)
+        if damage:
+            self.listener.note(f"{damage}; computing this stage again")
+        if kept is None:
             with compilation_shown(self.listener) as shown:
                 if corrections:
                     self._keep_corrected(number, stage, key, shown)
                 else:
                     self._keep(number, stage, key, lambda noted: self._compute(stage, noted), shown)
             self.computed.add(stage.name)
-        manifest = self.store.manifest(number, stage.name, key)
         # Load also what was just computed: a resumed run continues with the same values.
-        self.results[stage.name] = self.store.load(stage.produces, number, stage.name, key)
-        self.usage[stage.name] = Usage(**manifest["usage"])
+        found = kept or self._read(number, stage, key)
+        self.results[stage.name], self.usage[stage.name] = found.value, found.usage
         self.notes.extend(
-            note if note.startswith(f"{stage.name}:") else f"{stage.name}: {note}"
-            for note in manifest["notes"]
+            note if note.startswith(f"{stage.name}:") else f"{stage.name}: {note}" for note in found.notes
         )
         if stage.name == "world":
             self._note_coordinates()
         self.listener.end_stage(stage.name, None if kept else self.usage[stage.name])
         if self.after_stage is not None:
             self.after_stage(self, stage.name)
+
+    def _find(self, number: int, stage: Stage, key: str) -> "tuple[_Kept | None, str]":
+        """Return a result of the cache, None if there is none, and how it was damaged; a damaged one is removed."""
+        if not self.store.has(number, stage.name, key):
+            return None, ""
+        try:
+            self.store.check(number, stage.name, key)
+            return self._read(number, stage, key), ""
+        except DamagedResult as error:
+            logger.info("%s", error)
+            self.store.remove(number, stage.name, key)
+            return None, str(error)
+
+    def _read(self, number: int, stage: Stage, key: str) -> "_Kept":
+        """Load a result and its record.
+
+        Raises:
+            DamagedResult: it cannot be read.
+        """
+        record = self.store.manifest(number, stage.name, key)
+        try:
+            usage = Usage(**{name: float(value) for name, value in record["usage"].items()})
+            notes = [str(note) for note in record["notes"]]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise DamagedResult(f"{stage.name}-{key}: its manifest is not as it was written") from error
+        return _Kept(self.store.load(stage.produces, number, stage.name, key), usage, notes)
 
     def key_of(self, stage: Stage, corrections: list) -> str:
         """Return the fingerprint of a stage with these corrections."""
@@ -168,13 +194,13 @@ class Run:
         key: str,
         make: Callable[[Progress], Any],
         shown: Progress,
-        before: dict | None = None,
+        before: "_Kept | None" = None,
     ) -> None:
-        """Compute and save a result; `before`: manifest of the uncorrected result that it is computed from."""
-        notes = list(before["notes"]) if before and stage.name not in _REDONE else []
+        """Compute and save a result; `before`: the uncorrected result that it is computed from."""
+        notes = list(before.notes) if before and stage.name not in _REDONE else []
         with UsageMeter() as meter:
             result = make(_NoteTaker(shown, notes))
-        usage = meter.usage if before is None else Usage(**before["usage"]).followed_by(meter.usage)
+        usage = meter.usage if before is None else before.usage.followed_by(meter.usage)
         config = self.options_of(stage)
         record = {"stage": stage.name, "key": key, "usage": asdict(usage), "notes": notes, "config": config}
         self.store.save(result, number, stage.name, key, record)
@@ -184,10 +210,13 @@ class Run:
         from reconstruction.editing.corrections import corrected
 
         plain_key = self.key_of(stage, [])
-        if not self.store.has(number, stage.name, plain_key):
+        before, damage = self._find(number, stage, plain_key)
+        if damage:
+            self.listener.note(f"{damage}; computing this stage again")
+        if before is None:
             self._keep(number, stage, plain_key, lambda noted: self._compute(stage, noted), shown)
-        plain = self.store.load(stage.produces, number, stage.name, plain_key)
-        before = self.store.manifest(number, stage.name, plain_key)
+            before = self._read(number, stage, plain_key)
+        plain = before.value
 
         def make(progress: Progress) -> Any:
             if stage.name == "world":
@@ -228,6 +257,15 @@ class Run:
             return stage.make(call)
         finally:
             self.store.discard(scratch)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A result of the stage cache."""
+
+    value: Any
+    usage: Usage
+    notes: list[str]
 
 
 class _NoteTaker:

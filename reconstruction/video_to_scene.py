@@ -13,6 +13,7 @@ from reconstruction.config import PipelineConfig
 from reconstruction.core.progress import NO_PROGRESS, StageListener
 from reconstruction.core.types import ObjectAsset
 from reconstruction.editing.overrides import Overrides
+from reconstruction.frames.load import check_input
 from reconstruction.made_by import note_made_by
 from reconstruction.publish import publish_scene
 from reconstruction.runner import Run
@@ -77,8 +78,8 @@ def reconstruct(
     """
     started = time.perf_counter()
     video = Path(video)
-    if not video.exists():
-        raise UsageError(f"{video}: no such file or folder")
+    check_input(video)
+    _check_names(video, registry_root, work_dir)
     config = config or PipelineConfig()
     _check_backends(config)
     registry = SceneRegistry(registry_root, create=True)
@@ -110,6 +111,18 @@ def reconstruct(
         run.store.note_published(scene_id, record.revision, run.keys)
         note_made_by(folder, scene_id, video, run.overrides.file)
     return Reconstruction(record, run)
+
+
+def _check_names(*paths: Path | str | None) -> None:
+    """Raise now, not when the scene is published, if a path cannot be written into a bundle."""
+    for path in paths:
+        try:
+            str(path or "").encode()
+        except UnicodeEncodeError:
+            shown = str(path).encode("utf-8", "backslashreplace").decode()
+            raise UsageError(
+                f"{shown}: this name is not UTF-8. Rename the file or folder, and run again"
+            ) from None
 
 
 def _after(also: Callable[[Run, str], None] | None) -> Callable[[Run, str], None]:

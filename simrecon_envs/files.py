@@ -9,6 +9,7 @@ from typing import Any
 from registry import EnvironmentMissing, UsageError
 from registry.files import write_whole
 
+_MOST_BYTES = 1 << 30
 PACKAGES = ("simrecon", "mani_skill", "sapien", "gymnasium", "torch", "numpy")
 
 
@@ -24,17 +25,39 @@ def read_json(path: Path, what: str, schema: str) -> dict[str, Any]:
         UsageError: The file is absent, not JSON, or of another schema.
     """
     try:
-        body = json.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as stream:
+            data = stream.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise ValueError(f"it is larger than {_MOST_BYTES >> 20} MB")
+        body = json.loads(data.decode("utf-8-sig"), parse_constant=_no_number, object_pairs_hook=_unique)
     except FileNotFoundError:
         raise UsageError(f"{what} {path}: there is no such file") from None
     except OSError as error:
         raise UsageError(f"{what} {path}: cannot be read ({error.strerror})") from error
+    except RecursionError:
+        raise UsageError(f"{what} {path}: this is no JSON: it is nested too deeply") from None
     except ValueError as error:
         raise UsageError(f"{what} {path}: this is no JSON: {error}") from error
     found = body.get("schema") if isinstance(body, dict) else type(body).__name__
     if found != schema:
-        raise UsageError(f"{what} {path}: expected the schema {schema!r}, found {found!r}")
+        raise UsageError(
+            f"{what} {path}: expected the schema {schema!r}, found {str(found)[:80]!r}; if another version of simrecon "
+            "wrote it, make it again with this one"
+        )
     return body
+
+
+def _no_number(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the pairs of a JSON object as a dict. Raises ValueError where a key comes twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)[:80]!r} comes twice")
+    return found
 
 
 def write_json(path: Path, value: Any) -> None:

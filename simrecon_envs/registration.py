@@ -15,7 +15,7 @@ import gymnasium as gym
 from gymnasium.envs import registration as gym_registration
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
-from registry import SceneRegistry, SimReconError, default_registry_root
+from registry import SceneRegistry, SimReconError, UsageError, default_registry_root
 from registry.errors import did_you_mean
 from simrecon_envs.errors import EnvNotFound
 
@@ -76,7 +76,7 @@ def register_default_scenes() -> list[str]:
                                      disable_env_checker=True, order_enforce=False)  # fmt: skip
     try:
         return register_scenes()
-    except SimReconError as error:
+    except (SimReconError, RuntimeError) as error:  # RuntimeError: this user has no home folder
         warnings.warn(f"simrecon_envs: no scene was registered: {error}", RuntimeWarning, stacklevel=3)
         return []
 
@@ -91,7 +91,11 @@ def make(scene: str, *, registry: Path | str | None = None, **kwargs: Any) -> gy
 
     Raises:
         EnvNotFound: The scene does not exist; names the closest and the existing ones.
+        UsageError: An argument has a wrong value; names it.
     """
+    steps = kwargs.get("max_episode_steps", 1)
+    if steps is not None and (isinstance(steps, bool) or not hasattr(steps, "__index__") or steps < 1):
+        raise UsageError(f"max_episode_steps {steps!r}: expected a whole number, at least 1")
     name = env_id(scene)
     match = _TASK_ID.fullmatch(name)
     row = env_id(match["scene"]) if match is not None else name

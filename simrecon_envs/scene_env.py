@@ -17,12 +17,14 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
-from registry import EnvironmentMissing
+from registry import EnvironmentMissing, UsageError
 from simrecon_envs.arrays import Array, tensor, tensors
 from simrecon_envs.backends import choose_render_backend
 from simrecon_envs.cameras import room_view
 from simrecon_envs.cpu_env import DirectDrive
 from simrecon_envs.measures import Measures
+from simrecon_envs.option_values import check_arguments, check_names, check_noise
+from simrecon_envs.option_values import task_config as parse_task_config
 from simrecon_envs.physics_reset import renew_physics
 from simrecon_envs.placement import Target
 from simrecon_envs.planning import Plan, plan_task
@@ -30,7 +32,7 @@ from simrecon_envs.randomization import Randomization, Randomizer
 from simrecon_envs.robots import rest_qpos, robot_shape, traits_of
 from simrecon_envs.scene_builder import SceneBuilder, scene_extent
 from simrecon_envs.scene_options import REWARD_MODES, check_options, check_renderer, load_bundle
-from simrecon_envs.stepping import DirectStep, check_action, flatten
+from simrecon_envs.stepping import DirectStep, as_action, check_action, flatten
 from simrecon_envs.tasks import PickTaskConfig, Task, kind_of
 from simrecon_envs.tasks.facts import scene_facts
 from simrecon_envs.viewpoints import camera, observing_cameras, parse_cameras
@@ -111,6 +113,7 @@ class SceneEnv(BaseEnv):
     """
 
     measures: Measures  # created with the scene
+    _closed = False
     SUPPORTED_ROBOTS: Any = None  # all robots of ManiSkill with installed files; see `robots.usable_robots`
     SUPPORTED_OBS_MODES = ("state", "state_dict", "none", "sensor_data", "any_textures", "pointcloud")
     SUPPORTED_REWARD_MODES = REWARD_MODES
@@ -136,14 +139,16 @@ class SceneEnv(BaseEnv):
         renderer: str = "mesh",
         **kwargs: Any,
     ) -> None:
+        check_names(task=task, target=target, cameras=cameras, obs_mode=obs_mode, render_mode=render_mode,
+                    render_backend=render_backend, revision=revision)  # fmt: skip
+        check_arguments(kwargs)
         check_options(scene_id, robot_uids, obs_mode, kwargs)
         check_renderer(renderer, obs_mode)
         self.bundle, self.revision_note = load_bundle(scene_id, revision, registry, strict_revision)
         self.scene_id = scene_id
-        config = PickTaskConfig(**task_config) if isinstance(task_config, dict) else task_config
-        self.task_config: PickTaskConfig = config or PickTaskConfig()
-        shift, turn = pose_noise if isinstance(pose_noise, Sequence | np.ndarray) else (pose_noise, 0.0)
-        self.pose_noise = (shift, turn)
+        self.task_config: PickTaskConfig = parse_task_config(task_config)
+        self.pose_noise = check_noise(pose_noise)
+        self.randomization = Randomization.parse(randomize)
         self.facts = scene_facts(self.bundle, robot_uids)
         self.builder = SceneBuilder(self.bundle, scene_extent(self.facts.solids))
         self.movable_ids = tuple(body.root for body in self.builder.bodies if body.dynamic)
@@ -160,7 +165,6 @@ class SceneEnv(BaseEnv):
             self._splats = read_splats(self.bundle, self.builder.bodies, self.facts.solids)
         self._stepper: DirectStep | None = None
         self._info: dict[str, Array] = {}
-        self.randomization = Randomization.parse(randomize)
         self._randomizer = Randomizer(self, self.randomization)
         super().__init__(
             obs_mode=obs_mode,
@@ -264,26 +268,39 @@ class SceneEnv(BaseEnv):
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
         """Reset as in ManiSkill; also seed Gymnasium's generator, as its checker expects."""
+        self._require_open()
         if seed is not None:
             gym.Env.reset(self, seed=int(np.ravel(seed)[0]))
         return super().reset(seed=seed, options=options)
 
-    def step(self, action: np.ndarray | torch.Tensor | dict | None) -> tuple:
+    def close(self) -> None:
+        """Close the simulator; a second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            super().close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise UsageError(f"scene {self.scene_id}: the environment is closed; make it again with gym.make")
+
+    def step(self, action: "np.ndarray | torch.Tensor | Sequence[float] | dict | None") -> tuple:
         """Step as in ManiSkill; controllers that normalize actions clip them to [-1, 1].
 
         Raises:
-            UsageError: The action does not have the shape of the action space, or is not finite.
+            UsageError: The action does not have the shape of the action space, or is not finite; or the environment is
+                closed.
         """
-        numbers = isinstance(action, (np.ndarray, torch.Tensor))
+        self._require_open()
+        given: Any = as_action(self, action)
+        numbers = isinstance(given, (np.ndarray, torch.Tensor))
         if self.gpu_sim_enabled:
             if numbers:
-                check_action(self, action)
-            return super().step(action)
+                check_action(self, given)
+            return super().step(given)
         stepper = self._stepper
         if stepper is None or not stepper.current:
             stepper = self._stepper = DirectStep(self)
-        action = stepper.simulate(action) if numbers else super()._step_action(action)
-        return stepper.outcome(action)
+        return stepper.outcome(stepper.simulate(given) if numbers else super()._step_action(given))
 
     def _clear_sim_state(self) -> None:
         if not self.gpu_sim_enabled:

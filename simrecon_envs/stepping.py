@@ -119,6 +119,30 @@ class DirectStep:
         return torch.from_numpy(np.concatenate(rows, dtype=np.float32)[None])
 
 
+def as_action(env: Any, action: Any) -> Any:
+    """Return an action as an array if it is a list or tuple of numbers; arrays, tensors, dicts and None as they are.
+
+    Raises:
+        UsageError: It is something else.
+    """
+    if action is None or isinstance(action, np.ndarray | torch.Tensor | dict):
+        if isinstance(action, np.ndarray) and action.dtype.kind not in "fiub":
+            raise UsageError(f"action: expected numbers{_shape_of(env)}, got an array of {action.dtype}")
+        return action
+    try:
+        if not isinstance(action, list | tuple):
+            raise TypeError
+        return np.asarray(action, np.float32)
+    except (TypeError, ValueError, OverflowError):
+        raise UsageError(
+            f"action: expected an array of numbers{_shape_of(env)}, got {str(action)[:60]!r}"
+        ) from None
+
+
+def _shape_of(env: Any) -> str:
+    return "" if env.agent is None else f" of the shape {env._orig_single_action_space.shape}"
+
+
 def check_action(env: Any, action: np.ndarray | torch.Tensor) -> None:
     """Check an action for the robot of a `SceneEnv`.
 

@@ -9,6 +9,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
+from registry import UsageError
+from simrecon_envs.stepping import as_action
 from simrecon_envs.unwrapped import scene_of
 
 
@@ -20,12 +22,19 @@ class BatchedTimeLimit(gym.Wrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: gym.Env) -> None:
-        """Wrap an environment from `gym.make`; without a `TimeLimit` there is no limit."""
+        """Wrap an environment from `gym.make`.
+
+        Raises:
+            UsageError: It has no `TimeLimit`, as with `max_episode_steps=-1`.
+        """
         RecordConstructorArgs.__init__(self)
-        self._max_episode_steps: int | None = None
-        if isinstance(env, gym.wrappers.TimeLimit):
-            self._max_episode_steps = env._max_episode_steps
-            env = env.env
+        if not isinstance(env, gym.wrappers.TimeLimit):
+            env.close()
+            raise UsageError(
+                "max_episode_steps -1: expected a whole number, at least 1; a large one, such as 10**9, is no limit"
+            )
+        self._max_episode_steps: int = env._max_episode_steps
+        env = env.env
         gym.Wrapper.__init__(self, env)
         self._base = scene_of(env)
 
@@ -43,7 +52,7 @@ class BatchedTimeLimit(gym.Wrapper, RecordConstructorArgs):
         obs, reward, terminated, truncated, info = self.env.step(action)
         limit, base = self._max_episode_steps, self._base
         # For one environment, avoid tensors until the limit is reached: they cost more than the rest.
-        if limit is not None and (base.num_envs > 1 or base.steps_done() >= limit):
+        if base.num_envs > 1 or base.steps_done() >= limit:
             truncated = truncated | (base.elapsed_steps >= limit)
         return obs, reward, terminated, truncated, info
 
@@ -63,7 +72,9 @@ class NumpyEnv(CPUGymWrapper, RecordConstructorArgs):
         CPUGymWrapper.__init__(self, env, ignore_terminations, record_metrics)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        """Step with an unbatched NumPy action."""
+        """Step with an unbatched NumPy action, or a list of numbers."""
+        if not isinstance(action, np.ndarray):
+            action = as_action(scene_of(self), action)
         obs, reward, terminated, truncated, info = super().step(action)
         return obs, float(np.asarray(reward)), bool(terminated), bool(truncated), cast("dict[str, Any]", info)
 

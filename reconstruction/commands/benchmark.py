@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from reconstruction.commands.environments import run_by_name
-from reconstruction.commands.options import add_common, add_verb
+from reconstruction.commands.options import SEEDS, add_common, add_verb, number, whole_number
 
 _RUNNER = "simrecon_envs.benchmark.command"
 
@@ -67,12 +67,24 @@ def _add_generate(parts: argparse._SubParsersAction) -> None:
     add(
         "--robots", type=_words, default=("panda", "fetch"), help="separated by commas (default: panda,fetch)"
     )
-    add("--per-scene", type=int, default=30, metavar="N", help="most tasks of a scene (default: 30)")
-    add("--seeds", type=int, default=5, metavar="N", help="number of episodes of a task (default: 5)")
-    add("--seed", type=int, default=0, help="seed of the episodes' seeds (default: 0)")
+    add(
+        "--per-scene",
+        type=whole_number(1),
+        default=30,
+        metavar="N",
+        help="most tasks of a scene (default: 30)",
+    )
+    add(
+        "--seeds",
+        type=whole_number(1, 1_000_000),
+        default=5,
+        metavar="N",
+        help="number of episodes of a task (default: 5)",
+    )
+    add("--seed", type=whole_number(*SEEDS), default=0, help="seed of the episodes' seeds (default: 0)")
     add(
         "--test-share",
-        type=float,
+        type=number(0, 1),
         default=0.2,
         metavar="SHARE",
         help="share of scenes and objects in the test split, by the hashes of their names (default: 0.2)",
@@ -109,11 +121,18 @@ def _add_run(parts: argparse._SubParsersAction) -> None:
         help="keyword argument; may be repeated",
     )
     _add_choice(parser)
+    add(
+        "--timeout",
+        type=number(0, 1e6),
+        default=600.0,
+        metavar="SECONDS",
+        help="longest time of one call of the policy, of its making too; 0: no limit (default: 600)",
+    )
     add("--out", type=Path, metavar="FILE", help="output file, for example results.json")
     add("--videos", type=Path, metavar="DIR", help="write a video of the first episode of each task")
     add(
         "--fresh-seeds",
-        type=int,
+        type=whole_number(0, 1_000_000),
         default=0,
         metavar="N",
         help="run N episodes of each task from seeds that are not in the suite, instead of its own",
@@ -164,7 +183,12 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
     add("--tasks", default="*", metavar="GLOB", help="names, for example '*-push_*', separated by commas")
     add("--kinds", type=_words, default=(), help="only these kinds, separated by commas")
     add("--robots", type=_words, default=(), help="only these robots, separated by commas")
-    add("--episodes", type=int, metavar="N", help="maximum number of episodes of a task (default: all)")
+    add(
+        "--episodes",
+        type=whole_number(1),
+        metavar="N",
+        help="maximum number of episodes of a task (default: all)",
+    )
     add(
         "--fetch-from",
         metavar="PLACE",
@@ -204,7 +228,9 @@ def _add_demo_flags(parser: argparse.ArgumentParser, long: bool = False) -> None
 
 def _add_work(parser: argparse.ArgumentParser, jobs: bool = True) -> None:
     if jobs:
-        parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+        parser.add_argument(
+            "--jobs", type=whole_number(1, 10_000), default=1, metavar="N", help="processes (default: 1)"
+        )
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     add_common(parser)
 

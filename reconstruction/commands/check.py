@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from reconstruction.commands.options import add_verb
+from reconstruction.commands.options import add_verb, write_output
 
 _DESCRIPTION = """Check VIDEO before anything else: sharpness, texture, overlap, parallax, exposure,
 directions in view, floor, marker, length. One line of verdict for each, and one of advice where something is wrong."""
@@ -54,5 +54,5 @@ def run(arguments: argparse.Namespace) -> int:
     if page is not None:
         from reconstruction.precheck.page import check_page
 
-        page.write_text(check_page(report), encoding="utf-8")
+        write_output(page, check_page(report), "--page")
     return 1 if report.fails else 0

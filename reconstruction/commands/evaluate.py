@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from reconstruction.commands.options import add_common, add_scene, add_verb
+from reconstruction.commands.options import add_common, add_scene, add_verb, write_output
 from reconstruction.commands.truth import add_ground_truth, split_truth
 
 _DESCRIPTION = """Compare SCENE with the ground truth: cameras, geometry, objects, relations, images, physics, and the
@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     print(as_table(evaluation))
     if arguments.json:
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+        write_output(arguments.json, text + "\n", "--json")
         print(f"\nwritten to {arguments.json}")
     return 0
 

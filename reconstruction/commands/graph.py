@@ -33,7 +33,7 @@ def show_graph(arguments: argparse.Namespace, bundle: SceneBundle, registry_root
     if missing:
         print(f"only graphs are drawn, without views: {missing}", file=sys.stderr)
     folder = arguments.out or Path(f"{arguments.scene}_graph")
-    with output_errors():
+    with output_errors(folder):
         files = write_graph_steps(graph["steps"], names, views, folder)
     if arguments.json:
         print(json.dumps({"edges": graph["edges"], "files": [str(f) for f in files]}, indent=2))

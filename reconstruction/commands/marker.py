@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from reconstruction.commands.options import add_verb
+from reconstruction.commands.options import add_verb, number, whole_number
 
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
@@ -17,9 +17,15 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="marker.pdf or marker.png")
     parser.add_argument(
-        "--size", type=float, default=0.15, metavar="METRES", help="side of the black square (default 0.15)"
+        "--size",
+        type=number(0.001, 5),
+        default=0.15,
+        metavar="METRES",
+        help="side of the black square (default 0.15)",
     )
-    parser.add_argument("--id", type=int, default=0, metavar="N", help="number of the marker (default 0)")
+    parser.add_argument(
+        "--id", type=whole_number(0), default=0, metavar="N", help="number of the marker (default 0)"
+    )
     parser.add_argument("--verbose", action="store_true", help="log what is decided")
     parser.set_defaults(run=run)
 

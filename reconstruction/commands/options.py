@@ -1,12 +1,14 @@
 """Arguments that several verbs share, and the error of an output folder that cannot be written."""
 
 import argparse
+import math
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from registry.errors import EnvironmentMissing
+from registry.files import write_whole
 
 
 def add_verb(
@@ -37,12 +39,63 @@ def add_common(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
         parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
 
 
+SEEDS = (0, 2**32 - 1)
+
+
+def whole_number(low: int, high: int = 10**9) -> Callable[[str], int]:
+    """Return the `type` of an argument that is a whole number from `low` to `high`."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = None
+        if value is None or not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text[:80]!r} is not a whole number from {low} to {high}")
+        return value
+
+    return parse
+
+
+def number(low: float, high: float) -> Callable[[str], float]:
+    """Return the `type` of an argument that is a finite number from `low` to `high`."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text[:80]!r} is not a number from {low:g} to {high:g}")
+        return value
+
+    return parse
+
+
 @contextmanager
-def output_errors() -> Iterator[None]:
+def output_errors(out: Path | None = None) -> Iterator[None]:
     """Turn an `OSError` from writing pictures into an `EnvironmentMissing` that names --out."""
     try:
         yield
     except OSError as error:
         raise EnvironmentMissing(
-            f"cannot write {error.filename}: {error.strerror}; choose another --out"
+            f"cannot write {error.filename or out or 'the output'}: {error.strerror}; choose another --out"
+        ) from error
+
+
+def write_output(path: Path, text: str, flag: str) -> None:
+    """Write a text file that the user named with `flag`: whole or not at all, unless it is a device or a pipe.
+
+    Raises:
+        EnvironmentMissing: it cannot be written.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            with path.open("w", encoding="utf-8", errors="backslashreplace") as stream:
+                stream.write(text)
+        else:
+            write_whole(path, text.encode("utf-8", "backslashreplace"))
+    except OSError as error:
+        raise EnvironmentMissing(
+            f"{flag} {path}: cannot be written: {error.strerror}; nothing was written. Choose another place with {flag}"
         ) from error

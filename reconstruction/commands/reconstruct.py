@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reconstruction.commands.options import add_common, add_verb
+from reconstruction.commands.options import SEEDS, add_common, add_verb, number, whole_number
 
 if TYPE_CHECKING:
     from reconstruction.config import PipelineConfig
@@ -53,7 +53,13 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     )
     add("--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)")
     add("--work-dir", type=Path, metavar="DIR", help="folder of the stage cache")
-    add("--keep-results", type=int, default=2, metavar="N", help="cached results of each stage (default 2)")
+    add(
+        "--keep-results",
+        type=whole_number(1),
+        default=2,
+        metavar="N",
+        help="cached results of each stage (default 2)",
+    )
     add("--preset", choices=("fast", "default", "quality"), default="default")
     add(
         "--device",
@@ -62,7 +68,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         help="device for fitting Gaussians: cuda needs gsplat; auto uses cuda if it is available (default)",
     )
     add("--scale", metavar="HOW", help="source of the metric scale; see below")
-    add("--marker-size", type=float, metavar="METRES", help="side of a printed marker in view")
+    add("--marker-size", type=number(0.001, 5), metavar="METRES", help="side of a printed marker in view")
     add(
         "--poses",
         type=Path,
@@ -76,7 +82,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         metavar="FILE",
         help="your corrections (YAML): relabel, merge, split or drop objects; see docs/overrides.md",
     )
-    add("--seed", type=int, default=0, help="seed of all random numbers (default 0)")
+    add("--seed", type=whole_number(*SEEDS), default=0, help="seed of all random numbers (default 0)")
     add("--set", action="append", default=[], metavar="STAGE.FIELD=VALUE", help="set any option")
     add("--list-options", action="store_true", help="print all options for --set and exit")
     add("--require-stable", action="store_true", help="do not publish a scene with a moving object")
@@ -109,8 +115,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("no video is given. Give a file or a folder of images: simrecon reconstruct VIDEO")
     if not arguments.video.exists():
         raise UsageError(f"{arguments.video}: no such file or folder")
-    if arguments.keep_results < 1:
-        raise UsageError(f"--keep-results {arguments.keep_results}: it must be at least 1")
     from reconstruction.commands.reporting import make_listener
     from reconstruction.editing.overrides import Overrides
     from reconstruction.video_to_scene import reconstruct

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from reconstruction.commands.options import add_common, add_scene, add_verb
+from reconstruction.commands.options import add_common, add_scene, add_verb, write_output
 from reconstruction.commands.truth import add_ground_truth, split_truth
 
 
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
             bundle, stages, ground_truth, evaluation, labels=labels, room_page=room_page, progress=listener
         )
         listener.end_stage("report", None)
-    out.write_text(page, encoding="utf-8")
+    write_output(out, page, "--out")
     for reason, names in by_reason(stages.missing).items():
         print(f"left out: {', '.join(names)}: {reason}")
     print(f"{out} ({out.stat().st_size / 1e6:.1f} MB)")

@@ -6,7 +6,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from reconstruction.commands.options import add_common, add_scene, add_verb, output_errors
+from reconstruction.commands.options import add_common, add_scene, add_verb, output_errors, write_output
 from registry import SceneBundle, SceneRecord, SceneRegistry
 from registry.errors import UsageError
 from registry.plain_text import plain
@@ -157,11 +157,11 @@ def _show_instances(arguments: argparse.Namespace, bundle: SceneBundle) -> int:
     sheet = ContactSheet.of(bundle)
     folder = arguments.out or Path(f"{arguments.scene}_instances")
     template = arguments.overrides_template
-    with output_errors():
+    with output_errors(folder):
         if template is not None:
             if template.exists():
                 raise UsageError(f"{template} exists; it may hold your corrections and is not overwritten")
-            template.write_text(overrides_template(sheet), encoding="utf-8")
+            write_output(template, overrides_template(sheet), "--overrides-template")
         files = write_contact_sheets(sheet, folder)
     if arguments.json:
         keys = ("label", "label_confidence", "scale", "anchor")

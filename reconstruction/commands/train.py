@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from reconstruction.commands.environments import run_by_name
-from reconstruction.commands.options import add_common, add_verb
+from reconstruction.commands.options import SEEDS, add_common, add_verb, whole_number
 
 _DESCRIPTION = """Train a policy for a task in SCENE by reinforcement learning (stable-baselines3), on the CPU, with one
 process for each environment. The trained policy is evaluated on unseen seeds and recorded on video. One folder holds
@@ -44,9 +44,19 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         metavar="MODE",
         help="controller of the robot (default: auto: pd_ee_delta_pos, displacements of the hand, if available)",
     )
-    add("--steps", type=int, metavar="N", help="steps of all environments (default: ppo 50000, sac 30000)")
-    add("--envs", type=int, metavar="N", help="environments, one process each (default: cores, at most 8)")
-    add("--seed", type=int, metavar="N", help="seed of all random numbers (default: 0)")
+    add(
+        "--steps",
+        type=whole_number(1, 10**12),
+        metavar="N",
+        help="steps of all environments (default: ppo 50000, sac 30000)",
+    )
+    add(
+        "--envs",
+        type=whole_number(1, 10_000),
+        metavar="N",
+        help="environments, one process each (default: cores, at most 8)",
+    )
+    add("--seed", type=whole_number(*SEEDS), metavar="N", help="seed of all random numbers (default: 0)")
     add(
         "--randomize",
         metavar="WHAT",
@@ -55,7 +65,12 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="hyperparameter; may be repeated")
     add("--list-settings", action="store_true", help="show --algo's hyperparameters and exit")
     add("--device", help="device of the network: cpu or cuda (default: cpu)")
-    add("--eval-episodes", type=int, metavar="N", help="episodes of the evaluation; 0: none (default: 100)")
+    add(
+        "--eval-episodes",
+        type=whole_number(0),
+        metavar="N",
+        help="episodes of the evaluation; 0: none (default: 100)",
+    )
     add("--no-video", action="store_true", help="do not record a video of the policy")
     add("--out", type=Path, metavar="DIR", help="folder of the run (default: new in $SIMRECON_HOME/runs)")
     add("--resume", action="store_true", help="continue the run in --out, or the last of this task")

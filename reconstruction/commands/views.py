@@ -50,7 +50,7 @@ def show_views(arguments: argparse.Namespace, bundle: SceneBundle, registry_root
     views = run.results[stage.name]
     names = {item["id"]: item["label"] for item in bundle.scene["objects"]}
     folder = arguments.out or Path(f"{arguments.scene}_views")
-    with output_errors():
+    with output_errors(folder):
         files = write_view_sheets(views, names, folder)
     if arguments.json:
         print(

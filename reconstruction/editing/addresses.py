@@ -4,6 +4,7 @@ Ids change with settings, world coordinates change with the scale. A frame numbe
 every reconstruction of a film, so that clicks suit files that are kept. See docs/overrides.md.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,19 +89,21 @@ def parse_parts(values: Any, where: str) -> list[list[Address]]:
 
 def vector(value: Any, where: str) -> tuple[float, float, float]:
     """Parse three finite numbers."""
-    try:
-        numbers = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        numbers = np.zeros(0)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+    listed = value.tolist() if isinstance(value, np.ndarray) else value
+    if not isinstance(listed, list | tuple) or len(listed) != 3 or not all(map(is_number, listed)):
         raise UsageError(f"{where} must be three numbers, got {value!r}")
-    x, y, z = numbers.tolist()
+    x, y, z = map(float, listed)
     return x, y, z
 
 
 def is_number(value: Any) -> bool:
     """Return whether a value is a finite number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number of more than 308 digits
+        return False
 
 
 def _click(value: Any, where: str) -> Address:
@@ -110,7 +113,7 @@ def _click(value: Any, where: str) -> Address:
         or not {"frame", "x", "y"} <= set(value) <= {"frame", "x", "y", "size"}
         or not all(is_number(value[k]) for k in ("frame", "x", "y"))
         or value["frame"] != int(value["frame"])
-        or not (size is None or (isinstance(size, list) and len(size) == 2 and all(map(is_number, size))))
+        or not (size is None or _is_size(size))
     ):
         raise UsageError(
             f"{where}: pixel needs {{frame: N, x: X, y: Y}}, the video's frame number and a pixel in it "
@@ -119,3 +122,11 @@ def _click(value: Any, where: str) -> Address:
     pixel = float(value["x"]), float(value["y"])
     in_size = (int(size[0]), int(size[1])) if size else None
     return Address("pixel", frame=int(value["frame"]), pixel=pixel, size=in_size)
+
+
+def _is_size(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(is_number(side) and 1 <= side <= 1e6 for side in value)
+    )

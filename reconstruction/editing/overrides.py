@@ -12,12 +12,15 @@ from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.editing.addresses import parse_address
 from reconstruction.editing.entries import check_entry, part_of_stage
 from reconstruction.editing.scene_entries import SCENE_KEYS, SceneEntries, parse_scene_entries
+from reconstruction.editing.strict_yaml import read_yaml
 from registry.errors import UsageError
 
 if TYPE_CHECKING:
     from reconstruction.config import PipelineConfig
     from reconstruction.core.types import AssetSet, InstanceSet, SceneGraph
     from reconstruction.editing.anchors import Pointer
+
+_LONGEST_MESSAGE = 700
 
 
 @dataclass(frozen=True)
@@ -35,24 +38,26 @@ class Overrides:
         Raises:
             UsageError: the file is missing or malformed; the message names the entry and what is allowed.
         """
-        import yaml
-
         try:
-            entries = yaml.safe_load(path.read_text())
+            entries = read_yaml(path)
         except OSError as error:
             raise UsageError(f"--overrides {path}: {error.strerror or error}") from error
-        except yaml.YAMLError as error:
-            raise UsageError(f"--overrides {path}: not valid YAML: {error}") from error
+        except ValueError as error:
+            raise UsageError(f"--overrides {path}: {error}") from error
         if entries is None:
             entries = []
         if not isinstance(entries, list):
             raise UsageError(
                 f"--overrides {path}: expected a list of entries such as `- {{id: 3, relabel: mug}}`"
             )
-        for number, entry in enumerate(entries, start=1):
-            check_entry(entry, f"--overrides {path}: entry {number}")
         loaded = cls(entries, path.resolve().parent, path)
-        parse_scene_entries(loaded.of_stage("world"), f"--overrides {path}")
+        try:
+            for number, entry in enumerate(entries, start=1):
+                check_entry(entry, f"--overrides {path}: entry {number}")
+                _check_mesh(entry, loaded.folder, f"--overrides {path}: entry {number}")
+            parse_scene_entries(loaded.of_stage("world"), f"--overrides {path}")
+        except UsageError as error:
+            raise UsageError(_shortened(str(error))) from error
         return loaded
 
     def of_stage(self, stage: str) -> list[dict]:
@@ -166,3 +171,20 @@ def _has_world_coordinates(value: Any) -> bool:
         or bool({"at", "near"} & set(value))
         or any(map(_has_world_coordinates, value.values()))
     )
+
+
+def _check_mesh(entry: dict, folder: Path, where: str) -> None:
+    """Raise UsageError if the mesh of an entry is no file."""
+    if "mesh" not in entry:
+        return
+    path = folder / entry["mesh"]
+    if "\0" in entry["mesh"] or not path.is_file():
+        raise UsageError(
+            f"{where}: mesh: there is no file {path}; paths are relative to the folder of this file"
+        )
+
+
+def _shortened(message: str) -> str:
+    """Cut out the middle of a message that quotes a long value."""
+    half = _LONGEST_MESSAGE // 2
+    return message if len(message) <= _LONGEST_MESSAGE else f"{message[:half]} ... {message[-half:]}"

@@ -4,12 +4,18 @@ Videos are streamed: `VideoReader.frames` yields decoded frames one by one, and 
 conversion, so that memory holds only the selected images at working resolution.
 """
 
+import contextlib
 import hashlib
+import os
 import re
+import struct
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,8 +25,17 @@ from reconstruction.phone_exports.exports import natural
 from registry.errors import EnvironmentMissing, InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+# By content, not by name: other formats run programs (EPS), or unpack far.
+_PICTURE_FORMATS = ("JPEG", "PNG", "WEBP", "GIF", "BMP")
 _FOCAL_35MM_KEYS = ("com.apple.quicktime.camera.focal_length.35mm_equivalent", "focal_length_35mm")
 _DIAGONAL_35MM = 43.2666  # of a 36 x 24 mm frame, mm
+_MOST_PIXELS = 64_000_000  # of a video frame, or of an image that is decoded whole
+_MOST_JPEG_PIXELS = 178_000_000  # JPEG is decoded at reduced size; Pillow opens no more
+_PLAYLIST_HEADS = {  # by their first bytes; ffmpeg would open the files and addresses that such a file names
+    b"ffconcat": "a list of videos (ffconcat)", b"#EXTM3U": "a playlist (M3U)", b"[playlist]": "a playlist (PLS)",
+    b"<SMIL": "a playlist (SMIL)", b"<?xml": "an XML file", b"<MPD": "a playlist (DASH)", b"v=0": "a session (SDP)",
+}  # fmt: skip
+_PLAYLIST_FORMATS = ("concat", "hls", "dash", "sdp", "imf", "webm_dash_manifest")
 _EXIF_IFD, _EXIF_FOCAL_35MM = 0x8769, 0xA405
 
 
@@ -63,6 +78,7 @@ class VideoReader:
         """Read the headers; raise `InputError` if this is not a video."""
         if self.path.stat().st_size == 0:
             raise InputError(f"frames: {self.path} is empty (0 bytes). Copy or record the video again.")
+        self._refuse_playlist()
         with self._open() as container:
             stream = self._stream(container)
             self.announced_frames = int(stream.frames or 0)
@@ -71,6 +87,19 @@ class VideoReader:
                 value = container.metadata.get(key) or stream.metadata.get(key)
                 if value and re.fullmatch(r"\d+(\.\d+)?", value.strip()):
                     self.focal_35mm = float(value)
+
+    def _refuse_playlist(self) -> None:
+        try:
+            with self.path.open("rb") as stream:
+                head = stream.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+        except PermissionError:
+            return  # `_open` says so
+        for start, kind in _PLAYLIST_HEADS.items():
+            if head.startswith(start):
+                raise InputError(
+                    f"frames: {self.path} is {kind}, which only names other files. Give the video itself; "
+                    "ffmpeg can join several: ffmpeg -f concat -i LIST -c copy joined.mp4"
+                )
 
     def _open(self):
         import av.error
@@ -95,6 +124,18 @@ class VideoReader:
         for stream in container.streams.video:
             cover = bool(stream.disposition & Disposition.attached_pic)
             if not cover and container.format.name != "tty":  # ffmpeg decodes text files as terminal art
+                if container.format.name in _PLAYLIST_FORMATS:
+                    raise InputError(
+                        f"frames: {self.path} is a playlist ({container.format.name}), which only names other files. "
+                        "Give the video itself."
+                    )
+                if stream.width * stream.height > _MOST_PIXELS:
+                    raise InputError(
+                        f"frames: {self.path} has frames of {stream.width}x{stream.height} pixels; at most "
+                        f"{_MOST_PIXELS // 1_000_000} megapixels can be read. Scale it down first."
+                    )
+                # Frames may grow later on.
+                stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
                 # Multi-threaded by slices and frames; the order of frames stays.
                 stream.thread_type = "AUTO"
                 return stream
@@ -206,28 +247,24 @@ class ImageFolder:
 
     def __post_init__(self) -> None:
         """List the images and read their headers; keep those with the aspect ratio of the most common size."""
-        found = [p for p in self.path.iterdir() if p.is_file() and not p.name.startswith(".")]
-        files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES]
-        files.sort(key=lambda p: natural(p.name))
-        if not files:
-            others = sorted({p.suffix.lower() or "(none)" for p in found})
-            raise InputError(
-                f"frames: no jpg or png image in the folder {self.path}"
-                + (f" (it holds {', '.join(others[:6])} files)" if others else " (it is empty)")
-                + ". Give a folder of jpg or png images, or a video file."
-            )
+        files = list_images(self.path)
         sizes, focals = {}, []
         for path in files:
             header = _read_header(path)
-            if header is None:
-                self.notes.append(f"{path.name} is not a readable image: left out")
+            if isinstance(header, str):
+                self.notes.append(f"{printable(path.name)} {header}: left out")
                 continue
             sizes[path] = header[:2]
             if header[2] > 0:
                 focals.append(header[2])
         if not sizes:
+            if all("permission" in note for note in self.notes):
+                raise EnvironmentMissing(
+                    f"frames: permission denied to read the {len(files)} images in {self.path}. Make them readable "
+                    "(chmod u+r) and run again."
+                )
             raise InputError(
-                f"frames: none of {len(files)} images in {self.path} can be read. Copy them again."
+                f"frames: none of {len(files)} images in {self.path} can be read: {self.notes[0]}. Copy them again."
             )
         counts = Counter(sizes.values())
         self.width, self.height = max(counts, key=lambda size: (counts[size], size))
@@ -237,7 +274,7 @@ class ImageFolder:
                 self.files.append(path)
             else:
                 shapes = f"{size[0]}x{size[1]}, most are {self.width}x{self.height}"
-                self.notes.append(f"{path.name} is {shapes}: left out (another shape)")
+                self.notes.append(f"{printable(path.name)} is {shapes}: left out (another shape)")
         resized = sum(sizes[p] != (self.width, self.height) for p in self.files)
         if resized:
             self.notes.append(f"{resized} images of other sizes are resized to {self.width}x{self.height}")
@@ -248,12 +285,12 @@ class ImageFolder:
 
         size = working_size(self.width, self.height, max_side_px)
         try:
-            with Image.open(self.files[number]) as image:
+            with _without_warnings(), Image.open(self.files[number], formats=_picture_formats()) as image:
                 # JPEG can be decoded at reduced resolution.
                 image.draft("RGB", (2 * max(size), 2 * max(size)))
                 array = np.asarray(_to_rgb(ImageOps.exif_transpose(image)))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            self.notes.append(f"{self.files[number].name} is damaged ({error}): left out")
+            self.notes.append(f"{printable(self.files[number].name)} is damaged ({error}): left out")
             return None
         shrinks = size[0] < array.shape[1]
         return cv2.resize(array, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
@@ -262,13 +299,37 @@ class ImageFolder:
         """Return the SHA-256 of the names and contents of all images used."""
         digest = hashlib.sha256()
         for path in self.files:
-            digest.update(path.name.encode() + b"\0" + bytes.fromhex(file_sha256(path)))
+            digest.update(os.fsencode(path.name) + b"\0" + bytes.fromhex(file_sha256(path)))
         return digest.hexdigest()
 
     def focal_prior_px(self, max_side_px: int) -> float:
         """Return the focal length in pixels at working size, 0 where unknown."""
         width, height = working_size(self.width, self.height, max_side_px)
         return self.focal_35mm / _DIAGONAL_35MM * float(np.hypot(width, height))
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Return the jpg and png files in a folder, in natural name order.
+
+    Raises:
+        InputError: there are none.
+        EnvironmentMissing: the folder may not be read.
+    """
+    try:
+        found = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
+    except PermissionError as error:
+        raise EnvironmentMissing(
+            f"frames: permission denied to read the folder {folder}. Make it readable (chmod u+rx) and run again."
+        ) from error
+    files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not files:
+        others = sorted({p.suffix.lower() or "(none)" for p in found})
+        raise InputError(
+            f"frames: no jpg or png image in the folder {folder}"
+            + (f" (it holds {', '.join(others[:6])} files)" if others else " (it is empty)")
+            + ". Give a folder of jpg or png images, or a video file."
+        )
+    return sorted(files, key=lambda p: natural(p.name))
 
 
 def _to_rgb(image):
@@ -284,16 +345,50 @@ def _to_rgb(image):
     return image.convert("RGB")
 
 
-def _read_header(path: Path) -> tuple[int, int, float] | None:
-    """Return upright width, height and 35 mm equivalent focal length (0: unknown); None if this is no image."""
+@cache
+def _picture_formats() -> tuple[str, ...]:
+    """Return the formats that this build of Pillow opens."""
+    from PIL import Image
+
+    Image.init()
+    return tuple(name for name in _PICTURE_FORMATS if name in Image.OPEN)
+
+
+def printable(name: str) -> str:
+    """Return a file name with escapes in place of bytes that are not UTF-8, and of control characters."""
+    text = name.encode("utf-8", "backslashreplace").decode()
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Silence Pillow's warnings: `_read_header` has checked the size of an image, and its metadata may be odd."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _read_header(path: Path) -> tuple[int, int, float] | str:
+    """Return upright width, height and 35 mm equivalent focal length (0: unknown), or why the image is left out."""
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with _without_warnings(), Image.open(path, formats=_picture_formats()) as image:
             width, height = image.size
+            most = _MOST_JPEG_PIXELS if image.format in ("JPEG", "MPO") else _MOST_PIXELS
+            if width * height > most:
+                return f"has {width}x{height} pixels, more than {most // 1_000_000} megapixels"
             exif = image.getexif()
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None
+            return _upright_size(width, height, exif)
+    except PermissionError:
+        return "may not be read (permission denied)"
+    except Image.DecompressionBombError:
+        return f"has more than {_MOST_JPEG_PIXELS // 1_000_000} megapixels"
+    except (OSError, ValueError, SyntaxError, TypeError, LookupError, ArithmeticError, struct.error):
+        return "is not a readable image"
+
+
+def _upright_size(width: int, height: int, exif: Any) -> tuple[int, int, float]:
     if exif.get(0x0112, 1) in (5, 6, 7, 8):  # orientations that swap width and height
         width, height = height, width
     focal = exif.get_ifd(_EXIF_IFD).get(_EXIF_FOCAL_35MM, 0) or 0

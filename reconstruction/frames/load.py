@@ -16,7 +16,7 @@ import numpy as np
 from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.core.types import FrameSet, VideoSource
 from reconstruction.frames.config import HELD_OUT_EVERY, FramesConfig
-from reconstruction.frames.decoding import ImageFolder, VideoReader, file_sha256, working_size
+from reconstruction.frames.decoding import ImageFolder, VideoReader, file_sha256, list_images, working_size
 from reconstruction.frames.keyframes import (
     ANALYSIS_SIDE_PX,
     FrameStats,
@@ -52,6 +52,23 @@ def load_frames(video: Path, config: FramesConfig, *, progress: Progress = NO_PR
     if export is not None:
         return _from_export(export, config, progress)
     return _from_folder(video, config, progress) if video.is_dir() else _from_video(video, config, progress)
+
+
+def check_input(video: Path) -> None:
+    """Check that a path can be an input, without reading it: a regular file, or a folder with images or an export.
+
+    Raises:
+        UsageError: there is nothing, or no file.
+        InputError: it is a folder without images.
+    """
+    if not video.exists():
+        raise UsageError(f"{video}: no such file or folder")
+    if not video.is_dir():
+        if not video.is_file():
+            raise UsageError(f"{video} is a device or a pipe; give a video file or a folder of images")
+        return
+    if find_export(video) is None:
+        list_images(video)
 
 
 # --- Videos -----------------------------------------------------------------------------------------------

@@ -5,12 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from reconstruction.core import artifacts
+from reconstruction.cache import DamagedResult, read_result
 from reconstruction.core.types import DepthMaps, PosedFrames, WorldFrame
 from reconstruction.gaussians import Gaussians
 from reconstruction.pipeline import STAGES
 from registry import SceneBundle
-from registry.errors import BundleError
 
 _MANIFEST = "manifest.json"
 
@@ -60,8 +59,8 @@ class StageResults:
         if stage not in self._loaded:
             kind = next(s.produces for s in STAGES if s.name == stage)
             try:
-                self._loaded[stage] = artifacts.load(kind, self.folders[stage])
-            except BundleError as error:
+                self._loaded[stage] = read_result(kind, self.folders[stage])
+            except DamagedResult as error:
                 self.missing[stage] = f"{error}; reconstruct the scene again to create it"
                 del self.folders[stage]
                 return None
@@ -88,6 +87,7 @@ def _latest_keys(folder: Path, bundle: SceneBundle) -> dict[str, str]:
     """Return the stage keys of the latest run that produced this revision, if the work folder has a record of it."""
     try:
         noted = json.loads((folder / f"published-{bundle.scene['id']}.json").read_text())
-    except (OSError, json.JSONDecodeError):
+        keys = noted["stage_keys"] if noted["revision"] == bundle.revision else {}
+        return {str(stage): str(key) for stage, key in keys.items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):  # none, or damaged
         return {}
-    return noted["stage_keys"] if noted.get("revision") == bundle.revision else {}

@@ -11,10 +11,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from registry.errors import InputError
+from reconstruction.phone_exports.archives import check_total, member_bytes, opened
+from registry.errors import EnvironmentMissing, InputError
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _ARCHIVES = (".r3d", ".zip")
+_MOST_JSON, _MOST_IMAGE = 32 << 20, 128 << 20  # bytes of a file
 
 
 @dataclass(frozen=True)
@@ -28,39 +30,61 @@ class Export:
     cameras: str  # folder of the camera files (Polycam), or the metadata file (Record3D)
 
     def read(self, name: str) -> bytes:
-        """Read a file. Raises `InputError` where that fails, as does `read_json`."""
+        """Read a file of at most 32 MB. Raises `InputError` where that fails, as does `read_json`."""
+        if not self.path.is_dir():
+            with opened(self.path) as archive:
+                return member_bytes(archive, self.path, self.root + name, _MOST_JSON)
         try:
-            if self.path.is_dir():
-                return (self.path / name).read_bytes()
-            with zipfile.ZipFile(self.path) as archive:
-                return archive.read(self.root + name)
-        except (KeyError, OSError, zipfile.BadZipFile) as error:
+            with (self.path / name).open("rb") as stream:
+                data = stream.read(_MOST_JSON + 1)
+        except PermissionError as error:
+            raise EnvironmentMissing(
+                f"poses: {self.path / name}: {error.strerror}. Make it readable (chmod u+r) and run again."
+            ) from error
+        except OSError as error:
             raise InputError(f"poses: {self.path} has no readable {name}: export it again") from error
+        if len(data) > _MOST_JSON:
+            raise InputError(f"poses: {self.path / name} is larger than {_MOST_JSON >> 20} MB")
+        return data
 
     def read_json(self, name: str) -> dict:
         """Read a JSON file."""
+        content = self.read(name)
         try:
-            return json.loads(self.read(name))
-        except ValueError as error:
+            data = json.loads(content)
+        except (ValueError, RecursionError) as error:
             raise InputError(f"poses: {name} in {self.path} is not JSON: export it again") from error
+        if not isinstance(data, dict):
+            raise InputError(f"poses: {name} in {self.path} is not a JSON object: export it again")
+        return data
 
     def unpack_images(self, folder: Path) -> Path:
         """Return a folder that holds the images: the export's own, or `folder`, to which those of a zip are written."""
         if self.path.is_dir():
             return (self.path / self.images[0]).parent
-        with zipfile.ZipFile(self.path) as archive:
+        with opened(self.path) as archive:
+            check_total(archive, self.path, [self.root + name for name in self.images])
             for name in self.images:
-                (folder / PurePosixPath(name).name).write_bytes(archive.read(self.root + name))
+                data = member_bytes(archive, self.path, self.root + name, _MOST_IMAGE)
+                (folder / PurePosixPath(name).name).write_bytes(data)
         return folder
 
 
 def find_export(path: Path) -> Export | None:
-    """Detect whether a path is an export; None where it is not."""
+    """Detect whether a path is an export; None where it is not.
+
+    Raises:
+        InputError: it is a damaged archive.
+    """
     if path.is_dir():
         names = _names_in(path)
-    elif path.is_file() and path.suffix.lower() in _ARCHIVES and zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            names = [name for name in archive.namelist() if not name.endswith("/")]
+    elif path.is_file() and path.suffix.lower() in _ARCHIVES:
+        if not _is_zip(path):
+            if path.suffix.lower() == ".r3d" and path.stat().st_size:
+                raise InputError(f"{path} is no recording of Record3D, or only a part of one: copy it again")
+            return None
+        with opened(path) as archive:
+            names = list(dict.fromkeys(name for name in archive.namelist() if not name.endswith("/")))
     else:
         return None
     for depth in (0, 1):  # the root, or a single folder around everything, as zips often have
@@ -72,9 +96,29 @@ def find_export(path: Path) -> Export | None:
     return None
 
 
+def _is_zip(path: Path) -> bool:
+    """Return whether a file is a zip; `zipfile.is_zipfile` says no to a file that may not be read, too.
+
+    Raises:
+        EnvironmentMissing: it may not be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return zipfile.is_zipfile(stream)
+    except PermissionError as error:
+        raise EnvironmentMissing(
+            f"{path}: {error.strerror}. Make it readable (chmod u+r) and run again."
+        ) from error
+
+
 def _names_in(path: Path) -> list[str]:
     """List the relevant files of a folder; exports also hold thousands of depth maps."""
-    names = [f.name for f in path.iterdir() if f.is_file()]
+    try:
+        names = [f.name for f in path.iterdir() if f.is_file()]
+    except PermissionError as error:
+        raise EnvironmentMissing(
+            f"{path}: {error.strerror}. Make the folder readable (chmod u+rx) and run again."
+        ) from error
     for folder in ("rgb", "rgbd", *(f"keyframes/{x}" for x in _POLYCAM_FOLDERS)):
         if (path / folder).is_dir():
             names += [f"{folder}/{f.name}" for f in (path / folder).iterdir() if f.is_file()]
@@ -105,7 +149,12 @@ def _match(path: Path, root: str, names: list[str]) -> Export | None:
 
 def natural(name: str) -> list:
     """Return the sort key of natural name order: img2 before img10."""
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in re.split(r"(\d+)", name.lower())]
+    parts = [(p, p.lstrip("0")) for p in re.split(r"([0-9]+)", name.lower())]
+    # Numbers compare by their length, then by their digits: without int, which has a limit of digits.
+    return [
+        (0, len(digits), digits) if part[:1] in tuple("0123456789") else (1, 0, part)
+        for part, digits in parts
+    ]
 
 
 def upright_turns(world_from_camera: np.ndarray) -> int:

@@ -5,7 +5,7 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from reconstruction.phone_exports.exports import Export, turned_camera, upright_turns
-from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, pinhole
+from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, check_numbers, pinhole
 from registry.errors import InputError
 
 _MAX_FOCAL_SPREAD = 0.03  # relative deviation from the median; autofocus causes less
@@ -54,7 +54,8 @@ def _read(export: Export) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[int,
             pose[:3] = [[float(data[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
             lenses.append([float(data[key]) for key in _LENS])
             size = (int(data["width"]), int(data["height"]))
-        except (KeyError, TypeError, ValueError) as error:
+            check_numbers(lenses[-1], *size, pose[None])
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             why = f"{type(error).__name__} {error}"
             raise InputError(f"poses: {file} in {export.path} is no Polycam camera ({why})") from error
         stored[name] = pose @ OPENGL_FROM_OPENCV

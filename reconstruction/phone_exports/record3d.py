@@ -3,7 +3,7 @@
 import numpy as np
 
 from reconstruction.phone_exports.exports import Export
-from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, pinhole
+from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, check_numbers, pinhole
 from registry.errors import InputError
 
 
@@ -16,14 +16,14 @@ def read_record3d(export: Export) -> NamedPoses:
     Raises:
         InputError: the metadata is malformed, or the camera does not move.
     """
-    from scipy.spatial.transform import Rotation
-
     data = export.read_json(export.cameras)
     try:
         rows = np.array(data["poses"], np.float64).reshape(-1, 7)
         lens = _lens(data)
         width, height = int(data["w"]), int(data["h"])
-    except (KeyError, TypeError, ValueError) as error:
+        poses = _matrices(rows)
+        check_numbers(lens, width, height, poses)
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         why = f"{type(error).__name__} {error}"
         raise InputError(
             f"poses: {export.cameras} in {export.path} is no Record3D metadata ({why})"
@@ -33,12 +33,25 @@ def read_record3d(export: Export) -> NamedPoses:
             f"poses: {export.path} has no camera motion: Record3D tracks only the rear (LiDAR) camera. Give the "
             "video alone, then the poses are estimated"
         )
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, :4]).as_matrix()  # x, y, z, w
-    poses[:, :3, 3] = rows[:, 4:]
-    numbers = {name: int(name.rsplit("/", 1)[-1].split(".")[0]) for name in export.images}
+    stems = {name: name.rsplit("/", 1)[-1].split(".")[0] for name in export.images}
+    numbers = {
+        name: int(stem)
+        for name, stem in stems.items()
+        if stem.isascii() and stem.isdigit() and len(stem) < 10
+    }
     named = [(name, poses[i] @ OPENGL_FROM_OPENCV) for name, i in numbers.items() if i < len(poses)]
     return NamedPoses(pinhole(*lens, width, height), named, metric=True, roll_unknown=True)
+
+
+def _matrices(rows: np.ndarray) -> np.ndarray:
+    """Return the poses (n, 4, 4) of rows (n, 7): quaternion x, y, z, w and position."""
+    from scipy.spatial.transform import Rotation
+
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if len(rows):
+        poses[:, :3, :3] = Rotation.from_quat(rows[:, :4]).as_matrix()
+        poses[:, :3, 3] = rows[:, 4:]
+    return poses
 
 
 def _lens(data: dict) -> tuple[float, float, float, float]:

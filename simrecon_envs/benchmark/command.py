@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
@@ -70,7 +71,11 @@ def run(arguments: argparse.Namespace) -> int:
         any_revision=arguments.any_revision,
         videos=absolute(arguments.videos),
         registry=absolute(arguments.registry),
+        timeout_s=arguments.timeout or None,
     )
+    policy = PolicySpec(arguments.policy, _pairs(arguments.policy_option, "--policy-option"))
+    for warning in policy.warnings():
+        print(f"warning: {warning}", file=sys.stderr)
     if arguments.videos is not None:
         from simrecon_envs.backends import choose_render_backend
 
@@ -80,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     results = run_suite(
         suite,
         tasks,
-        PolicySpec(arguments.policy, _pairs(arguments.policy_option, "--policy-option")),
+        policy,
         settings,
         jobs=arguments.jobs,
         records=records,

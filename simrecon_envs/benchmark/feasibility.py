@@ -96,7 +96,7 @@ def _prove(env: gym.Env, candidate: Candidate, settings: ProofSettings) -> Proof
     for run in runs:
         if run_episode(env, still, run.seed).success:
             return Proof(reason=f"doing nothing solves it (seed {run.seed})")
-    oracle = tuple(OracleRun(seed=r.seed, steps=r.steps, path_m=round(r.path_m, 4)) for r in runs)
+    oracle = tuple(OracleRun(seed=r.seed, steps=r.steps, path_m=max(round(r.path_m, 4), 1e-4)) for r in runs)
     return Proof(reason="", instruction=scene.instruction, max_steps=max_steps, oracle=oracle)
 
 

@@ -12,9 +12,12 @@ The callable takes an environment (NumPy observations, not batched) and returns 
 """
 
 import hashlib
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -33,6 +36,13 @@ CONTROL_MODE = "pd_ee_delta_pose"  # the oracle's
 # Arguments of `gym.make` that define an episode; a policy may set the others.
 FIXED = ("task", "target", "robot_uids", "randomize", "pose_noise", "max_episode_steps", "reconfiguration_freq",
          "num_envs", "scene_id", "revision", "registry", "task_config", "render_mode")  # fmt: skip
+
+
+class PolicyTimeout(BaseException):
+    """A policy took too long. Not an `Exception`, so that a policy's own `except Exception` does not swallow it."""
+
+
+_ENDINGS = (Exception, SystemExit, GeneratorExit, PolicyTimeout)  # of a policy's code; Ctrl-C goes through
 
 
 class Policy(Protocol):
@@ -110,22 +120,40 @@ class PolicySpec:
     name: str
     arguments: dict[str, str] = field(default_factory=dict)
 
-    def make(self, env: gym.Env) -> Policy:
-        """Make the policy for an environment; its exceptions and invalid actions become a `UsageError`.
+    def make(self, env: gym.Env, timeout_s: float | None = None) -> Policy:
+        """Make the policy for an environment; its exceptions, exits and invalid actions become a `UsageError`.
+
+        Args:
+            env: The environment to act in.
+            timeout_s: Longest time of one call of the policy, of its making too; None: no limit. Only Python code in
+                the main thread can be interrupted.
 
         Raises:
-            UsageError: there is no such module or callable, or it does not return a policy.
+            UsageError: there is no such module or callable, it does not return a policy, or it takes too long.
         """
         maker = self._maker()
         try:
-            policy = maker(env, **self.arguments)
-        except Exception as error:
+            with time_limit(timeout_s):
+                policy = maker(env, **self.arguments)
+        except _ENDINGS as error:
             _fail(f"policy {self.name}: making it for {_where(env)}", error)
         if not callable(getattr(policy, "act", None)):
             raise UsageError(
                 f"policy {self.name}: the returned {type(policy).__name__} has no act(observation)"
             )
-        return _Watched(policy, self.name, env)
+        return _Watched(policy, self.name, env, timeout_s)
+
+    def warnings(self) -> list[str]:
+        """Return what its user should know before it is made: the result of the callable's `policy_warning`, if any.
+
+        Raises:
+            UsageError: there is no such policy.
+        """
+        said = getattr(self._maker(), "policy_warning", None)
+        try:
+            return [str(said(**self.arguments))] if callable(said) else []
+        except _ENDINGS as error:
+            _fail(f"policy {self.name}: its policy_warning", error)
 
     def options(self, task: "SuiteTask") -> dict[str, Any]:
         """Return the policy's keyword arguments for `gym.make` for a task.
@@ -137,8 +165,12 @@ class PolicySpec:
         if callable(wanted):
             try:
                 wanted = wanted(task, **self.arguments)
-            except Exception as error:
+            except _ENDINGS as error:
                 _fail(f"policy {self.name}: its policy_options for {task.name}", error)
+        if not isinstance(wanted, dict):
+            raise UsageError(
+                f"policy {self.name}: its policy_options is no dict, but {type(wanted).__name__}"
+            )
         wrong = sorted(set(wanted) & set(FIXED))
         if wrong:
             raise UsageError(
@@ -173,24 +205,26 @@ class PolicySpec:
 class _Watched:
     """Wraps a policy; its errors and invalid actions are reported with policy, task and step."""
 
-    def __init__(self, policy: Policy, name: str, env: gym.Env) -> None:
-        self._policy, self._name, self._env = policy, name, env
+    def __init__(self, policy: Policy, name: str, env: gym.Env, timeout_s: float | None = None) -> None:
+        self._policy, self._name, self._env, self._timeout_s = policy, name, env, timeout_s
         self._step = 0
 
     def reset(self) -> None:
         """Begin an episode."""
         self._step = 0
         try:
-            begin_episode(self._policy)
-        except Exception as error:
+            with time_limit(self._timeout_s):
+                begin_episode(self._policy)
+        except _ENDINGS as error:
             _fail(f"policy {self._name}: reset() in {_where(self._env)}", error)
 
     def act(self, observation: Any) -> np.ndarray:
         """Return the policy's action, float32 (k,)."""
         self._step += 1
         try:
-            answer: Any = self._policy.act(observation)
-        except Exception as error:
+            with time_limit(self._timeout_s):
+                answer: Any = self._policy.act(observation)
+        except _ENDINGS as error:
             _fail(
                 f"policy {self._name}: act() at step {self._step} of an episode of {_where(self._env)}", error
             )
@@ -212,11 +246,38 @@ class _Watched:
         return action
 
 
-def _fail(what: str, error: Exception) -> NoReturn:
+@contextmanager
+def time_limit(seconds: float | None) -> Iterator[None]:
+    """Interrupt the block with `PolicyTimeout` after so many seconds; None: never.
+
+    Only the main thread of a process can be interrupted, and in Python code only; elsewhere there is no limit.
+    """
+    if (
+        seconds is None
+        or threading.current_thread() is not threading.main_thread()
+        or not hasattr(signal, "setitimer")
+    ):
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        raise PolicyTimeout(f"it took longer than {seconds:g} s; allow more with --timeout")
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _fail(what: str, error: BaseException) -> NoReturn:
     """Raise a policy's error as a `UsageError` with its place in the code; re-raise the project's own errors."""
     if isinstance(error, SimReconError):
         raise error
-    last = traceback.extract_tb(error.__traceback__)[-1]
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__ and f.line]
+    last = frames[-1] if frames else traceback.extract_tb(error.__traceback__)[-1]
     theirs = Path(last.filename).is_file() and last.filename != __file__
     at = f" ({last.filename}:{last.lineno})" if theirs else ""
     raise UsageError(
@@ -247,7 +308,7 @@ def _find(name: str) -> Callable:
         raise UsageError(
             f"policy {name}: there is no module {module_name!r} in this folder or installed; run from its folder"
         ) from error
-    except Exception as error:
+    except _ENDINGS as error:
         _fail(f"policy {name}: importing {module_name}", error)
     for part in attribute.split("."):
         found = getattr(found, part, None)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from registry import UsageError
+from simrecon_envs.benchmark.checked import read_list, read_record, read_text_map
 from simrecon_envs.benchmark.statistics import bootstrap_mean, wilson
 from simrecon_envs.files import read_json, write_json
 
@@ -84,13 +85,25 @@ def load_results(path: Path | str) -> Results:
     path = Path(path)
     body = read_json(path, "results", SCHEMA)
     try:
-        episodes = tuple(EpisodeResult(**entry) for entry in body["episodes"])
-        return Results(suite=body["suite"], policy=body["policy"], selection=body["selection"], episodes=episodes,
-                       notes=tuple(body["notes"]), made_with=body["made_with"])  # fmt: skip
-    except (KeyError, TypeError) as error:
-        raise UsageError(
-            f"results {path}: a field is missing, unknown or of another type: {error}"
-        ) from error
+        rows = enumerate(read_list(body["episodes"], "episodes"))
+        episodes = [
+            read_record(EpisodeResult, entry, f"episodes[{n}]", negative=("reward",)) for n, entry in rows
+        ]
+        for name in ("suite", "policy", "selection"):
+            if not isinstance(body[name], dict):
+                raise ValueError(f"{name}: expected an object, found {type(body[name]).__name__}")
+        notes = read_text_map(dict(enumerate(read_list(body["notes"], "notes"))), "notes")
+        return Results(
+            suite=read_text_map(body["suite"], "suite"),
+            policy=body["policy"] | {"name": str(body["policy"]["name"])},
+            selection=body["selection"],
+            episodes=tuple(episodes),
+            notes=tuple(notes.values()),
+            made_with=read_text_map(body["made_with"], "made_with"),
+        )
+    except (KeyError, ValueError) as error:
+        said = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise UsageError(f"results {path}: {said}") from error
 
 
 def figures(episodes: Sequence[EpisodeResult]) -> dict[str, Any]:

@@ -35,6 +35,8 @@ class RunSettings:
     videos: str | None = None
     """Folder for a video of each task's first episode."""
     video_size_px: int = 384
+    timeout_s: float | None = None
+    """Longest time of one call of the policy, in seconds; no limit where None."""
     registry: str | None = None
 
     def __post_init__(self) -> None:
@@ -151,7 +153,7 @@ def run_task(
         extra |= {"render_mode": "rgb_array", "human_render_camera_configs": {"width": size, "height": size}}
     env = suite.make(task, registry=settings.registry, **extra)
     try:
-        actor = policy.make(env)
+        actor = policy.make(env, settings.timeout_s)
         rows = []
         for number, seed in enumerate(_seeds(task, settings, int(made.get("seed", 0)))):
             video = ""

@@ -3,20 +3,36 @@
 import fnmatch
 import hashlib
 import json
+import re
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
 from registry import SimReconError, UsageError
+from simrecon_envs.benchmark.checked import read_list, read_record, read_text_map
 from simrecon_envs.benchmark.splits import SIDES
 from simrecon_envs.files import read_json, write_json
 
-SCHEMA = "simrecon.suite/1"
+SCHEMA = "simrecon.suite/2"  # of the digest, too: since /2 it covers every field
 SPLITS = ("all", *SIDES)
 SPLIT_BY = ("object", "scene")
+# Arguments of gym.make that a suite may set for all of its tasks.
+_OPTIONS = ("randomize", "pose_noise", "obs_mode", "control_mode", "reward_mode", "observe_objects", "cameras",
+            "sensor_configs")  # fmt: skip
+_MOST_STEPS = 1_000_000
+# Names become names of files, and ids are imported by Gymnasium where they have a colon.
+_FORMS = {
+    "name": re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"),
+    "env_id": re.compile(r"SimRecon/[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"),
+    "scene": re.compile(r"[a-z0-9_]{1,200}"),
+    "revision": re.compile(r"[0-9a-f]{16}"),
+    "task": re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"),
+    "kind": re.compile(r"[a-z0-9_]{1,100}"),
+    "robot": re.compile(r"[A-Za-z0-9][A-Za-z0-9_]{0,99}"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +46,11 @@ class OracleRun:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteTask:
-    """A task of a suite, with one episode per entry of `oracle`."""
+    """A task of a suite, with one episode per entry of `oracle`.
+
+    Raises:
+        ValueError: a name could not be that of a file or an environment of this project, or a number is out of range.
+    """
 
     name: str  # "room-pick_mug-panda", unique in the suite
     env_id: str  # for gym.make
@@ -45,6 +65,28 @@ class SuiteTask:
     scene_side: str
     object_side: str  # "test" if any of its objects is in the test split
     oracle: tuple[OracleRun, ...]
+
+    def __post_init__(self) -> None:
+        """Check the forms of all names, and the ranges of numbers."""
+        for field_name, form in _FORMS.items():
+            value = getattr(self, field_name)
+            if not form.fullmatch(value) or ".." in value:
+                raise ValueError(f"{field_name}: {value[:80]!r} is not of the form {form.pattern}")
+        for field_name in ("scene_side", "object_side"):
+            if getattr(self, field_name) not in SIDES:
+                raise ValueError(
+                    f"{field_name}: expected {' or '.join(SIDES)}, found {getattr(self, field_name)!r}"
+                )
+        if not 1 <= self.max_steps <= _MOST_STEPS:
+            raise ValueError(f"max_steps: expected 1 to {_MOST_STEPS}, found {self.max_steps}")
+        if not self.oracle:
+            raise ValueError("oracle: expected at least one episode")
+        for number, run in enumerate(self.oracle):
+            if run.seed >= 2**32 or not 1 <= run.steps <= self.max_steps or not run.path_m > 0:
+                raise ValueError(
+                    f"oracle[{number}]: expected a seed below 2**32, 1 to max_steps steps and a path longer than 0, "
+                    f"found seed {run.seed}, {run.steps} steps, {run.path_m} m"
+                )
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -79,9 +121,8 @@ class Suite:
 
     @property
     def digest(self) -> str:
-        """Return 16 hexadecimal digits that identify the episodes."""
-        rows = [(t.env_id, t.revision, t.robot, t.max_steps, t.seeds) for t in self.tasks]
-        text = json.dumps([SCHEMA, self.options, rows], sort_keys=True)
+        """Return 16 hexadecimal digits of the SHA-256 over all fields."""
+        text = json.dumps([SCHEMA, asdict(self)], sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
@@ -165,17 +206,10 @@ def load_suite(path: Path | str) -> Suite:
     path = Path(path)
     body = read_json(path, "suite", SCHEMA)
     try:
-        tasks = tuple(_task(entry) for entry in body["tasks"])
-        left_out = tuple(LeftOut(**entry) for entry in body["left_out"])
-        suite = Suite(
-            tasks=tasks,
-            left_out=left_out,
-            options=body["options"],
-            settings=body["settings"],
-            made_with=body["made_with"],
-        )
-    except (KeyError, TypeError) as error:
-        raise UsageError(f"suite {path}: a field is missing, unknown or of another type: {error}") from error
+        suite = _read(body)
+    except (KeyError, ValueError) as error:
+        said = f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise UsageError(f"suite {path}: {said}") from error
     names = [task.name for task in suite.tasks]
     if not names or len(set(names)) < len(names):
         raise UsageError(f"suite {path}: it has {'no tasks' if not names else 'two tasks of one name'}")
@@ -187,11 +221,37 @@ def load_suite(path: Path | str) -> Suite:
     return suite
 
 
-def _task(entry: dict) -> SuiteTask:
-    runs = tuple(OracleRun(**run) for run in entry["oracle"])
-    if not runs or not isinstance(entry["max_steps"], int) or entry["max_steps"] < 1:
-        raise TypeError(f"task {entry['name']}: expected seeds and at least one step")
-    return SuiteTask(**{**entry, "objects": tuple(entry["objects"]), "oracle": runs})
+def _read(body: dict[str, Any]) -> Suite:
+    """Return the suite of a JSON object. Raises KeyError or ValueError, which name the field."""
+    unknown = sorted(set(body) - {"schema", "digest", *(item.name for item in fields(Suite))})
+    if unknown:
+        raise ValueError(f"unknown field {unknown[0][:80]!r}")
+    for name in ("options", "settings"):
+        if not isinstance(body[name], dict):
+            raise ValueError(f"{name}: expected an object, found {type(body[name]).__name__}")
+    wrong = sorted(set(body["options"]) - set(_OPTIONS))
+    if wrong:
+        raise ValueError(f"options: {wrong[0][:80]!r} is none of {', '.join(_OPTIONS)}")
+    seed = body["settings"].get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise ValueError(
+            f"settings.seed: expected a whole number from 0 to 2**32 - 1, found {str(seed)[:80]!r}"
+        )
+    tasks = []
+    for number, entry in enumerate(read_list(body["tasks"], "tasks")):
+        try:
+            tasks.append(read_record(SuiteTask, entry, f"tasks[{number}]"))
+        except ValueError as error:
+            said = str(error)
+            raise ValueError(said if said.startswith("tasks[") else f"tasks[{number}].{said}") from error
+    left_out = read_list(body["left_out"], "left_out")
+    return Suite(
+        tasks=tuple(tasks),
+        left_out=tuple(read_record(LeftOut, entry, f"left_out[{n}]") for n, entry in enumerate(left_out)),
+        options=body["options"],
+        settings=body["settings"],
+        made_with=read_text_map(body["made_with"], "made_with"),
+    )
 
 
 def _among(what: str, wanted: set[str]) -> str:

@@ -125,7 +125,16 @@ def _options(task: Any, run: str | None = None) -> dict[str, Any]:
     return options_of_run(TrainConfig.from_json(folder.read_config()["config"]))
 
 
+def _warning(run: str | None = None) -> str:
+    """Return what a user of `trained` should know."""
+    return (
+        f"{run or 'the policy'} is loaded with pickle, which can run any code on this machine; use only runs of your "
+        "own or of people whom you trust"
+    )
+
+
 trained.policy_options = _options
+trained.policy_warning = _warning
 
 
 def _newest(scene: str, task: str, robot: str) -> RunFolder:

@@ -1,9 +1,12 @@
 """Cache of collision parts, by mesh and options."""
 
+import contextlib
 import hashlib
 import io
 import json
+import os
 import zipfile
+import zlib
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -37,7 +40,8 @@ def kept_parts(
     file = folder / f"{_digest(solid, config, levels)}.npz"
     kept = _read(file)
     if kept is not None:
-        file.touch()
+        with contextlib.suppress(OSError):  # pruned by another run, or of another user
+            os.utime(file)
         return kept
     watch = _Watch(progress)
     parts = collision_parts(solid, config, levels=levels, progress=watch, name=name)
@@ -81,11 +85,14 @@ def _read(file: Path) -> tuple[ConvexPart, ...] | None:
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return tuple(ConvexPart(arrays[f"v{k}"], arrays[f"f{k}"]) for k in range(len(arrays.files) // 2))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
         return None
 
 
 def _forget_old(folder: Path) -> None:
-    files = sorted(folder.glob("*.npz"), key=lambda file: file.stat().st_mtime)
-    for file in files[: max(len(files) - _MOST_KEPT, 0)]:
+    files = []
+    for file in folder.glob("*.npz"):
+        with contextlib.suppress(FileNotFoundError):  # pruned by another run
+            files.append((file.stat().st_mtime, file))
+    for _, file in sorted(files)[: max(len(files) - _MOST_KEPT, 0)]:
         file.unlink(missing_ok=True)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses
-from registry.errors import UsageError
+from reconstruction.phone_exports.named_poses import OPENGL_FROM_OPENCV, NamedPoses, check_numbers
+from registry.errors import EnvironmentMissing, UsageError
 
 
 def read_transforms(path: Path) -> NamedPoses:
@@ -30,13 +30,22 @@ def read_transforms(path: Path) -> NamedPoses:
             if abs(float(frame.get("fl_x", fx)) - fx) > 0.01 * fx:
                 raise UsageError(f"poses: {path} has frames with different focal lengths; one lens is needed")
             world_from_opengl = np.array(frame["transform_matrix"], np.float64).reshape(4, 4)
+            if not isinstance(frame["file_path"], str):
+                raise TypeError(f"file_path {frame['file_path']!r} is no text")
             named.append((frame["file_path"], world_from_opengl @ OPENGL_FROM_OPENCV))
-    except (KeyError, TypeError, ValueError, IndexError, OSError) as error:
+        poses = np.array([pose for _, pose in named]).reshape(-1, 4, 4)
+        check_numbers(params, width, height, poses)
+        higher = [float(lens.get(key, 0.0)) for key in ("k3", "k4")]
+    except PermissionError as error:
+        raise EnvironmentMissing(f"poses: {path}: {error.strerror}. Make it readable (chmod u+r)") from error
+    except (
+        KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError, OSError,
+    ) as error:  # fmt: skip
         if isinstance(error, UsageError):
             raise
         why = f"{type(error).__name__} {error}"
         raise UsageError(f"poses: {path} is not a usable transforms.json: {why}") from error
-    if any(abs(float(lens.get(k, 0.0))) > 1e-9 for k in ("k3", "k4")):
+    if not all(abs(value) <= 1e-9 for value in higher):
         raise UsageError(f"poses: {path} has k3 or k4 distortion; only k1, k2, p1 and p2 are supported")
     camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", params[0], width, height)
     camera.params = params

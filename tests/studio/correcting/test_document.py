@@ -54,6 +54,10 @@ _ENTRIES = st.one_of(
     st.builds(lambda p, q: {"split": [[{"pixel": p}, {"at": [0.1, 2, 3.5]}], {"pixel": q}]}, _PIXEL, _PIXEL),
     st.builds(lambda n, m: {"id": n, "mass_kg": m}, st.integers(1, 99), st.floats(0.001, 9e4)),
 )  # fmt: skip
+# Labels of one printable line: those that a document accepts.
+_VALID_ENTRIES = _ENTRIES.filter(
+    lambda entry: entry.get("relabel", "x").strip() and entry.get("relabel", "x").isprintable()
+)
 _BY_HAND = st.sampled_from(
     [
         "",
@@ -123,7 +127,7 @@ class _Acts(RuleBasedStateMachine):
         self.texts[self.now + 1 :] = [text]
         self.now += 1
 
-    @rule(entry=_ENTRIES, title=_WORDS, page=st.integers(0, 1))
+    @rule(entry=_VALID_ENTRIES, title=_WORDS, page=st.integers(0, 1))
     def append(self, entry: dict, title: str, page: int) -> None:
         got = self.pages[page].append(entry, title)
         assert repr(got.entries) == repr([*(yaml.safe_load(self.texts[self.now]) or []), entry])
@@ -169,7 +173,7 @@ class _Acts(RuleBasedStateMachine):
             journal.write(torn)
         self.pages[page] = Document(self.path)
 
-    @rule(entry=_ENTRIES, page=st.integers(0, 1))
+    @rule(entry=_VALID_ENTRIES, page=st.integers(0, 1))
     def killed_between_journal_and_file(self, entry: dict, page: int) -> None:
         def killed(text: str) -> None:
             raise KeyboardInterrupt
