@@ -1,3 +1,4 @@
-"""Text that must be shown as text: HTML, Markdown, a right-to-left override and a control character."""
+"""Text that must be shown as text: HTML and Markdown. Bundles with control characters are refused before."""
 
-HOSTILE = "<img src=x onerror='window.hacked=1'>**b** `c` {1+1} \u202egnp.exe\x07"
+HOSTILE = "<img src=x onerror='window.hacked=1'>**b** `c` {1+1}"
+WITH_CONTROLS = HOSTILE + " \u202egnp.exe\x07"

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from hostile import HOSTILE
+from hostile import WITH_CONTROLS
 from made_scenes import BOOK, BOX, CYLINDER, KNOB, PICTURE, TABLE
 from PIL import Image
 
@@ -85,11 +85,11 @@ def test_selection_keeps_order_and_reports_changes_only():
 
 @pytest.mark.parametrize("escape", [plain, plain_markdown])
 def test_hostile_text_has_no_markup_left(escape):
-    out = escape(HOSTILE)
+    out = escape(WITH_CONTROLS)
     assert "<" not in out
     assert ">" not in out
     assert not any(ord(c) < 32 or c == "\u202e" for c in out)
-    assert "\\u202e" in bare(HOSTILE)
+    assert "\\u202e" in bare(WITH_CONTROLS)
     assert len(bare("x" * 1000)) <= 401
     assert plain("plain words, 3") == "plain words, 3"
 
