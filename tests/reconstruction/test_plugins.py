@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from test_instances_lifting import THINGS, Room, find, write_masks
@@ -180,6 +181,7 @@ def test_a_package_that_cannot_be_imported_is_said_before_the_first_stage(site, 
     (site / "broken.py").write_text("import no_such_package\n")
     install(site, "broken", "0.1", {"simrecon.instances.masks": {"bad": "broken:make"}})
     (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "one.png"), np.zeros((48, 64, 3), np.uint8))
     config = PipelineConfig().with_option("instances.masks=bad")
     with pytest.raises(EnvironmentMissing, match=r"instances\.masks=bad of broken 0\.1: .*no_such_package"):
         reconstruct(tmp_path / "photos", registry_root=tmp_path / "registry", config=config)

@@ -14,7 +14,7 @@ sys.path.append(str(Path(__file__).parents[1] / "simrecon_envs"))  # made_scenes
 @pytest.fixture(scope="session")
 def made_registry(tmp_path_factory: pytest.TempPathFactory) -> SceneRegistry:
     """Return a registry with `room` (furniture and Gaussians) and `hostile` (texts with HTML and control signs)."""
-    from hostile import HOSTILE
+    from hostile_text import HOSTILE
     from made_scenes import BundleWriter, add_furniture, add_room, publish_with_gaussians
 
     registry = SceneRegistry(tmp_path_factory.mktemp("home") / "registry", create=True)

@@ -6,7 +6,7 @@ import re
 import msgspec
 import pytest
 import zstandard
-from hostile import HOSTILE
+from hostile_text import HOSTILE
 from made_scenes import BOOK, KNOB, TABLE
 
 from studio.export import MAX_BYTES, export_html, write_export

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from hostile import WITH_CONTROLS
+from hostile_text import WITH_CONTROLS
 from made_scenes import BOOK, BOX, CYLINDER, KNOB, PICTURE, TABLE
 from PIL import Image
 

@@ -139,13 +139,14 @@ def test_an_interrupt_ends_running_videos_and_keeps_all_for_the_next_run(tmp_pat
             if len(self.started) == 2:
                 os.kill(os.getpid(), signal.SIGINT)
 
+    before = signal.getsignal(signal.SIGINT)
     summary, engine, journal = drive(tmp_path, {}, "abcdef", engine=Interrupting({}))
     assert summary.interrupted
     assert summary.waiting == 6
     assert len(engine.started) == 2
     assert engine.closed
     assert {state.result for state in journal.states().values()} == {"interrupted"}
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def row(name: str, folder: Path, **changes) -> VideoRow:
