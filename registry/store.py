@@ -16,6 +16,7 @@ a shared lock on its folder) is removed at the next publish or removal of the sc
 import contextlib
 import errno
 import os
+import random
 import re
 import secrets
 import shutil
@@ -40,6 +41,7 @@ from registry.plain_text import is_plain
 from registry.schema import check_scene_id, is_scene_id
 
 _TEMPORARY = (".publishing-", ".removing-")
+_MOST_SWEPT = 1000  # folders of other scenes that a publish looks into
 _CAUSES = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -421,7 +423,9 @@ class SceneRegistry:
                     shutil.rmtree(item, ignore_errors=True)
 
     def _sweep_others(self, but: Path) -> None:
-        for folder in self.scenes_folder.iterdir():
+        """Sweep other scenes' folders: all, or in a large registry a random part, so that the time is bounded."""
+        folders = list(self.scenes_folder.iterdir())
+        for folder in random.sample(folders, min(len(folders), _MOST_SWEPT)):
             if folder == but or folder.is_symlink() or not folder.is_dir():
                 continue
             with contextlib.suppress(OSError):
