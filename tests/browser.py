@@ -98,7 +98,7 @@ class Page:
             "Promise.all([...document.images].map(i => i.decode().catch(() => null))).then(() => true)"
         )
 
-    def wait_for(self, expression: str, timeout_s: float = 20.0) -> Any:
+    def wait_for(self, expression: str, timeout_s: float = 90.0) -> Any:
         """Evaluate JavaScript until its value is true, and return that value.
 
         Raises:

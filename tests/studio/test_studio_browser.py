@@ -19,7 +19,7 @@ from studio.server import StudioServer
 pytestmark = [pytest.mark.browser, pytest.mark.end_to_end]
 
 SIZE = (1200, 800)
-READY_S = 60  # in software, on a busy machine; figures are in docs/studio.md
+READY_S = 180  # in software, on a busy machine; figures are in docs/studio.md
 STEADY = "?fixedDpr=1"  # viser lowers the resolution where rendering is slow, which changes edges
 COLOR_ERROR = 6  # of 255
 TABLE_COLOR, BOX_COLOR = (

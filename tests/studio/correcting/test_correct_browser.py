@@ -30,7 +30,7 @@ class Viewer:
         self.page, self.browser = page, browser
         self.part = next(part for part in page.parts if isinstance(part, CorrectPart))
 
-    def until(self, true: Callable[[], object], what: str, timeout_s: float = 60.0) -> None:
+    def until(self, true: Callable[[], object], what: str, timeout_s: float = 180.0) -> None:
         """Wait for something."""
         limit = time.monotonic() + timeout_s
         while not true():
