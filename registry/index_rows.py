@@ -5,6 +5,7 @@ import json
 import math
 import re
 import sqlite3
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -54,30 +55,20 @@ def row_of(values: tuple[Any, ...]) -> SceneRow:
     Raises:
         BundleError: A value is not of its kind; names the scene and the column.
     """
-    scene_id, revision, version, created, source, digest, count, status, metrics = values
+    scene_id, *rest, metrics = values
     if not is_scene_id(scene_id):
         raise BundleError(f"registry: a row of the index has the scene id {ascii(scene_id)[:80]}")
-    texts = (version, created, source)
-    checks = (
-        ("revision", revision, is_revision(revision)),
-        *((name, x, _is_line(x)) for name, x in zip(("schema_version", "created_utc", "source_file"), texts)),
-        ("source_sha256", digest, isinstance(digest, str) and _SHA256.fullmatch(digest) is not None),
-        ("n_objects", count, type(count) is int and 0 <= count <= _MAX_OBJECTS),
-        ("status", status, status in _STATUS),
-    )
-    for name, value, valid in checks:
-        if not valid:
+    for (name, is_valid), value in zip(_COLUMNS, rest, strict=True):
+        if not is_valid(value):
             raise BundleError(f"scene {scene_id}: its row of the index has the {name} {ascii(value)[:80]}")
-    return SceneRow(
-        scene_id, revision, version, created, source, digest, count, status, _metrics(scene_id, metrics)
-    )
+    return SceneRow(scene_id, *rest, _metrics(scene_id, metrics))
 
 
 def _metrics(scene_id: str, text: Any) -> dict[str, Any]:
     found: Any = None
     if isinstance(text, str) and len(text) <= _MAX_METRICS:
         try:
-            found = json.loads(text, parse_constant=_no_constant)
+            found = _DECODER.decode(text)
         except (ValueError, RecursionError):
             found = None
     if not isinstance(found, dict):
@@ -96,16 +87,30 @@ def _metrics(scene_id: str, text: Any) -> dict[str, Any]:
     return cast("dict[str, Any]", found)
 
 
-def _no_constant(name: str) -> None:
-    raise ValueError(name)
-
-
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) <= 1e300 and math.isfinite(value)
 
 
 def _is_line(value: Any) -> bool:
     return isinstance(value, str) and len(value) <= _MAX_TEXT and is_plain(value)
+
+
+_COLUMNS: tuple[tuple[str, Callable[[Any], bool]], ...] = (  # between the scene id and the metrics
+    ("revision", is_revision),
+    ("schema_version", _is_line),
+    ("created_utc", _is_line),
+    ("source_file", _is_line),
+    ("source_sha256", lambda value: isinstance(value, str) and _SHA256.fullmatch(value) is not None),
+    ("n_objects", lambda value: type(value) is int and 0 <= value <= _MAX_OBJECTS),
+    ("status", lambda value: value in _STATUS),
+)
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(name)
+
+
+_DECODER = json.JSONDecoder(parse_constant=_no_constant)
 
 
 def check_schema(connection: sqlite3.Connection, path: Path) -> None:
