@@ -1,5 +1,7 @@
 """Stage 7: closed, textured objects with collision shapes and masses, and textured floor, walls and ceiling."""
 
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
 from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, frame_object, fuse_volume
-from reconstruction.core.progress import NO_PROGRESS, Progress
+from reconstruction.core.progress import NO_PROGRESS, NoProgress, Progress
 from reconstruction.core.types import (
     AssetProvenance,
     AssetSet,
@@ -112,16 +114,27 @@ def build_assets(
     """
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
     scene = replace(gather_evidence(posed, depth, surface, instances, config, progress, views), keep=keep)
-    objects: list[ObjectAsset] = []
-    hulls = 0
-    for left, item in zip(range(len(instances.objects) - 1, -1, -1), instances.objects):
-        own = config.with_hulls(config.hulls_scene - hulls - left * LEAST_HULLS)
-        objects.append(build_object(item, replace(scene, config=own), progress))
-        hulls += len(objects[-1].collision)
-        progress.advance()
-    end_decomposer()
-    base, backdrop = build_room(posed, depth, instances, objects, scene.pixels, surface.space, config)
+    objects, pending = [], deque[tuple[Draft, Future[Collided]]]()
+    # CoACD, a process of its own, works on one object while the next ones take shape.
+    worker, collider = ThreadPoolExecutor(1), Collider(scene, len(instances.objects))
+    try:
+        drafts = []
+        for item in instances.objects:
+            drafts.append(draft_object(item, scene))
+            pending.append((drafts[-1], worker.submit(collider, drafts[-1])))
+            while pending and pending[0][1].done():
+                objects.append(_finished(*pending.popleft(), scene, progress))
+        room = build_room(
+            posed, depth, instances, [d.asset for d in drafts], scene.pixels, surface.space, config
+        )
+        objects += [_finished(*item, scene, progress) for item in pending]
+    finally:
+        worker.shutdown(cancel_futures=True)
+        end_decomposer()
+    if any(made.visual is not draft.asset.visual for made, draft in zip(objects, drafts)):  # one became a box
+        room = build_room(posed, depth, instances, objects, scene.pixels, surface.space, config)
     progress.advance(len(instances.base))
+    base, backdrop = room
     return AssetSet(base, tuple(objects), backdrop)
 
 
@@ -140,38 +153,94 @@ def gather_evidence(
     return Evidence(posed, depth, surface, found, pixels, stands, said, fetched, config)
 
 
-def build_object(item: Instance, scene: Evidence, progress: Progress) -> ObjectAsset:
-    """Build one asset: shape, texture, collision, physics. After a failure, build it as a box."""
+class Notes(NoProgress):
+    """Notes of one object, kept until all of it is made, so that notes are in the order of objects."""
+
+    def __init__(self) -> None:
+        self.kept: list[str] = []
+
+    def note(self, message: str) -> None:
+        """See `Progress.note`."""
+        self.kept.append(message)
+
+    def failed(self, name: str, error: Exception) -> None:
+        """Note that an object became a box."""
+        self.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
+
+
+@dataclass(frozen=True)
+class Draft:
+    """An object with everything but its collision shape."""
+
+    item: Instance
+    body: Solid  # in object space
+    levels: tuple[float, ...]  # heights of what stands on it, in object space
+    asset: ObjectAsset
+    notes: Notes
+
+    @property
+    def name(self) -> str:
+        """Return how notes call the object."""
+        return f"object {self.item.id} ({self.item.label})"
+
+
+Collided = tuple[ConvexPart, ...] | Exception  # a collision shape, or why there is none
+
+
+class Collider:
+    """Makes the collision shapes of drafts, one after another, within the scene's budget of hulls."""
+
+    def __init__(self, scene: Evidence, count: int) -> None:
+        self._scene, self._left, self._hulls = scene, count, 0
+
+    def __call__(self, draft: Draft) -> Collided:
+        """Return the collision shape of the next draft."""
+        scene, self._left = self._scene, self._left - 1
+        config = scene.config.with_hulls(scene.config.hulls_scene - self._hulls - self._left * LEAST_HULLS)
+        try:
+            parts = _collision(draft, scene, config)
+        except (MemoryError, EnvironmentMissing):
+            raise
+        except Exception as error:
+            self._hulls += 1  # it becomes a box
+            return error
+        self._hulls += len(parts)
+        return parts
+
+
+def draft_object(item: Instance, scene: Evidence) -> Draft:
+    """Build all of one asset but its collision shape. After a failure, build it as a box."""
+    notes = Notes()
     name = f"object {item.id} ({item.label})"
     try:
         shape = object_shape(item, scene)
         if shape.is_box:
-            progress.note(f"{name}: too little was seen of it, it became a box")
+            notes.note(f"{name}: too little was seen of it, it became a box")
         if shape.attempt is not None and shape.attempt.rejected:
-            progress.note(f"{name}: {shape.attempt.how}; the embedded completion stands in")
-        return _finish_object(item, shape, scene, progress)
+            notes.note(f"{name}: {shape.attempt.how}; the embedded completion stands in")
+        return _draft(item, shape, scene, notes)
     # Compiled geometry libraries raise anything on a degenerate shape, and one object must not fail the scene. Missing
     # memory or software is no property of the object.
     except (MemoryError, EnvironmentMissing):
         raise
     except Exception as error:
-        progress.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
-    return _finish_object(item, box_fallback(item, np.zeros((0, 3))), scene, progress)
+        notes.failed(name, error)
+    return _draft(item, box_fallback(item, np.zeros((0, 3))), scene, notes)
 
 
-def _finish_object(item: Instance, shape: Shape, scene: Evidence, progress: Progress) -> ObjectAsset:
-    """Give a solid its texture, collision shape and mass."""
+def _draft(item: Instance, shape: Shape, scene: Evidence, notes: Notes) -> Draft:
+    """Give a solid its texture and mass."""
     body, world_from_object = to_object_space(shape.body, shape.frame)
     levels = [s.level_m - float(world_from_object[2, 3]) for s in scene.stands.on(item.id) if s.known]
     visual, baked = _bake(item, body, world_from_object, shape.colors, scene)
     choice = choice_for(item, scene.said, baked.mean_rgb, body.extents)
-    return ObjectAsset(
+    asset = ObjectAsset(
         id=item.id,
         label=item.label,
         label_confidence=float(item.label_confidence),
         world_from_object=world_from_object,
         visual=visual,
-        collision=_collision(body, tuple(levels), f"object {item.id} ({item.label})", scene, progress),
+        collision=(),
         physics=physical_attributes(body, choice),
         provenance=AssetProvenance(
             geometry=shape.provenance,
@@ -183,14 +252,27 @@ def _finish_object(item: Instance, shape: Shape, scene: Evidence, progress: Prog
         support_hint=int(item.support_hint),
         attached_hint=bool(item.attached_hint),
     )
+    return Draft(item, body, tuple(levels), asset, notes)
 
 
-def _collision(
-    body: Solid, levels: tuple[float, ...], name: str, scene: Evidence, progress: Progress
-) -> tuple[ConvexPart, ...]:
+def _collision(draft: Draft, scene: Evidence, config: AssetsConfig) -> tuple[ConvexPart, ...]:
+    say = {"levels": draft.levels, "progress": draft.notes, "name": draft.name}
     if scene.keep is None:
-        return collision_parts(body, scene.config, levels=levels, progress=progress, name=name)
-    return kept_parts(scene.keep, body, scene.config, levels=levels, progress=progress, name=name)
+        return collision_parts(draft.body, config, **say)
+    return kept_parts(scene.keep, draft.body, config, **say)
+
+
+def _finished(draft: Draft, collided: "Future[Collided]", scene: Evidence, progress: Progress) -> ObjectAsset:
+    """Wait for a draft's collision shape, and return the asset; without a shape, build it as a box."""
+    parts = collided.result()
+    if isinstance(parts, Exception):
+        draft.notes.failed(draft.name, parts)
+        draft = _draft(draft.item, box_fallback(draft.item, np.zeros((0, 3))), scene, draft.notes)
+        parts = _collision(draft, scene, scene.config)
+    for note in draft.notes.kept:
+        progress.note(note)
+    progress.advance()
+    return replace(draft.asset, collision=parts)
 
 
 def _bake(

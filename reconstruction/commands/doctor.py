@@ -6,6 +6,8 @@ from dataclasses import asdict
 
 from reconstruction.commands.options import add_verb
 
+_LONG_S = 5.0  # a kernel that took longer is named
+
 
 def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Add the verb."""
@@ -15,14 +17,43 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         "what works on this machine, what is missing, how to get it",
         "Check this machine; list installed plugins. Exit code 4: something required is missing.",
     )
+    parser.add_argument(
+        "--warm",
+        action="store_true",
+        help="instead, compile all kernels now (a minute or two, once after an installation or update); without this "
+        "they compile during the first reconstruction",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print all checks; return 4 if a required one fails."""
+    if arguments.warm:
+        return _warm()
     from reconstruction.doctor import format_checks, run_checks
 
     checks = run_checks()
     print(json.dumps([asdict(c) for c in checks], indent=2) if arguments.json else format_checks(checks))
     return 4 if any(c.required and not c.ok for c in checks) else 0
+
+
+def _warm() -> int:
+    """Compile the kernels of all stages, one process a core; print each that took long."""
+    import os
+    import time
+
+    from reconstruction.core.precompiling import Kernel, are_compiled, compile_all
+
+    if are_compiled():
+        print("All kernels are compiled on this machine.")
+        return 0
+    start = time.perf_counter()
+
+    def told(kernel: Kernel, seconds: float) -> None:
+        if seconds > _LONG_S:
+            print(f"compiled {kernel} in {seconds:.0f} s", flush=True)
+
+    count = compile_all(os.cpu_count() or 1, told)
+    print(f"{count} kernels are compiled, in {time.perf_counter() - start:.0f} s.")
+    return 0

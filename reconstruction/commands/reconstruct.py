@@ -116,11 +116,12 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.video.exists():
         raise UsageError(f"{arguments.video}: no such file or folder")
     from reconstruction.commands.reporting import make_listener
+    from reconstruction.core.precompiling import compiling_behind
     from reconstruction.editing.overrides import Overrides
     from reconstruction.video_to_scene import reconstruct
 
     with _live_page(arguments) as page:
-        with make_listener(quiet=arguments.quiet or arguments.json) as listener:
+        with make_listener(quiet=arguments.quiet or arguments.json) as listener, compiling_behind():
             result = reconstruct(
                 arguments.video,
                 scene_id=arguments.scene,

@@ -9,6 +9,8 @@ from reconstruction.poses.mapping import MAPPER_THREADS
 # of the Cauchy loss: SIFT errors in compressed video have heavy tails (measured: halves the camera error)
 LOSS_SCALE_PX = 0.5
 _MIN_OBSERVATIONS = 15  # points that a frame must observe for a reliable pose
+_ITERATIONS, _TOLERANCE = 40, 1e-5  # of the cost; with 1e-6 cameras move by less than 1 % of their error
+_ROUGH_ITERATIONS = 8  # before points with a large error are deleted
 _RICH_MODEL_FROM_FRAMES = 30  # with fewer frames a second distortion term overfits
 
 
@@ -17,7 +19,7 @@ def refine_model(model: Reconstruction, config: PosesConfig) -> Reconstruction:
     if config.camera_model == "auto" and model.num_reg_images() >= _RICH_MODEL_FROM_FRAMES:
         _change_camera_model(model, "RADIAL")
     filter_points(model, 1.5 * config.max_point_error_px, 2)
-    bundle_adjust(model)
+    bundle_adjust(model, iterations=_ROUGH_ITERATIONS)
     filter_points(model, config.max_point_error_px, 2)
     drop_weak_frames(model)
     bundle_adjust(model)
@@ -26,7 +28,9 @@ def refine_model(model: Reconstruction, config: PosesConfig) -> Reconstruction:
     return model
 
 
-def bundle_adjust(model: Reconstruction, loss_scale_px: float = LOSS_SCALE_PX) -> None:
+def bundle_adjust(
+    model: Reconstruction, loss_scale_px: float = LOSS_SCALE_PX, iterations: int = _ITERATIONS
+) -> None:
     """Adjust poses, points and intrinsics (without the principal point) under a Cauchy loss, in place."""
     import pycolmap
 
@@ -35,8 +39,8 @@ def bundle_adjust(model: Reconstruction, loss_scale_px: float = LOSS_SCALE_PX) -
     options.refine_principal_point = False  # weakly observable in a room (measured: cameras turn)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_scale_px
-    options.ceres.solver_options.max_num_iterations = 40
-    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.function_tolerance = _TOLERANCE
     options.ceres.solver_options.num_threads = MAPPER_THREADS
     problem = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):

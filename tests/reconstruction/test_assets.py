@@ -1,5 +1,6 @@
 """The assets stage on a generated room with true depth and ids: closed, posed, hollow and robust objects."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -132,6 +133,41 @@ def test_an_unseen_object_becomes_a_box_with_a_note(built, small_capture):
     assert item.provenance.geometry == "box-fallback"
     assert any("999" in line for line in notes.notes)
     np.testing.assert_allclose(np.ptp(item.visual.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-6)
+
+
+def test_an_object_without_a_collision_shape_becomes_a_box_and_the_others_stay(
+    built, small_capture, monkeypatch
+):
+    """Also the floor's texture knows the box, and notes are in the order of objects, whichever is done first."""
+    from reconstruction.assets import build
+
+    assets, found = built
+    bad, first = found.objects[1].id, found.objects[0].id
+    made = build.collision_parts
+
+    def fails_on_one(body, config, *, levels, progress, name):
+        progress.note(f"{name}: noted")
+        if name.startswith(f"object {first} "):
+            time.sleep(0.5)  # the others take shape meanwhile
+        if name.startswith(f"object {bad} ") and len(body.faces) > 12:
+            raise ValueError("no shape")
+        return made(body, config, levels=levels, progress=progress, name=name)
+
+    monkeypatch.setattr(build, "collision_parts", fails_on_one)
+    notes = Notes()
+    again = build_assets(small_capture.posed, small_capture.depth, EMPTY, found, CONFIG, progress=notes)
+    assert [item.id for item in again.objects] == [item.id for item in found.objects]
+    for old, new in zip(assets.objects, again.objects):
+        assert len(new.collision) > 0
+        if new.id == bad:
+            assert new.provenance.geometry == "box-fallback"
+            assert len(new.collision) == 1
+        else:
+            np.testing.assert_array_equal(new.visual.vertices, old.visual.vertices)
+            assert len(new.collision) == len(old.collision)
+    told = [line.split()[1] for line in notes.notes if line.startswith("object")]
+    assert told == sorted(told, key=[str(item.id) for item in found.objects].index)
+    assert any(f"object {bad} " in line and "no shape" in line for line in notes.notes)
 
 
 def test_results_are_deterministic(built, small_capture):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reconstruction.core.precompiling import are_compiled
 from reconstruction.pipeline import DEFAULT_STAGE_NAMES
 from registry import SceneRegistry
 from registry.geometry import transform_points, umeyama
@@ -55,7 +57,9 @@ def video(tmp_path_factory) -> Path:
 def undisturbed(video, tmp_path_factory) -> Path:
     """The home folder of a run that nobody disturbed."""
     home = tmp_path_factory.mktemp("undisturbed")
+    warm = are_compiled()
     done = run(video, home, "--scene", "room")
+    (home / ("warm.txt" if warm else "cold.txt")).write_text(done.stderr)
     assert done.returncode == 0, done.stderr
     assert "SimRecon/room is registered" in done.stdout
     return home
@@ -72,6 +76,15 @@ def test_the_scene_is_whole_and_verified(undisturbed):
         assert item["mass_kg"] > 0
         assert item["collision"]
         assert len(item["collision_primitives"]) == len(item["collision"])
+
+
+def test_nothing_is_compiled_in_a_run_after_make_setup(undisturbed):
+    """Else a kernel is missing in reconstruction/core/kernels.json: run tools/kernels.py."""
+    if not (undisturbed / "warm.txt").exists():
+        pytest.skip("kernels are not compiled here: `simrecon doctor --warm` does it")
+    text = (undisturbed / "warm.txt").read_text()
+    assert "publish" in text
+    assert not re.findall("compil[a-z]+ .*", text)
 
 
 def test_killed_in_every_stage_and_resumed_gives_the_same_bundle(video, undisturbed, tmp_path):
