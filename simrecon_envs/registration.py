@@ -5,9 +5,12 @@ happens if the scene has a newer one. `SimRecon/scene0001-pick_mug-v0` is a task
 of success and reward. Scenes have entries in Gymnasium's registry; specs of tasks are created on demand from the id.
 """
 
+import gc
 import re
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,15 +62,28 @@ def register_scenes(root: Path | str | None = None) -> list[str]:
     """
     # Absolute, because the working folder may change before the environment is made.
     folder = str((default_registry_root() if root is None else Path(root).expanduser()).absolute())
-    revisions = SceneRegistry(Path(folder)).revisions()
-    ids = {env_id(scene): scene for scene in revisions}
-    for known in [name for name, spec in gym.registry.items() if _registry_of(spec) == folder]:
-        if known not in ids:
-            del gym.registry[known]
-    for name, scene in ids.items():
-        # Not by `gym.register`, which searches the whole registry in every call and warns about replaced ids.
-        gym.registry[name] = _spec(name, scene, revisions[scene], folder)
+    with _collection_paused():
+        revisions = SceneRegistry(Path(folder)).revisions()
+        ids = {env_id(scene): scene for scene in revisions}
+        for known in [name for name, spec in gym.registry.items() if _registry_of(spec) == folder]:
+            if known not in ids:
+                del gym.registry[known]
+        for name, scene in ids.items():
+            # Not by `gym.register`, which searches the whole registry in every call and warns about replaced ids.
+            gym.registry[name] = _spec(name, scene, revisions[scene], folder)
     return list(ids)
+
+
+@contextmanager
+def _collection_paused() -> Iterator[None]:
+    """Pause the garbage collector, which would look through all new specs again and again."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def register_default_scenes() -> list[str]:
