@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _warm() -> int:
     """Compile the kernels of all stages, one process a core; print each that took long."""
     import os
+    import sys
     import time
 
     from reconstruction.core.precompiling import Kernel, are_compiled, compile_all
@@ -54,6 +55,8 @@ def _warm() -> int:
         if seconds > _LONG_S:
             print(f"compiled {kernel} in {seconds:.0f} s", flush=True)
 
-    count = compile_all(os.cpu_count() or 1, told)
-    print(f"{count} kernels are compiled, in {time.perf_counter() - start:.0f} s.")
-    return 0
+    count, failed = compile_all(os.cpu_count() or 1, told)
+    for line in failed:
+        print(f"could not be compiled: {line}", file=sys.stderr)
+    print(f"{count - len(failed)} kernels are compiled, in {time.perf_counter() - start:.0f} s.")
+    return 4 if failed else 0

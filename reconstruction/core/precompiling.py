@@ -123,20 +123,26 @@ def compile_kernel(kernel: Kernel) -> float:
 
 def compile_all(
     processes: int, told: Callable[[Kernel, float], object] = lambda kernel, seconds: None
-) -> int:
-    """Compile all listed kernels in processes of their own; return how many there are.
+) -> tuple[int, list[str]]:
+    """Compile all listed kernels in processes of their own; return how many there are, and a line for each that failed.
+
+    A kernel that fails here is compiled on its first use, which then says why it cannot.
 
     Args:
         processes: at work at once.
         told: receives each kernel that is ready and the seconds that it took.
     """
-    kernels = listed_kernels()
+    kernels, failed = listed_kernels(), []
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         jobs = {pool.submit(compile_kernel, kernel): kernel for kernel in kernels}
         for job in as_completed(jobs):
-            told(jobs[job], job.result())
-    note_compiled()
-    return len(kernels)
+            if (error := job.exception()) is None:
+                told(jobs[job], job.result())
+            else:
+                failed.append(f"{jobs[job]}: {type(error).__name__}: {error}")
+    if not failed:
+        note_compiled()
+    return len(kernels), failed
 
 
 def are_compiled() -> bool:
@@ -206,7 +212,7 @@ def _compile_alone() -> int:
         for kernel in listed_kernels():
             compile_kernel(kernel)
         note_compiled()
-    return 0
+    return 0  # where a kernel cannot be compiled, the stage that needs it says so
 
 
 if __name__ == "__main__":

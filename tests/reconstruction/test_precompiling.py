@@ -63,8 +63,8 @@ def test_compiled_once_and_then_found(tmp_path, monkeypatch):
         "seconds = []\n"
         "before = precompiling.are_compiled()\n"
         "if __name__ == '__main__':\n"
-        "    count = precompiling.compile_all(1, lambda kernel, s: seconds.append(s))\n"
-        "    print(before, precompiling.are_compiled(), count, sum(seconds))\n"
+        "    count, failed = precompiling.compile_all(1, lambda kernel, s: seconds.append(s))\n"
+        "    print(before, precompiling.are_compiled(), count, sum(seconds), *failed)\n"
     )
     program = tmp_path / "program.py"
     program.write_text(line)
@@ -83,8 +83,24 @@ def test_compiled_once_and_then_found(tmp_path, monkeypatch):
     assert first[:3] == ["False", "True", str(len(_few_kernels()))]
     assert second[:3] == ["True", "True", str(len(_few_kernels()))]
     assert float(second[3]) < 0.5 * float(first[3])
+    assert len(second) == 4
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(precompiling, "LISTED", listed)
     assert precompiling.are_compiled()
     listed.write_text("[]")
+    assert not precompiling.are_compiled()
+
+
+@pytest.mark.stage
+def test_a_kernel_that_fails_is_named_and_the_others_are_compiled(tmp_path, monkeypatch):
+    wrong = [MULTICUT, _few_kernels()[0].name, ["none"]]
+    good = [[k.module, k.name, k.types] for k in _few_kernels()]
+    listed = tmp_path / "kernels.json"
+    listed.write_text(json.dumps([wrong, *good]))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(precompiling, "LISTED", listed)
+    count, failed = precompiling.compile_all(1)
+    assert count == len(good) + 1
+    (line,) = failed
+    assert line.startswith(f"{MULTICUT}.{wrong[1]}: ")
     assert not precompiling.are_compiled()
