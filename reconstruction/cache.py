@@ -237,11 +237,14 @@ class StageStore:
         target = self._folder(number, stage, key)
         for _ in range(_TRIES):
             if self.has(number, stage, key):
-                with contextlib.suppress(DamagedResult):
+                try:
                     self.check(number, stage, key)
                     return
-            if target.exists():
-                self.remove(number, stage, key)
+                except DamagedResult:
+                    self.remove(number, stage, key)
+            # Not one that another run has put there meanwhile: that has a manifest, and the next try finds it.
+            elif target.exists() and not (target / _MANIFEST).is_file():
+                (remove_unless_leased if target.is_dir() else remove_at_once)(target)
             try:
                 partial.rename(target)
             except (FileExistsError, NotADirectoryError):

@@ -102,6 +102,23 @@ def test_a_finished_result_of_another_run_is_kept(tmp_path):
     assert second.manifest(10, "scene_graph", "k") == {"by": 1}
 
 
+def test_a_result_that_another_run_puts_in_place_meanwhile_is_kept(tmp_path, monkeypatch):
+    first, second = StageStore(tmp_path), StageStore(tmp_path)
+    has, asked = second.has, []
+
+    def too_early(*result):
+        if not asked:
+            asked.append(result)
+            first.save(GRAPH, 10, "scene_graph", "k", {"by": 1})
+            return False
+        return has(*result)
+
+    monkeypatch.setattr(second, "has", too_early)
+    second.save(GRAPH, 10, "scene_graph", "k", {"by": 2})
+    assert second.manifest(10, "scene_graph", "k") == {"by": 1}
+    first.check(10, "scene_graph", "k")
+
+
 def test_a_result_in_use_is_not_pruned_and_goes_once_it_is_free(tmp_path):
     reader, writer = StageStore(tmp_path, 1), StageStore(tmp_path, 1)
     writer.save(GRAPH, 10, "scene_graph", "used", {})
