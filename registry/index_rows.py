@@ -61,7 +61,10 @@ def row_of(values: tuple[Any, ...]) -> SceneRow:
     for (name, is_valid), value in zip(_COLUMNS, rest, strict=True):
         if not is_valid(value):
             raise BundleError(f"scene {scene_id}: its row of the index has the {name} {ascii(value)[:80]}")
-    return SceneRow(scene_id, *rest, _metrics(scene_id, metrics))
+    revision, version, created, source, digest, count, status = rest
+    return SceneRow(
+        scene_id, revision, version, created, source, digest, count, status, _metrics(scene_id, metrics)
+    )
 
 
 def _metrics(scene_id: str, text: Any) -> dict[str, Any]:

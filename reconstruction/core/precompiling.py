@@ -88,7 +88,7 @@ def described(numba_type: Any) -> Any:
             "array", described(numba_type.dtype), numba_type.ndim, numba_type.layout, not numba_type.mutable
         ]  # fmt: skip
     if isinstance(numba_type, types.BaseTuple):
-        return ["tuple", *map(described, numba_type)]
+        return ["tuple", *map(described, numba_type)]  # pyright: ignore[reportArgumentType]
     if isinstance(numba_type, types.Omitted):
         return ["omitted", numba_type.value]
     if isinstance(numba_type, types.Boolean):
