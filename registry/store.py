@@ -99,16 +99,12 @@ class SceneRegistry:
 
     def __init__(self, root: Path | None = None, create: bool = False) -> None:
         self.root = default_registry_root() if root is None else Path(root).expanduser()
+        self.scenes_folder = self.root / "scenes"  # of the bundles
         self._index = Index(self.root / "index.sqlite")
         if create:
             with _disk_errors(f"create the registry {self.root}"):
                 self.scenes_folder.mkdir(parents=True, exist_ok=True)
                 self._create_index()
-
-    @property
-    def scenes_folder(self) -> Path:
-        """Folder of the bundles."""
-        return self.root / "scenes"
 
     def list(self) -> Records:
         """Return all scenes, ordered by id. Opens no bundle; scenes with a malformed row are left out.
@@ -299,7 +295,7 @@ class SceneRegistry:
     # ---- Reading.
 
     def _record(self, row: SceneRow) -> SceneRecord:
-        path = self.root / f"scenes/{row.scene_id}/{row.revision}"  # one join: a third of the time of a list
+        path = self.scenes_folder / f"{row.scene_id}/{row.revision}"  # one join, as joins are slow
         return SceneRecord(path=path, **vars(row))
 
     def _not_found(self, scene_id: str) -> str:

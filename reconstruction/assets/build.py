@@ -168,6 +168,10 @@ class Notes(NoProgress):
         self.note(f"{name}: could not be completed ({type(error).__name__}: {error}), it became a box")
 
 
+def _name(item: Instance) -> str:
+    return f"object {item.id} ({item.label})"
+
+
 @dataclass(frozen=True)
 class Draft:
     """An object with everything but its collision shape."""
@@ -181,7 +185,7 @@ class Draft:
     @property
     def name(self) -> str:
         """Return how notes call the object."""
-        return f"object {self.item.id} ({self.item.label})"
+        return _name(self.item)
 
 
 Collided = tuple[ConvexPart, ...] | Exception  # a collision shape, or why there is none
@@ -210,8 +214,7 @@ class Collider:
 
 def draft_object(item: Instance, scene: Evidence) -> Draft:
     """Build all of one asset but its collision shape. After a failure, build it as a box."""
-    notes = Notes()
-    name = f"object {item.id} ({item.label})"
+    notes, name = Notes(), _name(item)
     try:
         shape = object_shape(item, scene)
         if shape.is_box:

@@ -23,10 +23,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:  # pragma: no cover - Windows
-    fcntl = None
+from registry.locks import LockHeld, file_lock
 
 LISTED = Path(__file__).with_name("kernels.json")
 _PACKAGES = ("reconstruction.", "simrecon_envs.")
@@ -203,12 +200,7 @@ def compiling_behind() -> Iterator[subprocess.Popen[bytes] | None]:
 def _compile_alone() -> int:
     """Compile all kernels in this process, at low priority; return 0 at once where another process does so."""
     os.nice(_NICENESS)
-    with _stamp().with_suffix(".lock").open("a") as lock:
-        if fcntl is not None:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                return 0
+    with contextlib.suppress(LockHeld), file_lock(_stamp().with_suffix(".lock"), blocking=False):
         for kernel in listed_kernels():
             compile_kernel(kernel)
         note_compiled()

@@ -9,10 +9,8 @@ from reconstruction.poses.mapping import MAPPER_THREADS
 # of the Cauchy loss: SIFT errors in compressed video have heavy tails (measured: halves the camera error)
 LOSS_SCALE_PX = 0.5
 _MIN_OBSERVATIONS = 15  # points that a frame must observe for a reliable pose
-_ITERATIONS, _TOLERANCE = (
-    40,
-    1e-5,
-)  # of the cost; 1e-6 moves cameras by up to .006 % of their path, their error by 3 %
+_ITERATIONS = 40
+_TOLERANCE = 1e-5  # of the cost; 1e-6 moves cameras by up to .006 % of their path, their error by 3 %
 _ROUGH_ITERATIONS = 8  # before points with a large error are deleted
 _RICH_MODEL_FROM_FRAMES = 30  # with fewer frames a second distortion term overfits
 
