@@ -20,7 +20,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--warm",
         action="store_true",
-        help="instead, compile all kernels now (a minute or two, once after an installation or update); without this "
+        help="instead, compile the kernels of a reconstruction now (a minute or two, once after an installation or update); without this "
         "they compile during the first reconstruction",
     )
     parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
@@ -47,7 +47,7 @@ def _warm() -> int:
     from reconstruction.core.precompiling import Kernel, are_compiled, compile_all
 
     if are_compiled():
-        print("All kernels are compiled on this machine.")
+        print("The kernels of a reconstruction are compiled on this machine.")
         return 0
     start = time.perf_counter()
 
