@@ -20,8 +20,8 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--warm",
         action="store_true",
-        help="instead, compile the kernels of a reconstruction now (a minute or two, once after an installation or update); without this "
-        "they compile during the first reconstruction",
+        help="instead, compile the kernels of a reconstruction now (a minute or two, once after an installation or "
+        "update); without this they compile during the first reconstruction",
     )
     parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
     parser.set_defaults(run=run)
