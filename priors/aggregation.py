@@ -7,6 +7,7 @@ import torch
 from torch.nn import functional
 
 from priors.affinities import affinity_loss
+from priors.keyframe_pool import KeyframePool
 from priors.samples import Room, draw_sample, load_sample, stack
 from reconstruction.depth.network import Aggregation, place_of
 
@@ -14,8 +15,11 @@ ARRAYS = ("cost", "smoothed", "color", "true_depth", "true_ids", "range")
 """Names of the arrays that a room's folder must hold."""
 SCORE = "net_off2"
 """The figure that is least for the best weights."""
+POOL = KeyframePool
+"""Draws the samples where there is CUDA."""
+_SOME = 0.005  # share of a keyframe from which it has a say in the figures of where nothing stands
 
-__all__ = ["ARRAYS", "SCORE", "check", "draw_sample", "losses", "make_network", "stack"]
+__all__ = ["ARRAYS", "POOL", "SCORE", "check", "draw_sample", "losses", "make_network", "stack"]
 
 
 def make_network(config: Any) -> Aggregation:
@@ -31,6 +35,8 @@ def losses(net: Aggregation, batch, config: Any) -> dict[str, torch.Tensor]:
     weight = known * (1 + config.border_weight * border)
     total = weight.sum().clamp_min(1)
     log_share = functional.log_softmax(logits.float(), 1)
+    # Where nothing stands inside of the sweep no bin is right: all are to be equally probable, so that none is sure.
+    nowhere = -log_share.mean(1) - float(np.log(logits.shape[1]))
     low = place.clamp_min(0).floor().long().clamp_max(logits.shape[1] - 2)
     share = (place.clamp_min(0) - low).clamp(0, 1)
     entropy = -(
@@ -47,6 +53,7 @@ def losses(net: Aggregation, batch, config: Any) -> dict[str, torch.Tensor]:
     ).sum() / total
     return {
         "entropy": (weight * entropy).sum() / total,
+        "nowhere": (~known * nowhere).sum() / known.numel(),
         "precision": 0.25 * precision,
         "affinity": config.affinity_weight * affinity_loss(affinity.float(), ids),
     }
@@ -58,12 +65,13 @@ def check(net: Aggregation, rooms: list[Room], keyframes: int) -> dict[str, floa
     sums: dict[str, list[float]] = {}
     rng = np.random.default_rng(0)
     chosen = [(rooms[int(k)], int(rng.integers(1 << 30))) for k in np.linspace(0, len(rooms) - 1, keyframes)]
+    device = next(net.parameters()).device
     for room, number in chosen:
         row = number % len(room)
         sample = load_sample(room, row)
         correlation, smoothed, color, place, _, border, _ = stack([sample])
-        logits, offset, _ = net(correlation, smoothed, color)
-        found, surety = place_of(logits.softmax(1), offset)
+        logits, offset, _ = net(*(tensor.to(device) for tensor in (correlation, smoothed, color)))
+        found, surety = (tensor.cpu() for tensor in place_of(logits.softmax(1), offset))
         start, step = sample.rho
         truth = (start + step * place[0]).numpy()
         known, border = (place[0] >= 0).numpy(), border[0].numpy()
@@ -77,6 +85,8 @@ def check(net: Aggregation, rooms: list[Room], keyframes: int) -> dict[str, floa
                     sums.setdefault(f"{name}_off5{part}", []).append(float((off[mask] > 0.05).mean()))
                     sums.setdefault(f"{name}_off2{part}", []).append(float((off[mask] > 0.02).mean()))
             sums.setdefault(f"{name}_median", []).append(float(np.median(off[known])))
+        if (~known).mean() > _SOME:
+            sums.setdefault("sure_nowhere", []).append(float((surety[0].numpy() > 0.6)[~known].mean()))
         sure = known & (surety[0].numpy() > 0.6)
         sums.setdefault("sure", []).append(float(sure.sum() / max(known.sum(), 1)))
         off = np.abs(errors["net"] - 1)

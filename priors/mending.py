@@ -190,13 +190,13 @@ def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
     def add(name: str, value: float) -> None:
         sums.setdefault(name, []).append(float(value))
 
-    rng = np.random.default_rng(0)
+    rng, device = np.random.default_rng(0), next(net.parameters()).device
     chosen = [(rooms[int(k)], int(rng.integers(1 << 30))) for k in np.linspace(0, len(rooms) - 1, keyframes)]
     for room, number in chosen:
         for agreed in (False, True):
             sample = load_sample(room, number % len(room), agreed=agreed)
             features, likelihood, weight, ids = stack([sample])
-            logits, affinity = net(features)
+            logits, affinity = (tensor.cpu() for tensor in net(features.to(device)))
             share = logits.float().masked_fill(likelihood <= 0.5 * _MISSING, _MISSING).softmax(1)[0].numpy()
             mark = "agreed_" if agreed else ""
             add(mark + "entropy", _entropy(logits, likelihood, weight))

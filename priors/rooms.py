@@ -43,6 +43,7 @@ _OBJECTS = (8, 26)  # things in a room
 _FRAMES_A_STEP = (
     8.0  # frames of a phone's film from keyframe to keyframe: the shutter is open for a share of one
 )
+_ROUGH = 1 / 3  # share of films with less exact cameras
 _OPEN = 0.4  # share of rooms without one or two of their walls: nothing stands there
 _AS_FURNISHED = (
     0.4  # share of rooms with the generator's own materials, which windows measure nearly everywhere
@@ -148,11 +149,14 @@ class Film:
         )
 
     def shaken(self, path: np.ndarray) -> np.ndarray:
-        """Return poses off by what bundle adjustment leaves: up to .15 mrad and .5 mm, as much as this film drew."""
+        """Return poses off by what bundle adjustment leaves, as much as this film drew.
+
+        Up to .15 mrad and .5 mm; four times that in one film of three, as in films of real rooms.
+        """
         from scipy.spatial.transform import Rotation
 
         rng = np.random.default_rng((self.number, 8))
-        size = rng.uniform(0, 1)
+        size = rng.uniform(0, 1) * (4 if rng.random() < _ROUGH else 1)
         out = path.copy()
         turn = Rotation.from_rotvec(1.5e-4 * size * rng.standard_normal((len(path), 3))).as_matrix()
         out[:, :3, :3] = path[:, :3, :3] @ turn

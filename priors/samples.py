@@ -38,8 +38,8 @@ ARRAYS = {
     "mesh_true_ids": "uint16 (v,) true entity of each vertex, 0: far from all (`surfaces.true_ids`)",
 }
 """Arrays of a room's folder, by name; `priors.dataset --keep` chooses among them."""
-_CROP = (192, 224)
-_JUMP = 1.03  # ratio of depths from which two neighbors are two surfaces
+CROP = (192, 224)
+JUMP = 1.03  # ratio of depths from which two neighbors are two surfaces
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
     """Draw a keyframe, a crop of it, and disturb what does not matter."""
     row = int(rng.integers(len(room)))
     h, w = room.arrays["color"].shape[1:3]
-    ch, cw = min(_CROP[0], h), min(_CROP[1], w)
+    ch, cw = min(CROP[0], h), min(CROP[1], w)
     y, x = int(rng.integers(h - ch + 1)), int(rng.integers(w - cw + 1))
     sample = load_sample(room, row, (slice(y, y + ch), slice(x, x + cw)))
     correlation, smoothed, color = sample.correlation, sample.smoothed, sample.color
@@ -154,7 +154,7 @@ def near_steps(values: np.ndarray, reach_px: int) -> np.ndarray:
     step = np.zeros(values.shape, np.uint8)
     for axis in (0, 1):
         a, b = np.moveaxis(values, axis, 0)[1:], np.moveaxis(values, axis, 0)[:-1]
-        jump = (np.maximum(a, b) > _JUMP * np.minimum(a, b)).astype(np.uint8)
+        jump = (np.maximum(a, b) > JUMP * np.minimum(a, b)).astype(np.uint8)
         view = np.moveaxis(step, axis, 0)
         view[1:] |= jump
         view[:-1] |= jump

@@ -9,8 +9,10 @@ if it had not been stopped. On a CPU all is float32; where there is CUDA, bfloat
 
 import argparse
 import json
+import os
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -35,6 +37,7 @@ class TrainConfig:
     out: str
     start: str = ""  # weights of the same network to begin with; "" = random ones
     steps: int = 4000
+    minutes: float = 0.0  # > 0: the learning rate falls with this time, and training ends then or at `steps`
     batch: int = 8
     rate: float = 2e-3
     decay: float = 1e-4
@@ -78,11 +81,46 @@ def draw_batch(task, rooms: list[Room], config: TrainConfig, step: int) -> list[
     )
 
 
-def rate_at(step: int, config: TrainConfig) -> float:
-    """Return the learning rate: a linear start, then half a cosine down to zero."""
+class Batches(torch.utils.data.Dataset):
+    """Batches by step, for processes that draw them."""
+
+    def __init__(self, task, rooms: list[Room], config: TrainConfig) -> None:
+        """Draw from these rooms."""
+        self._task, self._rooms, self._config = task, rooms, config
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return self._config.steps
+
+    def __getitem__(self, step: int) -> list[torch.Tensor]:
+        """Return the samples of a step."""
+        return draw_batch(self._task, self._rooms, self._config, step)
+
+
+def loaded(task, rooms: list[Room], config: TrainConfig, steps: range) -> Iterator[list[torch.Tensor]]:
+    """Yield the batches of steps, drawn by as many processes as there are cores."""
+    loader = torch.utils.data.DataLoader(
+        Batches(task, rooms, config), sampler=list(steps), batch_size=None, num_workers=os.cpu_count() or 1,
+        pin_memory=True, prefetch_factor=4, worker_init_fn=_one_thread,
+    )  # fmt: skip
+    return iter(loader)
+
+
+def _one_thread(_: int) -> None:
+    import cv2
+    import numba
+
+    cv2.setNumThreads(1)
+    numba.set_num_threads(1)
+
+
+def rate_at(step: int, config: TrainConfig, seconds: float = 0.0) -> float:
+    """Return the learning rate: a linear start, then half a cosine down to zero, over steps or over time."""
     if step < config.warm_up:
         return config.rate * (step + 1) / config.warm_up
     share = (step - config.warm_up) / max(1, config.steps - config.warm_up)
+    if config.minutes > 0:
+        share = seconds / (60 * config.minutes)
     return float(config.rate * 0.5 * (1 + np.cos(np.pi * min(share, 1.0))))
 
 
@@ -98,12 +136,17 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     torch.manual_seed(config.seed)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     task = NETWORKS[config.network]
+    torch.backends.cudnn.benchmark = device == "cuda"  # all crops have one size
     net = task.make_network(config).to(device)
     if config.start:
         weights = load_file(config.start)
         net.load_state_dict({name: value.to(net.state_dict()[name].dtype) for name, value in weights.items()})
     slow = task.make_network(config).to(device)
     slow.load_state_dict(net.state_dict())
+    averaged, current = (
+        [value for value in model.state_dict().values() if value.dtype.is_floating_point]
+        for model in (slow, net)
+    )
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=config.decay)
     first, best = 0, float("inf")
     checkpoint = out / "checkpoint.pt"
@@ -122,17 +165,30 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     held: dict[str, list[Room]] = {}
     started, seen = time.perf_counter(), 0
     ahead, coming = ThreadPoolExecutor(1), None
+    pool = task.POOL(device) if device == "cuda" and hasattr(task, "POOL") else None
+    drawn: Iterator[list[torch.Tensor]] = iter(())
     for step in range(first, config.steps):
         if not rooms or step % config.refresh_every == 0:
             rooms = open_rooms(data / "train", task.ARRAYS)
             held = {name: open_rooms(data / name, task.ARRAYS) for name in config.held_out}
+            if pool is not None:
+                pool.add(rooms)
+            elif device == "cuda":
+                drawn = loaded(task, rooms, config, range(step, min(step + config.refresh_every, config.steps)))
+        seconds = time.perf_counter() - started
+        last = step + 1 == config.steps or 0 < 60 * config.minutes <= seconds
         for group in optimizer.param_groups:
-            group["lr"] = rate_at(step, config)
-        # The next samples are drawn while this step is computed, but for those that may come from newer rooms.
-        coming = coming or ahead.submit(draw_batch, task, rooms, config, step)
-        batch = [tensor.to(device) for tensor in coming.result()]
-        fresh = (step + 1) % config.refresh_every == 0 or step + 1 == config.steps
-        coming = None if fresh else ahead.submit(draw_batch, task, rooms, config, step + 1)
+            group["lr"] = rate_at(step, config, seconds)
+        if pool is not None:
+            batch = pool.draw(config.batch, torch.Generator().manual_seed(config.seed * 1_000_003 + step))
+        elif device == "cuda":
+            batch = [tensor.to(device, non_blocking=True) for tensor in next(drawn)]
+        else:
+            # The next samples are drawn while this step is computed, but for those that may come from newer rooms.
+            coming = coming or ahead.submit(draw_batch, task, rooms, config, step)
+            batch = [tensor.to(device) for tensor in coming.result()]
+            fresh = (step + 1) % config.refresh_every == 0 or last
+            coming = None if fresh else ahead.submit(draw_batch, task, rooms, config, step + 1)
         net.train()
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
             parts = task.losses(net, batch, config)
@@ -143,29 +199,26 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
         optimizer.step()
         keep = min(config.ema, (step + 1) / (step + 10))
         with torch.no_grad():
-            for a, b in zip(slow.state_dict().values(), net.state_dict().values(), strict=True):
-                if a.dtype.is_floating_point:
-                    a.lerp_(b, 1 - keep)
-                else:
+            torch._foreach_lerp_(averaged, current, 1 - keep)
+            for a, b in zip(slow.buffers(), net.buffers(), strict=True):
+                if not a.dtype.is_floating_point:
                     a.copy_(b)
         seen += config.batch
-        for name, value in parts.items():
-            log.add_scalar(f"train/{name}", value.item(), step)
+        if device == "cpu" or (step + 1) % 50 == 0:  # reading a value waits for the device
+            for name, value in parts.items():
+                log.add_scalar(f"train/{name}", value.item(), step)
         if (step + 1) % 50 == 0:
             speed = seen / (time.perf_counter() - started)
             told = ", ".join(f"{n} {v.item():.3f}" for n, v in parts.items())
             print(f"step {step + 1}: {told}; {speed:.2f} crops/s, {len(rooms)} rooms", flush=True)
-        if (step + 1) % config.check_every == 0 or step + 1 == config.steps:
+        if (step + 1) % config.check_every == 0 or last:
             slow.eval()
             figures = {}
             for name, split in [("train", rooms[-60:]), *held.items()]:
                 if split:
-                    figures[name] = task.check(
-                        slow.cpu() if device == "cuda" else slow, split, config.check_keyframes
-                    )
+                    figures[name] = task.check(slow, split, config.check_keyframes)
                     for key, value in figures[name].items():
                         log.add_scalar(f"{name}/{key}", value, step)
-            slow.to(device)
             shown = {n: {k: round(v, 4) for k, v in f.items()} for n, f in figures.items()}
             print(f"step {step + 1}: {json.dumps(shown)}", flush=True)
             with (out / "curve.jsonl").open("a") as file:
@@ -190,7 +243,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
         if (
             (step + 1) % config.save_every == 0
             or (step + 1) % config.check_every == 0
-            or step + 1 == config.steps
+            or last
         ):
             state = {
                 "net": net.state_dict(), "slow": slow.state_dict(), "optimizer": optimizer.state_dict(),
@@ -198,6 +251,8 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
             }  # fmt: skip
             torch.save(state, checkpoint.with_suffix(".part"))
             checkpoint.with_suffix(".part").replace(checkpoint)
+        if last:
+            break
     ahead.shutdown()
     log.close()
 

@@ -66,7 +66,7 @@ class GsplatBackend:
         fixed = self._tensor(invert_rigid(world_from_camera))
         camera_from_world = (torch.eye(4, device=self._device) - twist) @ fixed
         color, alpha, normal, _, distortion, median, meta = self._rasterization(
-            p[:, :3], p[:, 3:7], scales, torch.sigmoid(p[:, 9]), rgb, camera_from_world[None],
+            p[:, :3], p[:, 3:7], scales, torch.sigmoid(p[:, 9]), rgb[None], camera_from_world[None],
             self._tensor(camera.matrix)[None], camera.width, camera.height, near_plane=settings.near,
             render_mode="RGB+ED", distloss=True,
         )  # fmt: skip
@@ -153,7 +153,7 @@ class GsplatBackend:
         rows = torch.nonzero((radii > 0).all(dim=1))[:, 0]
         depths = meta["depths"].reshape(-1)[rows]
         return StepResult(
-            {name: float(value) for name, value in terms.items()}, float(total), by[0], by[1].astype(np.float64),
+            {name: value.item() for name, value in terms.items()}, total.item(), by[0], by[1].astype(np.float64),
             by[2].astype(np.float64), by[3].astype(np.float64), rows.int().cpu().numpy(),
             depths.detach().cpu().numpy(), contribution, errors,
         )  # fmt: skip
