@@ -53,7 +53,7 @@ class DepthConfig:
     min_speckle_px: int = 60
     """Smaller islands of measured depth are dropped."""
 
-    prior: Literal["none", "mending", "both"] = "mending"
+    prior: Literal["none", "mending", "both"] = "both"
     """The networks in use (docs/priors.md): "mending" puts every pixel on one of the surfaces around it or on none;
     with "both", depth is predicted from the costs before that, where nothing was measured."""
 
