@@ -115,7 +115,7 @@ def test_the_weights_are_small_and_load_quickly():
 
 def test_predictions_fill_what_is_unknown_and_change_nothing_else():
     capture = make_test_capture(10, 160, 120)
-    plain = DepthConfig(depth_side_px=160, sweep_side_px=160, complete=False)
+    plain = DepthConfig(depth_side_px=160, sweep_side_px=160, complete=False, prior="mending")
     before = gather_evidence(capture.posed, plain)
     after = gather_evidence(capture.posed, replace(plain, prior="both", prior_surety=0.3))
     known = before.depth > 0
