@@ -116,11 +116,16 @@ class KeyframePool:
         mixed = torch.gather(color, 1, order[:, :, None, None].expand_as(color))
         color = torch.where(chance(0.3), mixed, color)
         color = torch.where(chance(0.15), color.mean(1, keepdim=True), color)
-        gain = self._normal(0.25, (n, 1, 1, 1), generator).exp() * self._normal(0.1, (n, 3, 1, 1), generator).exp()
+        gain = (
+            self._normal(0.25, (n, 1, 1, 1), generator).exp()
+            * self._normal(0.1, (n, 3, 1, 1), generator).exp()
+        )
         power = self._normal(0.25, (n, 1, 1, 1), generator).exp()
         color = color.clamp(0, 1) ** power * gain + self._normal(0.04, (n, 1, 1, 1), generator)
         color = torch.where(chance(0.25), self._blurred(color, generator), color)
-        noise = torch.randn(color.shape, device=self._device) * self._uniform(0, 0.03, (n, 1, 1, 1), generator)
+        noise = torch.randn(color.shape, device=self._device) * self._uniform(
+            0, 0.03, (n, 1, 1, 1), generator
+        )
         color = torch.where(chance(0.5), color + noise, color)
         return torch.where(chance(0.03), torch.full_like(color, 0.5), color).clamp(0, 1)
 

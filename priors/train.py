@@ -174,7 +174,9 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
             if pool is not None:
                 pool.add(rooms)
             elif device == "cuda":
-                drawn = loaded(task, rooms, config, range(step, min(step + config.refresh_every, config.steps)))
+                drawn = loaded(
+                    task, rooms, config, range(step, min(step + config.refresh_every, config.steps))
+                )
         seconds = time.perf_counter() - started
         last = step + 1 == config.steps or 0 < 60 * config.minutes <= seconds
         for group in optimizer.param_groups:
@@ -240,11 +242,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
                     "figures": json.dumps(figures),
                 }
                 save_file(weights, str(out / "best.safetensors"), metadata=about)
-        if (
-            (step + 1) % config.save_every == 0
-            or (step + 1) % config.check_every == 0
-            or last
-        ):
+        if (step + 1) % config.save_every == 0 or (step + 1) % config.check_every == 0 or last:
             state = {
                 "net": net.state_dict(), "slow": slow.state_dict(), "optimizer": optimizer.state_dict(),
                 "step": step + 1, "best": best,
