@@ -185,19 +185,20 @@ def play(studio: StudioPage, browser: Page) -> None:
     viewer.press("Undo")
     viewer.until(lambda: "split" not in viewer.acts()[-1], "the split is undone")
 
-    viewer.select(second)
+    to_move = next(thing for thing in things[1:] if free_arrow(viewer, thing) is not None)
+    viewer.select(to_move)
     viewer.press("Move and turn")
     viewer.until(lambda: viewer.part.gizmo.handle is not None, "the gizmo is there")
     browser.settle(1.5)
-    place = studio.pose_of(second)
-    viewer_drag(viewer, place)
+    place = studio.pose_of(to_move)
+    drag_arrow(viewer, to_move)
     viewer.until(lambda: "move" in viewer.acts()[-1], "the move is written")
     moved = np.array(viewer.acts()[-1]["move"]["to"])
     assert np.linalg.norm(moved - place[:3, 3]) > 0.01
-    assert np.allclose(studio.pose_of(second)[:3, 3], moved, atol=1e-3)
+    assert np.allclose(studio.pose_of(to_move)[:3, 3], moved, atol=1e-3)
     viewer.press("Undo")
     viewer.until(lambda: len(viewer.acts()) == 1, "the move is undone")
-    viewer.until(lambda: np.allclose(studio.pose_of(second), place, atol=1e-6), "it is back in its place")
+    viewer.until(lambda: np.allclose(studio.pose_of(to_move), place, atol=1e-6), "it is back in its place")
 
     before = studio.revision
     viewer.press("Even if things move")
@@ -212,13 +213,32 @@ def play(studio: StudioPage, browser: Page) -> None:
     viewer.until(lambda: studio.revision != before, "the scene after is shown again")
 
 
-def viewer_drag(viewer: Viewer, place: np.ndarray) -> None:
-    """Drag the arrow of the gizmo that lies most across the view."""
-    axes = [place[:3, k] for k in range(3)]
-    across = [
-        np.linalg.norm(np.subtract(viewer.at(place[:3, 3] + 0.1 * a), viewer.at(place[:3, 3]))) for a in axes
-    ]
-    axis = axes[int(np.argmax(across))]
-    start, end = place[:3, 3] + _ARROW_M * axis, place[:3, 3] + 3 * _ARROW_M * axis
+def free_arrow(viewer: Viewer, thing: int) -> np.ndarray | None:
+    """Return an axis (3,) of the gizmo across the view whose arrow no object and no panel hides, or None."""
+    place, eye = viewer.page.pose_of(thing), viewer.camera()[0][:3, 3]
+
+    def shown(point: np.ndarray) -> bool:
+        x, y = viewer.at(point)
+        return viewer.browser.evaluate(f"(document.elementFromPoint({x}, {y}) || {{}}).tagName") == "CANVAS"
+
+    def hidden(point: np.ndarray) -> bool:
+        hit = viewer.page.pickable.cast(eye, point - eye, viewer.page.unpickable)
+        return hit is not None and hit.distance < np.linalg.norm(point - eye)
+
+    def across(axis: np.ndarray) -> float:
+        return np.linalg.norm(np.subtract(viewer.at(place[:3, 3] + 0.1 * axis), viewer.at(place[:3, 3])))
+
+    for axis in sorted((place[:3, k] for k in range(3)), key=across)[:0:-1]:
+        start, end = (place[:3, 3] + length * _ARROW_M * axis for length in (1, 3))
+        if shown(start) and shown(end) and not hidden(start):
+            return axis
+    return None
+
+
+def drag_arrow(viewer: Viewer, thing: int) -> None:
+    """Drag an object's arrow (`free_arrow`) along itself."""
+    axis, place = free_arrow(viewer, thing), viewer.page.pose_of(thing)
+    assert axis is not None
+    start, end = (place[:3, 3] + length * _ARROW_M * axis for length in (1, 3))
     viewer.browser.drag(viewer.at(start), viewer.at(end), steps=20)
     viewer.browser.settle(1.0)
