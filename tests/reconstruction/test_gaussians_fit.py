@@ -175,9 +175,8 @@ def test_gsplat_agrees_with_the_cpu_in_image_and_derivatives(noisy):
         results.append(backend.step(p, pose, target, np.ones(3), np.zeros(3), weights, settings))
     assert np.abs(renders[0].color - renders[1].color).mean() < 0.01
     assert np.corrcoef(renders[0].contribution, renders[1].contribution)[0, 1] > 0.99
-    # Cut-offs and low-pass filters differ, and seeds leave gaps: on an H100 the L1 was .030, on the CPU .022.
     for name in ("l1", "ssim", "depth"):
-        assert results[1].terms[name] == pytest.approx(results[0].terms[name], rel=0.5)
+        assert results[1].terms[name] == pytest.approx(results[0].terms[name], rel=0.1)
     for columns in (slice(0, 3), slice(9, 10), slice(10, 13)):
         a, b = (r.parameters[:, columns].ravel() for r in results)
         assert np.corrcoef(a, b)[0, 1] > 0.9
