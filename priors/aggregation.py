@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional
 
 from priors.affinities import affinity_loss
-from priors.keyframe_pool import KeyframePool
+from priors.aggregation_pool import AggregationPool
 from priors.samples import Room, draw_sample, load_sample, stack
 from reconstruction.depth.network import Aggregation, place_of
 
@@ -15,7 +15,7 @@ ARRAYS = ("cost", "smoothed", "color", "true_depth", "true_ids", "range")
 """Names of the arrays that a room's folder must hold."""
 SCORE = "net_off2"
 """The figure that is least for the best weights."""
-POOL = KeyframePool
+POOL = AggregationPool
 """Draws the samples where there is CUDA."""
 _SOME = 0.005  # share of a keyframe from which it has a say in the figures of where nothing stands
 

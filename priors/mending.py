@@ -8,6 +8,19 @@ import numpy as np
 import torch
 
 from priors.affinities import affinity_loss
+from priors.mending_pool import (
+    AGREED,
+    BESIDE_PX,
+    BESIDE_WEIGHT,
+    CROP,
+    EXCHANGED,
+    LEFT_OUT,
+    MISSING,
+    NONE,
+    SPREAD,
+    ZOOM,
+    MendingPool,
+)
 from priors.samples import Room, near_steps, other_light
 from reconstruction.depth.candidates import OFFSETS, candidate_depths, choose_candidates
 from reconstruction.depth.evidence import MEASURED, PREDICTED, inverse
@@ -18,17 +31,10 @@ ARRAYS = ("picture", "depth", "origin", "agreed", "correlation", "surety", "exac
 """Names of the arrays that a room's folder must hold."""
 SCORE = "entropy"
 """The figure that is least for the best weights."""
-_CROP = (192, 224)
-_ZOOM = (0.55, 1.25)
-_EXCHANGED = 0.3  # share of samples whose rows and columns are exchanged
-_LEFT_OUT = 0.5  # share of samples without predictions
-_AGREED = 0.2  # share of samples with what was measured alone
-_BESIDE_PX, _BESIDE_WEIGHT = 9, 4  # around steps of the true depth a pixel weighs more
+POOL = MendingPool
+"""Draws the samples where there is CUDA."""
 _OFF = 0.05
 _SOME = 0.005  # share of a keyframe from which it has a say in the figures of where nothing stands
-_SPREAD = 0.015  # scale of a right candidate's relative error, the noise of the measurement (Laplace)
-_NONE = -3.0  # log likelihood of "none of them": that of a candidate three spreads off
-_MISSING = -1e4
 
 
 @dataclass(frozen=True)
@@ -110,16 +116,16 @@ def draw_sample(room: Room, rng: np.random.Generator) -> Sample:
     """Draw a keyframe, a crop of it, the maps it comes with, and disturb what does not matter."""
     row = int(rng.integers(len(room)))
     h, w = room.arrays["depth"].shape[1:3]
-    exchanged = bool(rng.random() < _EXCHANGED)
-    size = _CROP[::-1] if exchanged else _CROP
-    zoom = float(np.exp(rng.uniform(*np.log(_ZOOM))))
+    exchanged = bool(rng.random() < EXCHANGED)
+    size = CROP[::-1] if exchanged else CROP
+    zoom = float(np.exp(rng.uniform(*np.log(ZOOM))))
     zoom = max(zoom, size[0] / h, size[1] / w)
     high, wide = (min(round(s / zoom), limit) for s, limit in zip(size, (h, w), strict=True))
     y, x = int(rng.integers(h - high + 1)), int(rng.integers(w - wide + 1))
     disturb = Disturbance(size, bool(rng.random() < 0.5), exchanged, rng)
     return load_sample(
         room, row, (slice(y, y + high), slice(x, x + wide)), disturb=disturb,
-        agreed=bool(rng.random() < _AGREED), predictions=bool(rng.random() >= _LEFT_OUT),
+        agreed=bool(rng.random() < AGREED), predictions=bool(rng.random() >= LEFT_OUT),
     )  # fmt: skip
 
 
@@ -138,14 +144,14 @@ def likelihoods(sample: Sample) -> np.ndarray:
     Where nothing stands (truth 0) no candidate is right.
     """
     out = np.empty((len(sample.candidates) + 1, *sample.truth.shape), np.float32)
-    out[-1] = _NONE
+    out[-1] = NONE
     _compare(sample.candidates, sample.truth, out)
     return out
 
 
 def _weights(sample: Sample) -> np.ndarray:
     there = (sample.candidates > 0).any(0)
-    return (there * np.where(beside_steps(sample.truth), _BESIDE_WEIGHT, 1)).astype(np.float32)
+    return (there * np.where(beside_steps(sample.truth), BESIDE_WEIGHT, 1)).astype(np.float32)
 
 
 @numba.njit(cache=True)
@@ -155,19 +161,19 @@ def _compare(candidates, truth, out):  # pragma: no cover - compiled
         for y in range(h):
             for x in range(w):
                 c = candidates[j, y, x]
-                out[j, y, x] = -abs(c * truth[y, x] - np.float32(1)) / np.float32(_SPREAD)
+                out[j, y, x] = -abs(c * truth[y, x] - np.float32(1)) / np.float32(SPREAD)
                 if c <= 0:
-                    out[j, y, x] = np.float32(_MISSING)
+                    out[j, y, x] = np.float32(MISSING)
 
 
 def beside_steps(depth: np.ndarray) -> np.ndarray:
     """Return which pixels (h, w) lie within a few pixels of a step of the true depth."""
-    return near_steps(depth, _BESIDE_PX)
+    return near_steps(depth, BESIDE_PX)
 
 
 def _entropy(logits: torch.Tensor, likelihood, weight) -> torch.Tensor:
     """Negative log likelihood of the true depth: a mixture of the candidates and of "none of them"."""
-    logits = logits.float().masked_fill(likelihood <= 0.5 * _MISSING, _MISSING)
+    logits = logits.float().masked_fill(likelihood <= 0.5 * MISSING, MISSING)
     told = torch.logsumexp(logits + likelihood, 1) - torch.logsumexp(logits, 1)
     return -(weight * told).sum() / weight.sum().clamp_min(1)
 
@@ -197,7 +203,7 @@ def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
             sample = load_sample(room, number % len(room), agreed=agreed)
             features, likelihood, weight, ids = stack([sample])
             logits, affinity = (tensor.cpu() for tensor in net(features.to(device)))
-            share = logits.float().masked_fill(likelihood <= 0.5 * _MISSING, _MISSING).softmax(1)[0].numpy()
+            share = logits.float().masked_fill(likelihood <= 0.5 * MISSING, MISSING).softmax(1)[0].numpy()
             mark = "agreed_" if agreed else ""
             add(mark + "entropy", _entropy(logits, likelihood, weight))
             add(mark + "affinity", affinity_loss(affinity.float(), ids))

@@ -53,6 +53,7 @@ class TrainConfig:
     check_keyframes: int = 48
     held_out: tuple[str, ...] = ("shapes", "rooms")
     refresh_every: int = 200  # steps between looks for rooms that were finished meanwhile
+    compiled: bool = False  # where there is CUDA: the loss by torch.compile, which takes a minute first
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -167,12 +168,17 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     ahead, coming = ThreadPoolExecutor(1), None
     pool = task.POOL(device) if device == "cuda" and hasattr(task, "POOL") else None
     drawn: Iterator[list[torch.Tensor]] = iter(())
+    losses = torch.compile(task.losses) if config.compiled and device == "cuda" else task.losses
     for step in range(first, config.steps):
         if not rooms or step % config.refresh_every == 0:
             rooms = open_rooms(data / "train", task.ARRAYS)
             held = {name: open_rooms(data / name, task.ARRAYS) for name in config.held_out}
-            if pool is not None:
+            if pool is not None and not len(pool):
                 pool.add(rooms)
+            elif pool is not None:  # read beside the next steps
+                if coming is not None:
+                    pool.take(coming.result())
+                coming = ahead.submit(pool.read, rooms)
             elif device == "cuda":
                 drawn = loaded(
                     task, rooms, config, range(step, min(step + config.refresh_every, config.steps))
@@ -193,7 +199,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
             coming = None if fresh else ahead.submit(draw_batch, task, rooms, config, step + 1)
         net.train()
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
-            parts = task.losses(net, batch, config)
+            parts = losses(net, batch, config)
         total = sum(parts.values())
         optimizer.zero_grad(set_to_none=True)
         total.backward()

@@ -20,11 +20,12 @@ SPREAD = np.float32(0.02)
 """Relative difference of depths at which a candidate has half a say in another one's probability."""
 _KEPT = np.float32(0.9)  # a pixel keeps its own depth from this share of the mode's probability on
 _NO_MODE = np.float32(0.01)  # candidates less probable than this are no mode
-_JUMP = np.float32(
-    0.012
-)  # change of inverse depth from pixel to pixel up to which a surface goes on, relative
-_SLOPE_REACH, _SLOPE_STRIDE = 6, 2  # pixels whose slopes are averaged: far candidates amplify a slope's noise
-_MOST_BENT = np.float32(0.3)  # relative change of inverse depth up to which a plane is extended
+JUMP = np.float32(0.012)
+"""Relative change of inverse depth from pixel to pixel up to which a surface goes on."""
+SLOPE_REACH, SLOPE_STRIDE = 6, 2
+"""Pixels whose slopes are averaged: far candidates amplify a slope's noise."""
+MOST_BENT = np.float32(0.3)
+"""Relative change of inverse depth up to which a plane is extended."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -39,15 +40,15 @@ def _mean_slopes(rho, gx, gy, out_x, out_y):  # pragma: no cover - compiled
                 out_y[y, x] = 0.0
                 continue
             sx, sy, n = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for dy in range(-_SLOPE_REACH, _SLOPE_REACH + 1, _SLOPE_STRIDE):
+            for dy in range(-SLOPE_REACH, SLOPE_REACH + 1, SLOPE_STRIDE):
                 j = y + dy
                 if j < 0 or j >= h:
                     continue
-                for dx in range(-_SLOPE_REACH, _SLOPE_REACH + 1, _SLOPE_STRIDE):
+                for dx in range(-SLOPE_REACH, SLOPE_REACH + 1, SLOPE_STRIDE):
                     i = x + dx
                     if i < 0 or i >= w or rho[j, i] <= 0.0:
                         continue
-                    if abs(rho[j, i] - r - gx[y, x] * dx - gy[y, x] * dy) < _JUMP * r:
+                    if abs(rho[j, i] - r - gx[y, x] * dx - gy[y, x] * dy) < JUMP * r:
                         sx += gx[j, i]
                         sy += gy[j, i]
                         n += np.float32(1.0)
@@ -71,7 +72,7 @@ def _extend(rho, gx, gy, offsets, out):  # pragma: no cover - compiled
                 if r <= 0.0:
                     continue
                 there = r - gx[j, i] * dx - gy[j, i] * dy
-                if abs(there - r) < _MOST_BENT * r:
+                if abs(there - r) < MOST_BENT * r:
                     out[k, y, x] = there
 
 
@@ -86,7 +87,7 @@ def candidate_depths(rho: np.ndarray) -> np.ndarray:
     from reconstruction.depth.refine import fit_slopes
 
     fitted, gx, gy, sx, sy = (np.zeros(rho.shape, np.float32) for _ in range(5))
-    fit_slopes(rho, float(_JUMP), fitted, gx, gy)
+    fit_slopes(rho, float(JUMP), fitted, gx, gy)
     _mean_slopes(rho, gx, gy, sx, sy)
     out = np.empty((len(OFFSETS), *rho.shape), np.float32)
     _extend(rho, sx, sy, OFFSETS, out)

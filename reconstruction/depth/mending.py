@@ -20,8 +20,10 @@ from reconstruction.depth.evidence import COMPLETED, MEASURED, PREDICTED, Eviden
 from reconstruction.depth.images import small_color
 
 WEIGHTS = Path(__file__).parent / "weights" / "mending.safetensors"
-_AROUND = 49  # pixels of the window whose mean depth a pixel's depth is told against
-_MANY_VIEWS = 10.0
+AROUND_PX = 49
+"""Side of the window whose mean depth a pixel's depth is told against."""
+MANY_VIEWS = 10.0
+"""Counts of views are told as shares of it."""
 _OWN_ODDS = 8.0  # odds of a pixel's own depth over those in the rooms of the training (docs/priors.md)
 _LOOK_THROUGH = 2  # views that see something beyond a point, from which it may be dropped
 
@@ -50,8 +52,8 @@ def mending_features(
 
     known = depth > 0
     log = np.where(known, np.log(np.maximum(depth, 1e-9)), 0).astype(np.float32)
-    amount = cv2.boxFilter(known.astype(np.float32), -1, (_AROUND, _AROUND), normalize=False)
-    around = cv2.boxFilter(log, -1, (_AROUND, _AROUND), normalize=False) / np.maximum(amount, 1)
+    amount = cv2.boxFilter(known.astype(np.float32), -1, (AROUND_PX, AROUND_PX), normalize=False)
+    around = cv2.boxFilter(log, -1, (AROUND_PX, AROUND_PX), normalize=False) / np.maximum(amount, 1)
     middle = np.median(log[known]) if known.any() else 0.0
     beside = np.where(known, log - around, 0)
     out = np.empty((FEATURES, *depth.shape), np.float32)
@@ -62,8 +64,8 @@ def mending_features(
     for channel, kind in enumerate((MEASURED, COMPLETED, PREDICTED), start=6):
         out[channel] = origin == kind
     out[9] = np.where(origin == MEASURED, np.clip(correlation, 0, 1), 0)
-    out[10] = np.minimum(agree / _MANY_VIEWS, 1)
-    out[11] = np.minimum(through / _MANY_VIEWS, 1)
+    out[10] = np.minimum(agree / MANY_VIEWS, 1)
+    out[11] = np.minimum(through / MANY_VIEWS, 1)
     out[12] = np.where(origin == PREDICTED, surety, 0)
     return out
 
