@@ -16,6 +16,8 @@ from registry.schema import is_scene_id
 
 _REVISION = re.compile(r"[0-9a-f]{16}")
 _SHA256 = re.compile(r"[0-9a-f]{1,64}")
+_SCENE_IDS = re.compile(r"(?:[a-z0-9_]{1,64}\n)*")
+_REVISIONS = re.compile(r"(?:[0-9a-f]{16}\n)*")
 _STATUS = ("stable", "unstable", "unchecked")
 _MAX_TEXT, _MAX_METRICS, _MAX_OBJECTS = 4096, 100_000, 1_000_000
 _RATES = (
@@ -47,6 +49,25 @@ class SceneRow:
 def is_revision(value: Any) -> bool:
     """Return whether a value is a revision: 16 hexadecimal digits."""
     return isinstance(value, str) and _REVISION.fullmatch(value) is not None
+
+
+def are_scene_ids(values: list[Any]) -> bool:
+    """Return whether all values are valid scene ids: `is_scene_id` of each, much faster for many."""
+    return _all_match(_SCENE_IDS, values)
+
+
+def are_revisions(values: list[Any]) -> bool:
+    """Return whether all values are revisions: `is_revision` of each, much faster for many."""
+    return _all_match(_REVISIONS, values)
+
+
+def _all_match(lines: re.Pattern[str], values: list[Any]) -> bool:
+    """Return whether all values are texts of one line that match; the pattern is of all lines, each with its end."""
+    try:
+        text = "\n".join([*values, ""])
+    except TypeError:  # one is no text
+        return False
+    return text.count("\n") == len(values) and lines.fullmatch(text) is not None
 
 
 def row_of(values: tuple[Any, ...]) -> SceneRow:
