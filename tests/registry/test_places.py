@@ -258,7 +258,6 @@ def test_many_processes_push_and_lose_nothing(kind, processes, each, request, tm
             [
                 sys.executable,
                 exchange_worker.__file__,
-                "push",
                 address,
                 *map(str, bundles[n * each : (n + 1) * each]),
             ],
