@@ -1,7 +1,7 @@
 """kill -9 at random moments of publish, pack, add and push: is everything that can be seen whole, and does it go on?
 
 Usage:
-    python -m benchmarks.registry_kills --kills 200 [--verbs publish,pack,add,push,push_s3] [--seed N] [--json FILE]
+    python -m benchmarks.registry_kills --kills 200 [--verbs publish,pack,…] [--seed N] [--json FILE]
 
 The kills are spread evenly over the verbs. A process repeats its verb with two revisions of a scene in turn; it is
 killed up to 0.25 s after its first turn, which is a random moment of a turn. After every kill:
@@ -9,7 +9,8 @@ killed up to 0.25 s after its first turn, which is a random moment of a turn. Af
 - publish, add: the index has no malformed row, the scenes of the turns that were done are there, every scene verifies,
   every folder with the name of a revision is an intact bundle, no lock is held;
 - pack: the file is that of one of the revisions, byte by byte;
-- push (to a folder, and to an S3 server): every entry of the index has its pack, every pack verifies.
+- push (to a folder, and to an S3 server), publish_s3 (to a registry on that server): every entry of the index has its
+  pack, every pack verifies, the scenes of the turns that were done are there.
 
 At the end a new process does the verb again, or finishes every interrupted push. It must not wait, and must remove what
 killed ones left more than a minute ago (the times of the files are set back). `left` counts kills that left a temporary
@@ -31,16 +32,16 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.s3_server import s3_server
-from registry import SceneBundle, SceneRegistry
+from registry import SceneBundle, SceneRegistry, open_registry
 from registry.errors import SimReconError, UsageError
 from registry.exchange import add_scene, list_place, open_place, pack_scene, pull_scene, push_scene
-from registry.exchange.sharing import revisions_of
+from registry.exchange.sharing import entries_of, revisions_of
 from registry.exchange.wholefile import scratch_folder
 from registry.index_rows import is_revision
 from registry.locks import is_locked
 from synthetic.small_bundle import write_small_bundle
 
-VERBS = ("publish", "pack", "add", "push", "push_s3")
+VERBS = ("publish", "pack", "add", "push", "push_s3", "publish_s3")
 NAMES = ("one", "two")
 _SCENES = ("room", "hall")  # of publish
 _LONGEST_S = 0.25
@@ -57,6 +58,8 @@ def turn(verb: str, home: Path, number: int, address: str) -> None:
     name = NAMES[number % 2]
     if verb == "publish":
         SceneRegistry(home / "registry").publish(home / name, _SCENES[number // 2 % 2])
+    elif verb == "publish_s3":
+        open_registry(address).publish(home / name, _SCENES[number // 2 % 2])
     elif verb == "pack":
         pack_scene(SceneBundle.open(home / name), home / "packed" / "room.simrecon")
     elif verb == "add":
@@ -80,7 +83,7 @@ def work(verb: str, home: Path, addresses: list[str], turns: int | None) -> None
 def _start(verb: str, home: Path, *addresses: str, turns: int | None = None) -> subprocess.Popen:
     command = [sys.executable, "-m", "benchmarks.registry_kills", "--worker", verb, str(home), *addresses]
     command += [] if turns is None else ["--turns", str(turns)]
-    environment = {**os.environ, "TMPDIR": str(home / "tmp")}
+    environment = {**os.environ, "TMPDIR": str(home / "tmp"), "SIMRECON_HOME": str(home)}
     return subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
 
@@ -117,9 +120,7 @@ def check_registry(registry: SceneRegistry, expected: set[str]) -> Iterator[str]
 def check_place(address: str, checked: SceneRegistry) -> Iterator[str]:
     """Yield what is wrong with a place; every scene that it lists and every pack in it is verified."""
     place = open_place(address)
-    entries = {
-        (s.scene_id, s.revision) for scene in list_place(place) for s in revisions_of(place, scene.scene_id)
-    }
+    entries = {(shared.scene_id, shared.revision) for shared in entries_of(place)}
     packs = [key for key in place.keys("packs") if key.endswith(".simrecon")]
     for scene, revision in sorted(entries):
         try:
@@ -140,12 +141,11 @@ def check_place(address: str, checked: SceneRegistry) -> Iterator[str]:
 
 def leftovers(home: Path, places: list[str]) -> set[str]:
     """Return the temporary files and folders below a home, and the packs without an entry in places."""
-    scenes = home / "registry" / "scenes"
     found = [*(home / "tmp").iterdir(), *home.rglob(".*.tmp")]
-    found += [*scenes.glob("*/.publishing-*"), *scenes.glob("*/.removing-*")]
+    found += [*home.rglob("scenes/*/.publishing-*"), *home.rglob("scenes/*/.removing-*")]
     names = {str(path) for path in found}
     for place in map(open_place, places):
-        entered = {f"{s.scene_id}/{s.revision}.simrecon" for s in revisions_of(place, "room")}
+        entered = {f"{s.scene_id}/{s.revision}.simrecon" for s in entries_of(place)}
         packs = {key for key in place.keys("packs") if key.endswith(".simrecon")}
         names |= {f"{place.url}/packs/{key}" for key in packs - entered}
     return names
@@ -168,8 +168,8 @@ def run_kills(home: Path, verb: str, kills: int, chance: random.Random, address:
     unfinished: list[str] = []
     turns = left = 0
     for number in range(kills):
-        before = leftovers(home, [])
-        process = _start(verb, home, f"{address}{number}")
+        before = leftovers(home, [address] if verb == "publish_s3" else [])
+        process = _start(verb, home, address if verb == "publish_s3" else f"{address}{number}")
         assert process.stdout is not None
         first = process.stdout.readline()  # the imports are over, and one turn is done
         time.sleep(chance.uniform(0, _LONGEST_S))
@@ -181,13 +181,17 @@ def run_kills(home: Path, verb: str, kills: int, chance: random.Random, address:
             continue
         turns += done
         places = [f"{address}{number}_{k}" for k in sorted({0, done // 2})] if verb.startswith("push") else []
+        if verb == "publish_s3":
+            places = [address]
+        else:
+            unfinished += places[-1:]
         left += bool(leftovers(home, places[-1:]) - before)
-        unfinished += places[-1:]
         problems += [f"kill {number}: {line}" for line in _check(home, verb, done, places, registry, checked)]
     began = time.monotonic()
-    problems += _go_on(home, verb, unfinished)
+    problems += _go_on(home, verb, unfinished, address)
     next_s = round(time.monotonic() - began, 2)
-    problems += _check(home, verb, 4, unfinished, registry, checked)
+    places = [address] if verb == "publish_s3" else unfinished
+    problems += _check(home, verb, len(NAMES) * len(_SCENES), places, registry, checked)
     return {"kills": kills, "turns": turns, "left": left, "next_s": next_s, "problems": problems}
 
 
@@ -204,13 +208,16 @@ def _check(
             yield "the pack is not whole"
     for place in places:
         yield from check_place(place, checked)
+    if verb == "publish_s3":
+        scenes = {shared.scene_id for shared in list_place(open_place(places[0]))}
+        yield from (f"{name}: lost" for name in set(_SCENES if done > 2 else _SCENES[:1]) - scenes)
 
 
-def _go_on(home: Path, verb: str, unfinished: list[str]) -> Iterator[str]:
+def _go_on(home: Path, verb: str, unfinished: list[str], address: str) -> Iterator[str]:
     """Do the verb again in a new process; yield what is wrong: it fails, waits, or leaves what killed ones left."""
     for path in leftovers(home, []):
         os.utime(path, (0, 0))  # younger ones could belong to a process at work
-    process = _start("finish", home, *unfinished) if unfinished else _start(verb, home, "", turns=4)
+    process = _start("finish", home, *unfinished) if unfinished else _start(verb, home, address, turns=4)
     try:
         process.communicate(timeout=_NEXT_S + len(unfinished))
     except subprocess.TimeoutExpired:
@@ -231,11 +238,11 @@ def measure(home: Path, verbs: list[str], kills: int, seed: int) -> dict[str, di
     """Spread the kills over the verbs; return {verb: result of `run_kills`}."""
     found: dict[str, dict[str, Any]] = {}
     with contextlib.ExitStack() as stack:
-        if "push_s3" in verbs:
+        if any(verb.endswith("_s3") for verb in verbs):
             stack.enter_context(s3_server(_BUCKET))
         for number, verb in enumerate(verbs):
             share = kills * (number + 1) // len(verbs) - kills * number // len(verbs)
-            address = f"s3://{_BUCKET}/p" if verb == "push_s3" else ""
+            address = f"s3://{_BUCKET}/{verb}" if verb.endswith("_s3") else ""
             began = time.monotonic()
             found[verb] = run_kills(home / verb, verb, share, random.Random(f"{seed} {verb}"), address)
             found[verb]["wall_s"] = round(time.monotonic() - began, 1)

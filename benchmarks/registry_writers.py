@@ -1,20 +1,22 @@
-"""Many processes write to one registry on local disk, and to one place in a folder and on S3: is anything lost?
+"""Many processes write to a registry on local disk and on S3, and to a place in a folder and on S3: is anything lost?
 
 Usage:
-    python -m benchmarks.registry_writers --processes 8 --publishes 500 [--targets registry,folder,s3] [--json FILE]
+    python -m benchmarks.registry_writers --processes 8 --publishes 500 [--targets registry,…] [--json FILE]
 
 Four of five bundles have an id of their own; every fifth is another revision of one id that all processes write. While
 they write, a reader lists all the time: what it has once seen must stay, and it must never see damage.
 
 Afterwards, of a registry: every id is there, every scene verifies, no temporary folder is left, and an index that is
 rebuilt after it was deleted says the same. Of a place: every push has its entry and its pack, and every scene and
-revision is pulled and verified.
+revision is pulled and verified. The writers of the registry on S3 have a home of their own, as on different machines;
+its entries are deleted and rebuilt from the packs, too.
 """
 
 import argparse
 import contextlib
 import json
 import multiprocessing
+import os
 import sys
 import tempfile
 import time
@@ -25,13 +27,14 @@ from typing import Any
 
 from benchmarks.registry_kills import check_registry
 from benchmarks.s3_server import s3_server
-from registry import SceneBundle, SceneRegistry
+from registry import SceneBundle, SceneRegistry, open_registry
 from registry.errors import SimReconError, UsageError
 from registry.exchange import list_place, open_place, pull_scene, push_scene
-from registry.exchange.sharing import revisions_of
+from registry.exchange.remote import RemoteRegistry
+from registry.exchange.sharing import entries_of, revisions_of
 from synthetic.small_bundle import write_small_bundle
 
-TARGETS = ("registry", "folder", "s3")
+TARGETS = ("registry", "folder", "s3", "s3_registry")
 SHARED = "shared"
 _BUCKET = "writers"
 _SPAWN = multiprocessing.get_context("spawn")  # clients of S3 do not survive a fork
@@ -44,12 +47,15 @@ def scene_of(number: int) -> str:
 
 def write_some(target: str, address: str, bundles: Path, numbers: list[int], start: Barrier) -> None:
     """Write bundles one after the other (the work of one process)."""
-    place = None if target == "registry" else open_place(address)
+    if target == "s3_registry":  # of a machine of its own
+        os.environ["SIMRECON_HOME"] = str(bundles.parent / f"home{numbers[0]}")
+    registry = open_registry(address) if "registry" in target else None
+    place = open_place(address)
     start.wait()
     for number in numbers:
         folder = bundles / f"{number}"
-        if place is None:
-            SceneRegistry(Path(address)).publish(folder, scene_of(number))
+        if registry is not None:
+            registry.publish(folder, scene_of(number))
         else:
             push_scene(SceneBundle.open(folder), place)
 
@@ -111,6 +117,8 @@ def run_writers(home: Path, target: str, address: str, processes: int, publishes
     problems += [f"a writer: exit code {w.exitcode}" for w in writers if w.exitcode]
     pushed = {(scene_of(n), revision) for n, revision in enumerate(revisions)}
     judge: Callable[..., list[str]] = judge_registry if target == "registry" else judge_place
+    if target == "s3_registry":
+        judge = judge_remote
     began = time.monotonic()
     problems += judge(home, address, pushed)
     return {
@@ -161,12 +169,25 @@ def judge_place(home: Path, address: str, pushed: set[tuple[str, str]]) -> list[
     return problems + list(check_registry(mine, {scene for scene, _ in pushed}))
 
 
+def judge_remote(home: Path, address: str, pushed: set[tuple[str, str]]) -> list[str]:
+    """Return what a registry at an address has lost; rebuild its index from its packs, and judge again."""
+    problems = judge_place(home, address, pushed)
+    place = open_place(address)
+    place.remove([shared.entry_key for shared in entries_of(place)])
+    records, said = RemoteRegistry(home / "judge", address).rebuild()
+    found = {(record.scene_id, record.revision) for record in records}
+    problems += said + [f"{pair}: rebuilt, never published" for pair in sorted(found - pushed)]
+    if {scene for scene, _ in found} != {scene for scene, _ in pushed}:
+        problems.append("the rebuilt index has other scenes")
+    return problems
+
+
 def measure(home: Path, targets: list[str], processes: int, publishes: int) -> dict[str, dict[str, Any]]:
     """Write to all targets; return {target: result of `run_writers`}."""
     found: dict[str, dict[str, Any]] = {}
     for target in targets:
-        with s3_server(_BUCKET) if target == "s3" else contextlib.nullcontext():
-            address = f"s3://{_BUCKET}/place" if target == "s3" else str(home / target / "written")
+        with s3_server(_BUCKET) if target.startswith("s3") else contextlib.nullcontext():
+            address = f"s3://{_BUCKET}/place" if target.startswith("s3") else str(home / target / "written")
             found[target] = run_writers(home / target, target, address, processes, publishes)
         print(f"{target}: {found[target]}", flush=True)
     return found

@@ -137,6 +137,36 @@ def _no_constant(name: str) -> None:
 _DECODER = json.JSONDecoder(parse_constant=_no_constant)
 
 
+def row_of_scene(scene: dict[str, Any], revision: str, scene_id: str, created_utc: str) -> SceneRow:
+    """Return the row of a valid scene.json."""
+    physics = scene["report"].get("physics", {})
+    rate = physics.get("stable_rate")
+    known = isinstance(rate, int | float) and not isinstance(rate, bool)
+    metrics = {key: value for key, value in physics.items() if _fits_index(key, value)}
+    metrics["scale_method"] = scene["scale"]["method"]
+    metrics["scale_uncertainty"] = scene["scale"].get("uncertainty")
+    metrics["n_dynamic"] = sum(item["dynamic"] for item in scene["objects"])
+    metrics["n_base"] = len(scene["base"])
+    return SceneRow(
+        scene_id=scene_id,
+        revision=revision,
+        schema_version=scene["schema"],
+        created_utc=created_utc,
+        source_file=scene["source"]["file"],
+        source_sha256=scene["source"]["sha256"],
+        n_objects=len(scene["objects"]),
+        status=("stable" if rate >= 1 else "unstable") if known else "unchecked",
+        metrics=metrics,
+    )
+
+
+def _fits_index(key: str, value: Any) -> bool:
+    """Return whether a value of the physics report is one that the index takes."""
+    if not is_plain(key) or len(key) > 100:
+        return False
+    return isinstance(value, bool | float | str) or (isinstance(value, int) and abs(value) < 2**53)
+
+
 def check_schema(connection: sqlite3.Connection, path: Path) -> None:
     """Check that an index has plain tables only: a view or an expression could run without end or hold anything.
 

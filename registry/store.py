@@ -35,9 +35,9 @@ from registry.errors import (
     UsageError,
     did_you_mean,
 )
-from registry.index_rows import is_revision, row_of
+from registry.index_rows import is_revision, row_of, row_of_scene
 from registry.locks import LockHeld, file_lock, is_leased, is_locked
-from registry.plain_text import is_plain
+from registry.roots import address_of, default_registry_root
 from registry.schema import check_scene_id, is_scene_id
 
 _TEMPORARY = (".publishing-", ".removing-")
@@ -88,17 +88,19 @@ Records = list[SceneRecord]
 Names = list[str]
 
 
-def default_registry_root() -> Path:
-    """Return `$SIMRECON_HOME/registry`, or `~/.simrecon/registry` if that variable is unset."""
-    home = os.environ.get("SIMRECON_HOME")
-    return (Path(home).expanduser() if home else Path.home() / ".simrecon") / "registry"
-
-
 class SceneRegistry:
-    """All scenes below one folder. An absent registry reads as empty."""
+    """All scenes below one folder. An absent registry reads as empty.
+
+    `registry.open_registry` also opens those at an address; of these, this class would see the copy only.
+
+    Raises:
+        UsageError: The folder is the copy of a registry at an address.
+    """
 
     def __init__(self, root: Path | None = None, create: bool = False) -> None:
         self.root = default_registry_root() if root is None else Path(root).expanduser()
+        if type(self) is SceneRegistry and (address := address_of(self.root)) is not None:
+            raise UsageError(f"{self.root} is a copy of {address}; open it by registry.open_registry")
         self.scenes_folder = self.root / "scenes"  # of the bundles
         self._index = Index(self.root / "index.sqlite")
         if create:
@@ -123,11 +125,12 @@ class SceneRegistry:
             rows, problems = self._index.read()
         return [self._record(row) for row in rows], problems
 
-    def revisions(self, ordered: bool = True) -> dict[str, str]:
+    def revisions(self, ordered: bool = True, known_only: bool = False) -> dict[str, str]:
         """Return {scene id: current revision} of all scenes; cheaper than `list`.
 
         Args:
             ordered: By scene id; otherwise in any order, which is faster.
+            known_only: Of a registry at an address, return what was listed before, without asking there.
 
         Raises:
             BundleError: As `list`.
@@ -302,12 +305,15 @@ class SceneRegistry:
         return SceneRecord(path=path, **vars(row))
 
     def _not_found(self, scene_id: str) -> str:
-        known = [row.scene_id for row in self._index.rows()]
+        known = self._known_ids()
         if not known:
             hint = "the registry is empty; make a scene with `simrecon reconstruct VIDEO`"
             return f"scene {scene_id!r} is not in {self.root}: {hint}"
         shown = ", ".join(known[:10]) + (f" and {len(known) - 10} more" if len(known) > 10 else "")
         return f"scene {scene_id!r} is not in {self.root}.{did_you_mean(scene_id, known)} There are: {shown}"
+
+    def _known_ids(self) -> Names:
+        return [row.scene_id for row in self._index.rows()]
 
     def _folder_ids(self) -> Names:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -353,7 +359,7 @@ class SceneRegistry:
         return folder
 
     def _highest_number(self) -> int:
-        names = [row.scene_id for row in self._index.rows()] + self._folder_ids()
+        names = self._known_ids() + self._folder_ids()
         numbers = [int(m.group(1)) for n in names if (m := re.fullmatch(r"scene(\d{4,9})", n))]
         return max(numbers, default=0)
 
@@ -532,31 +538,5 @@ def _flush_tree(folder: Path) -> None:
         _flush(Path(parent))
 
 
-def _fits_index(key: str, value: Any) -> bool:
-    """Return whether a value of the physics report is one that the index takes."""
-    if not is_plain(key) or len(key) > 100:
-        return False
-    return isinstance(value, bool | float | str) or (isinstance(value, int) and abs(value) < 2**53)
-
-
 def _row_of(bundle: SceneBundle, scene_id: str, created_utc: str) -> SceneRow:
-    scene = bundle.scene
-    physics = scene["report"].get("physics", {})
-    rate = physics.get("stable_rate")
-    known = isinstance(rate, int | float) and not isinstance(rate, bool)
-    metrics = {key: value for key, value in physics.items() if _fits_index(key, value)}
-    metrics["scale_method"] = scene["scale"]["method"]
-    metrics["scale_uncertainty"] = scene["scale"].get("uncertainty")
-    metrics["n_dynamic"] = sum(item["dynamic"] for item in scene["objects"])
-    metrics["n_base"] = len(scene["base"])
-    return SceneRow(
-        scene_id=scene_id,
-        revision=bundle.revision,
-        schema_version=scene["schema"],
-        created_utc=created_utc,
-        source_file=scene["source"]["file"],
-        source_sha256=scene["source"]["sha256"],
-        n_objects=len(scene["objects"]),
-        status=("stable" if rate >= 1 else "unstable") if known else "unchecked",
-        metrics=metrics,
-    )
+    return row_of_scene(bundle.scene, bundle.revision, scene_id, created_utc)

@@ -21,7 +21,7 @@ import gymnasium as gym
 from gymnasium.envs import registration as gym_registration
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
-from registry import SceneRegistry, SimReconError, UsageError, default_registry_root
+from registry import SimReconError, UsageError, default_registry_root, open_registry, registry_folder
 from registry.errors import did_you_mean
 from simrecon_envs.errors import EnvNotFound
 
@@ -55,7 +55,7 @@ def register_scenes(root: Path | str | None = None) -> list[str]:
     Removed scenes of the same registry are unregistered. A scene with the same id in another registry is replaced.
 
     Args:
-        root: Folder of the registry; None for the default one.
+        root: Folder or address of the registry; None for the default one.
 
     Returns:
         The Gymnasium ids of this registry's scenes, in order.
@@ -66,13 +66,17 @@ def register_scenes(root: Path | str | None = None) -> list[str]:
     return sorted(_register(root))
 
 
-def _register(root: Path | str | None) -> dict[str, EnvSpec]:
-    """Register as `register_scenes` does; return {id: spec} of the registry's scenes, in any order."""
+def _register(root: Path | str | None, known_only: bool = False) -> dict[str, EnvSpec]:
+    """Register as `register_scenes` does; return {id: spec} of the registry's scenes, in any order.
+
+    With `known_only` nothing is asked of an address: its scenes that were listed before are registered.
+    """
     # Absolute, because the working folder may change before the environment is made.
-    folder = str((default_registry_root() if root is None else Path(root).expanduser()).absolute())
+    folder = str(registry_folder(root).absolute())
     with _collection_paused():
         # Not by `gym.register`, which searches the whole registry in every call and warns about replaced ids.
-        specs = _scene_specs(SceneRegistry(Path(folder)).revisions(ordered=False), folder)
+        revisions = open_registry(folder).revisions(ordered=False, known_only=known_only)
+        specs = _scene_specs(revisions, folder)
         for known in [name for name, spec in gym.registry.items() if _registry_of(spec) == folder]:
             if known not in specs:
                 del gym.registry[known]
@@ -97,7 +101,7 @@ def register_default_scenes() -> None:
     gym.registry[MULTI_ID] = EnvSpec(id=MULTI_ID, entry_point="simrecon_envs.multi:MultiSceneEnv",
                                      disable_env_checker=True, order_enforce=False)  # fmt: skip
     try:
-        _register(None)
+        _register(None, known_only=True)
     except (SimReconError, RuntimeError) as error:  # RuntimeError: this user has no home folder
         warnings.warn(f"simrecon_envs: no scene was registered: {error}", RuntimeWarning, stacklevel=3)
 

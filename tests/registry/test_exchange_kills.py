@@ -15,7 +15,7 @@ pytestmark = pytest.mark.stage
 def test_killed_at_random_moments_nothing_is_half_there(tmp_path, verb, kills):
     found = registry_kills.run_kills(tmp_path / "home", verb, kills, random.Random(f"{verb} {kills}"))
     assert found["problems"] == []
-    assert found["turns"] > kills
+    assert found["turns"] >= kills
     assert found["next_s"] < 15
 
 
