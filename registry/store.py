@@ -41,6 +41,7 @@ from registry.roots import address_of, default_registry_root
 from registry.schema import check_scene_id, is_scene_id
 
 _TEMPORARY = (".publishing-", ".removing-")
+_NUMBERED = re.compile(r"scene(\d{4,9})")
 _MOST_SWEPT = 1000  # folders of other scenes that a publish looks into
 _CAUSES = {
     errno.ENOSPC: "the disk is full",
@@ -191,7 +192,7 @@ class SceneRegistry:
 
     def next_free_id(self) -> str:
         """Return the next free `sceneNNNN`. If other processes may ask at the same time, use `reserve_next_id`."""
-        return _scene_name(self._highest_number() + 1)
+        return scene_name(self._highest_number() + 1)
 
     @contextlib.contextmanager
     def hold(self, scene_id: str) -> Generator[None, None, None]:
@@ -218,7 +219,7 @@ class SceneRegistry:
         """Choose the next free id and lock it while the block runs; no two processes get the same id."""
         number = self._highest_number() + 1
         while True:
-            scene_id = _scene_name(number)
+            scene_id = scene_name(number)
             with contextlib.ExitStack() as stack:
                 try:
                     stack.enter_context(self.hold(scene_id))
@@ -313,7 +314,7 @@ class SceneRegistry:
         return f"scene {scene_id!r} is not in {self.root}.{did_you_mean(scene_id, known)} There are: {shown}"
 
     def _known_ids(self) -> Names:
-        return [row.scene_id for row in self._index.rows()]
+        return list(self._index.revisions())
 
     def _folder_ids(self) -> Names:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -359,9 +360,14 @@ class SceneRegistry:
         return folder
 
     def _highest_number(self) -> int:
-        names = self._known_ids() + self._folder_ids()
-        numbers = [int(m.group(1)) for n in names if (m := re.fullmatch(r"scene(\d{4,9})", n))]
-        return max(numbers, default=0)
+        """Return the highest number of the ids `sceneNNNN`, also of those whose row is not written yet."""
+        highest = highest_number(self._known_ids())
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            for folder in self.scenes_folder.iterdir():
+                number = highest_number([folder.name])
+                if number > highest and any(_revisions(folder)):
+                    highest = number
+        return highest
 
     # ---- Writing.
 
@@ -496,7 +502,13 @@ def _disk_errors(doing: str) -> Generator[None, None, None]:
         ) from error
 
 
-def _scene_name(number: int) -> str:
+def highest_number(scene_ids: Names) -> int:
+    """Return the highest number of the ids that are `sceneNNNN`; 0 if there are none."""
+    return max((int(m[1]) for name in scene_ids if (m := _NUMBERED.fullmatch(name))), default=0)
+
+
+def scene_name(number: int) -> str:
+    """Return the id `sceneNNNN` of a number."""
     return f"scene{number:04d}"
 
 

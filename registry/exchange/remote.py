@@ -9,7 +9,6 @@ read again, and the locks of this machine. It may be deleted at any time.
 
 import contextlib
 import datetime
-import re
 import socket
 from collections.abc import Generator
 from pathlib import Path
@@ -32,7 +31,15 @@ from registry.exchange.unpacking import unpack
 from registry.exchange.wholefile import scratch_folder
 from registry.index_rows import SceneRow, is_revision
 from registry.schema import check_scene_id, is_scene_id
-from registry.store import Names, Records, SceneRecord, SceneRegistry, VerifyReport
+from registry.store import (
+    Names,
+    Records,
+    SceneRecord,
+    SceneRegistry,
+    VerifyReport,
+    highest_number,
+    scene_name,
+)
 
 _IDS = "ids"
 
@@ -162,7 +169,7 @@ class RemoteRegistry(SceneRegistry):
         """Choose the next free id and write it down in the place; it is never given again, published or not."""
         number = self._highest_number() + 1
         while True:
-            scene_id = f"scene{number:04d}"
+            scene_id = scene_name(number)
             if self.place.create(f"{_IDS}/{scene_id}", socket.gethostname().encode()):
                 with self.hold(scene_id):
                     yield scene_id
@@ -207,8 +214,7 @@ class RemoteRegistry(SceneRegistry):
         return [shared.scene_id for shared in list_place(self.place)]
 
     def _highest_number(self) -> int:
-        names = [*self._known_ids(), *self.place.keys(_IDS)]
-        return max((int(m[1]) for name in names if (m := re.fullmatch(r"scene(\d{4,9})", name))), default=0)
+        return highest_number([*self._known_ids(), *self.place.keys(_IDS)])
 
     def _create_index(self) -> None:
         self._index.create()  # nothing is lost with the copy's index
