@@ -109,6 +109,11 @@ class SceneRegistry:
                 self.scenes_folder.mkdir(parents=True, exist_ok=True)
                 self._create_index()
 
+    @property
+    def where(self) -> str:
+        """Return the folder or the address of the registry, as `open_registry` takes it on any machine."""
+        return str(self.root)
+
     def list(self) -> Records:
         """Return all scenes, ordered by id. Opens no bundle; scenes with a malformed row are left out.
 
@@ -309,9 +314,9 @@ class SceneRegistry:
         known = self._known_ids()
         if not known:
             hint = "the registry is empty; make a scene with `simrecon reconstruct VIDEO`"
-            return f"scene {scene_id!r} is not in {self.root}: {hint}"
+            return f"scene {scene_id!r} is not in {self.where}: {hint}"
         shown = ", ".join(known[:10]) + (f" and {len(known) - 10} more" if len(known) > 10 else "")
-        return f"scene {scene_id!r} is not in {self.root}.{did_you_mean(scene_id, known)} There are: {shown}"
+        return f"scene {scene_id!r} is not in {self.where}.{did_you_mean(scene_id, known)} There are: {shown}"
 
     def _known_ids(self) -> Names:
         return list(self._index.revisions())

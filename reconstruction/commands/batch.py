@@ -256,7 +256,7 @@ def _tasks(
             scene_id=scene,
             fingerprint=step.fingerprint,
             arguments=(*step.row.arguments(), *common),
-            registry=registry.root,
+            registry=registry.where,
             log=out / "logs" / f"{scene}.log",
             work_dir=work_dir,
             report=None if arguments.no_reports else out / "reports" / f"{scene}.html",

@@ -29,5 +29,5 @@ def run_rebuild(arguments: argparse.Namespace) -> int:
     else:
         for problem in problems:
             print(f"left out: {plain(problem)}")
-        print(f"{len(records)} scenes in the index of {registry.root}")
+        print(f"{len(records)} scenes in the index of {registry.where}")
     return 1 if problems else 0

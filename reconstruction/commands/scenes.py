@@ -85,7 +85,7 @@ def run_list(arguments: argparse.Namespace) -> int:
         print(json.dumps([_record_json(r) for r in records], indent=2))
         return 0
     if not records and not problems:
-        print(f"no scenes in {registry.root} yet; make one with: simrecon reconstruct VIDEO")
+        print(f"no scenes in {registry.where} yet; make one with: simrecon reconstruct VIDEO")
         return 0
     width = max((len(r.scene_id) for r in records), default=0)
     for record in records:

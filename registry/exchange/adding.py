@@ -79,7 +79,7 @@ def add_scene(
             before = _record(registry, name)
             if before is not None and before.revision != bundle.revision and not replace:
                 raise UsageError(
-                    f"the registry {registry.root} has scene {name} already, with revision {before.revision}; this is "
+                    f"the registry {registry.where} has scene {name} already, with revision {before.revision}; this is "
                     f"{bundle.revision}. Add it under another id with --as NAME, or replace yours with --replace"
                 )
             intact = before is not None and before.revision == bundle.revision and registry.verify(name).ok

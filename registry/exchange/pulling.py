@@ -44,7 +44,7 @@ def pull_scene(
         return AddedScene(registry.get(mine), False, licence_of(registry.load(mine).scene))
     if there is not None and there != revision and not replace:
         raise UsageError(
-            f"the registry {registry.root} has scene {mine} already, with revision {there}; {place.url} has "
+            f"the registry {registry.where} has scene {mine} already, with revision {there}; {place.url} has "
             f"{revision}. Pull it under another id with --as NAME, or replace yours with --replace"
         )
     with scratch_folder("simrecon-pull-") as folder:

@@ -9,6 +9,7 @@ read again, and the locks of this machine. It may be deleted at any time.
 
 import contextlib
 import datetime
+import json
 import socket
 from collections.abc import Generator
 from pathlib import Path
@@ -29,6 +30,7 @@ from registry.exchange.sharing import (
 )
 from registry.exchange.unpacking import unpack
 from registry.exchange.wholefile import scratch_folder
+from registry.files import write_whole
 from registry.index_rows import SceneRow, is_revision
 from registry.schema import check_scene_id, is_scene_id
 from registry.store import (
@@ -42,6 +44,7 @@ from registry.store import (
 )
 
 _IDS = "ids"
+_LISTED = "listed.json"  # in the copy
 
 
 class RemoteRegistry(SceneRegistry):
@@ -56,16 +59,21 @@ class RemoteRegistry(SceneRegistry):
         self.address = address
         self.place = open_place(address)
 
+    @property
+    def where(self) -> str:
+        """Return the address."""
+        return self.address
+
     def list_with_problems(self) -> tuple[Records, Names]:
         """Return all scenes, and one line about each malformed entry of the place."""
-        rows, problems = self._rows(list_place(self.place))
+        rows, problems = self._rows(self._list())
         return [self._record(row) for row in rows], problems
 
     def revisions(self, ordered: bool = True, known_only: bool = False) -> dict[str, str]:
-        """Return {scene id: current revision}; with `known_only` of the scenes that were listed before, unasked."""
+        """Return {scene id: current revision}; with `known_only` of the last list that this machine asked for."""
         if known_only:
-            return self._index.revisions(ordered)
-        return {shared.scene_id: shared.revision for shared in list_place(self.place)}
+            return self._listed_before()
+        return {shared.scene_id: shared.revision for shared in self._list()}
 
     def get(self, scene_id: str) -> SceneRecord:
         """Return the record of a scene; one listing request, and one entry unless it was read before."""
@@ -210,8 +218,25 @@ class RemoteRegistry(SceneRegistry):
                 )
             yield bundle
 
+    def _list(self) -> list[SharedScene]:
+        """Ask for the current revisions of all scenes, ordered by id; keep them for `known_only`."""
+        found = list_place(self.place)
+        listed = {shared.scene_id: shared.revision for shared in found}
+        if listed != self._listed_before():
+            with contextlib.suppress(OSError):  # only the next import would use it
+                write_whole(self.root / _LISTED, json.dumps(listed).encode())
+        return found
+
+    def _listed_before(self) -> dict[str, str]:
+        try:
+            listed = json.loads((self.root / _LISTED).read_bytes())
+        except (OSError, ValueError):
+            return {}
+        listed = listed if isinstance(listed, dict) else {}
+        return {key: value for key, value in listed.items() if is_scene_id(key) and is_revision(value)}
+
     def _known_ids(self) -> Names:
-        return [shared.scene_id for shared in list_place(self.place)]
+        return [shared.scene_id for shared in self._list()]
 
     def _highest_number(self) -> int:
         return highest_number([*self._known_ids(), *self.place.keys(_IDS)])

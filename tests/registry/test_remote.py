@@ -100,6 +100,21 @@ def _seconds(text: str) -> float:
     return datetime.datetime.fromisoformat(text).timestamp()
 
 
+def test_what_was_listed_last_is_known_without_asking(address, machine, make_bundle, monkeypatch):
+    here, there = machine(address, "here"), machine(address, "there")
+    record = here.publish(make_bundle("room"), "room")
+    assert there.revisions(known_only=True) == {}
+    assert there.revisions() == {"room": record.revision}
+    here.publish(make_bundle("hall"), "hall")
+    with monkeypatch.context() as patch:
+        patch.setattr(there, "place", None)  # any question would fail
+        assert there.revisions(known_only=True) == {"room": record.revision}
+    there.list()
+    assert there.revisions(known_only=True).keys() == {"hall", "room"}
+    (there.root / "listed.json").write_text('{"../x": "0123456789abcdef", "room": "../y"}')
+    assert there.revisions(known_only=True) == {}
+
+
 def test_publishing_the_current_revision_again_changes_nothing(address, make_bundle):
     registry = open_registry(address)
     bundle = make_bundle("room")

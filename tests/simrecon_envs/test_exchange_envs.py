@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -95,6 +96,10 @@ def test_scenes_of_a_registry_at_an_address_are_environments(scenes_root, tmp_pa
     env = simrecon_envs.make("lab_bare", obs_mode="state")
     assert env.unwrapped.scene_id == "lab_bare"
     env.close()
+    del gym.registry["SimRecon/lab_bare"]
+    shutil.rmtree(tmp_path / "lab")  # importing asks no place
+    simrecon_envs.registration.register_default_scenes()
+    assert "SimRecon/lab_bare" in gym.registry
     with pytest.raises(SystemExit) as refused:
         main(["list", "--registry", "s3://key:secret@host/x"])
     assert refused.value.code == 2
