@@ -81,7 +81,8 @@ class Index:
         pairs = self._select("scene_id, revision", f"LIMIT {_MAX_ROWS}")
         if not are_scene_ids([key for key, _ in pairs]) or not are_revisions([value for _, value in pairs]):
             pairs = [pair for pair in pairs if is_scene_id(pair[0]) and is_revision(pair[1])]
-        return dict(sorted(pairs) if ordered else pairs)
+        found: dict[str, str] = dict(pairs)
+        return {key: found[key] for key in sorted(found)} if ordered else found
 
     def row(self, scene_id: str) -> SceneRow | None:
         """Return the row of a scene, or None.

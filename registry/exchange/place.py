@@ -110,7 +110,7 @@ class Place:
     def create(self, key: str, data: bytes) -> bool:
         """Write an object unless there is one; return whether it was written.
 
-        In a folder, in memory and on S3 only one of several writers gets True; other clients look first.
+        In a folder and on S3 only one of several writers gets True; other clients of fsspec look first.
 
         Raises:
             As `write`.

@@ -7,7 +7,9 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 import uuid
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import exchange_worker
@@ -95,6 +97,21 @@ def test_a_lost_pack_is_uploaded_again(address, bundles, mine):
         pull_scene(place, "room", mine)
     assert push_scene(bundles[0], place).uploaded_bytes > 0
     assert pull_scene(place, "room", mine).new
+
+
+def test_one_of_many_creates_an_object(address):
+    place = open_place(address)
+    many = [1] if address.startswith("memory") else range(8)  # fsspec's memory looks first
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda number: place.create("ids/room", f"{number}".encode()), many))
+    assert sum(made) == 1
+    assert place.read("ids/room", 10) == f"{list(many)[made.index(True)]}".encode()
+    assert not place.create("ids/room", b"later")
+    assert abs(time.time() - place.modified_s("ids/room")) < 100
+    assert place.read_many(["ids/room", "ids/none"], 10) == [place.read("ids/room", 10), None]
+    place.remove(["ids/room", "ids/none"])
+    assert place.keys("ids") == []
+    assert place.create("ids/room", b"later")
 
 
 def test_foreign_files_and_wrong_packs_are_not_trusted(address, bundles, mine, tmp_path):
