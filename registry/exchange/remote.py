@@ -15,7 +15,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from registry.bundle import SceneBundle
-from registry.errors import BundleError, SceneNotFound
+from registry.errors import BundleError, SceneBusy, SceneNotFound
 from registry.exchange.layout import MAX_PACK_BYTES, SUFFIX
 from registry.exchange.place import open_place
 from registry.exchange.sharing import (
@@ -44,6 +44,7 @@ from registry.store import (
 )
 
 _IDS = "ids"
+_TRIES = 10
 _LISTED = "listed.json"  # in the copy
 
 
@@ -114,16 +115,21 @@ class RemoteRegistry(SceneRegistry):
         """Publish a copy of a sealed bundle on this machine, then in the place: whole or not at all.
 
         Of machines that publish one scene at the same time the last one wins; the place keeps all revisions.
+
+        Raises:
+            SceneBusy: Other processes of this machine replaced it each time before it could be pushed.
         """
-        while True:
+        for _ in range(_TRIES):
             record = super().publish(staging, scene_id)
             try:
-                bundle = SceneBundle.open(record.path, check_hashes=False)  # and keep others from removing it
-                break
-            except BundleError:  # another process published another revision meanwhile
+                bundle = SceneBundle.open(record.path, check_hashes=False)
+            except BundleError:  # another process published another revision, and removed this one
                 continue
-        push_scene(bundle, self.place)
-        return record
+            push_scene(bundle, self.place)  # while it is open, no other process removes it
+            return record
+        raise SceneBusy(
+            f"scene {scene_id}: other processes of this machine publish it all the time; run it again"
+        )
 
     def remove(self, scene_id: str) -> None:
         """Remove a scene with all its revisions from the place, and its copy: entries first, then packs.
