@@ -17,7 +17,7 @@ from reconstruction.frames.load import check_input
 from reconstruction.made_by import note_made_by
 from reconstruction.publish import publish_scene
 from reconstruction.runner import Run
-from registry import SceneRecord, SceneRegistry
+from registry import SceneRecord, open_registry
 from registry.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def reconstruct(
     _check_names(video, registry_root, work_dir)
     config = config or PipelineConfig()
     _check_backends(config)
-    registry = SceneRegistry(registry_root, create=True)
+    registry = open_registry(registry_root, create=True)
     holder = registry.hold(scene_id) if scene_id is not None else registry.reserve_next_id()
     with holder as held_id:
         scene_id = scene_id or held_id

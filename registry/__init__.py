@@ -19,8 +19,10 @@ from registry.errors import (
     SimReconError,
     UsageError,
 )
+from registry.opening import open_registry
+from registry.roots import default_registry_root, registry_folder
 from registry.schema import SCHEMA, check_scene_id, validate_scene
-from registry.store import SceneRecord, SceneRegistry, VerifyReport, default_registry_root
+from registry.store import SceneRecord, SceneRegistry, VerifyReport
 
 __all__ = [
     "SCHEMA",
@@ -42,6 +44,8 @@ __all__ = [
     "check_scene_id",
     "content_revision",
     "default_registry_root",
+    "open_registry",
+    "registry_folder",
     "seal_bundle",
     "validate_scene",
 ]

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 
 from registry import migrations
 from registry.errors import BundleError, EnvironmentMissing
-from registry.index_rows import SceneRow, check_schema, is_revision, row_of
+from registry.index_rows import SceneRow, are_revisions, are_scene_ids, check_schema, is_revision, row_of
 from registry.locks import file_lock
 from registry.plain_text import plain
 from registry.schema import is_scene_id
@@ -71,10 +71,18 @@ class Index:
                 problems.append(f"{error}; {REPAIR}")
         return found, problems
 
-    def revisions(self) -> dict[str, str]:
-        """Return {scene id: current revision} of the valid rows, ordered by scene id; reads only these two columns."""
-        pairs = self._select("scene_id, revision")
-        return {key: revision for key, revision in pairs if is_scene_id(key) and is_revision(revision)}
+    def revisions(self, ordered: bool = True) -> dict[str, str]:
+        """Return {scene id: current revision} of the valid rows; reads only these two columns.
+
+        Args:
+            ordered: By scene id; otherwise in any order, which is faster.
+        """
+        # Not ordered by SQLite, which would look up each row by its id.
+        pairs = self._select("scene_id, revision", f"LIMIT {_MAX_ROWS}")
+        if not are_scene_ids([key for key, _ in pairs]) or not are_revisions([value for _, value in pairs]):
+            pairs = [pair for pair in pairs if is_scene_id(pair[0]) and is_revision(pair[1])]
+        found: dict[str, str] = dict(pairs)
+        return {key: found[key] for key in sorted(found)} if ordered else found
 
     def row(self, scene_id: str) -> SceneRow | None:
         """Return the row of a scene, or None.

@@ -16,6 +16,8 @@ from registry.schema import is_scene_id
 
 _REVISION = re.compile(r"[0-9a-f]{16}")
 _SHA256 = re.compile(r"[0-9a-f]{1,64}")
+_SCENE_IDS = re.compile(r"(?:[a-z0-9_]{1,64}\n)*")
+_REVISIONS = re.compile(r"(?:[0-9a-f]{16}\n)*")
 _STATUS = ("stable", "unstable", "unchecked")
 _MAX_TEXT, _MAX_METRICS, _MAX_OBJECTS = 4096, 100_000, 1_000_000
 _RATES = (
@@ -47,6 +49,25 @@ class SceneRow:
 def is_revision(value: Any) -> bool:
     """Return whether a value is a revision: 16 hexadecimal digits."""
     return isinstance(value, str) and _REVISION.fullmatch(value) is not None
+
+
+def are_scene_ids(values: list[Any]) -> bool:
+    """Return whether all values are valid scene ids: `is_scene_id` of each, much faster for many."""
+    return _all_match(_SCENE_IDS, values)
+
+
+def are_revisions(values: list[Any]) -> bool:
+    """Return whether all values are revisions: `is_revision` of each, much faster for many."""
+    return _all_match(_REVISIONS, values)
+
+
+def _all_match(lines: re.Pattern[str], values: list[Any]) -> bool:
+    """Return whether all values are texts of one line that match; the pattern is of all lines, each with its end."""
+    try:
+        text = "\n".join([*values, ""])
+    except TypeError:  # one is no text
+        return False
+    return text.count("\n") == len(values) and lines.fullmatch(text) is not None
 
 
 def row_of(values: tuple[Any, ...]) -> SceneRow:
@@ -114,6 +135,36 @@ def _no_constant(name: str) -> None:
 
 
 _DECODER = json.JSONDecoder(parse_constant=_no_constant)
+
+
+def row_of_scene(scene: dict[str, Any], revision: str, scene_id: str, created_utc: str) -> SceneRow:
+    """Return the row of a valid scene.json."""
+    physics = scene["report"].get("physics", {})
+    rate = physics.get("stable_rate")
+    known = isinstance(rate, int | float) and not isinstance(rate, bool)
+    metrics = {key: value for key, value in physics.items() if _fits_index(key, value)}
+    metrics["scale_method"] = scene["scale"]["method"]
+    metrics["scale_uncertainty"] = scene["scale"].get("uncertainty")
+    metrics["n_dynamic"] = sum(item["dynamic"] for item in scene["objects"])
+    metrics["n_base"] = len(scene["base"])
+    return SceneRow(
+        scene_id=scene_id,
+        revision=revision,
+        schema_version=scene["schema"],
+        created_utc=created_utc,
+        source_file=scene["source"]["file"],
+        source_sha256=scene["source"]["sha256"],
+        n_objects=len(scene["objects"]),
+        status=("stable" if rate >= 1 else "unstable") if known else "unchecked",
+        metrics=metrics,
+    )
+
+
+def _fits_index(key: str, value: Any) -> bool:
+    """Return whether a value of the physics report is one that the index takes."""
+    if not is_plain(key) or len(key) > 100:
+        return False
+    return isinstance(value, bool | float | str) or (isinstance(value, int) and abs(value) < 2**53)
 
 
 def check_schema(connection: sqlite3.Connection, path: Path) -> None:

@@ -35,12 +35,13 @@ from registry.errors import (
     UsageError,
     did_you_mean,
 )
-from registry.index_rows import is_revision, row_of
+from registry.index_rows import is_revision, row_of, row_of_scene
 from registry.locks import LockHeld, file_lock, is_leased, is_locked
-from registry.plain_text import is_plain
+from registry.roots import address_of, default_registry_root
 from registry.schema import check_scene_id, is_scene_id
 
 _TEMPORARY = (".publishing-", ".removing-")
+_NUMBERED = re.compile(r"scene(\d{4,9})")
 _MOST_SWEPT = 1000  # folders of other scenes that a publish looks into
 _CAUSES = {
     errno.ENOSPC: "the disk is full",
@@ -88,23 +89,30 @@ Records = list[SceneRecord]
 Names = list[str]
 
 
-def default_registry_root() -> Path:
-    """Return `$SIMRECON_HOME/registry`, or `~/.simrecon/registry` if that variable is unset."""
-    home = os.environ.get("SIMRECON_HOME")
-    return (Path(home).expanduser() if home else Path.home() / ".simrecon") / "registry"
-
-
 class SceneRegistry:
-    """All scenes below one folder. An absent registry reads as empty."""
+    """All scenes below one folder. An absent registry reads as empty.
+
+    `registry.open_registry` also opens those at an address; of these, this class would see the copy only.
+
+    Raises:
+        UsageError: The folder is the copy of a registry at an address.
+    """
 
     def __init__(self, root: Path | None = None, create: bool = False) -> None:
         self.root = default_registry_root() if root is None else Path(root).expanduser()
+        if type(self) is SceneRegistry and (address := address_of(self.root)) is not None:
+            raise UsageError(f"{self.root} is a copy of {address}; open it by registry.open_registry")
         self.scenes_folder = self.root / "scenes"  # of the bundles
         self._index = Index(self.root / "index.sqlite")
         if create:
             with _disk_errors(f"create the registry {self.root}"):
                 self.scenes_folder.mkdir(parents=True, exist_ok=True)
                 self._create_index()
+
+    @property
+    def where(self) -> str:
+        """Return the folder or the address of the registry, as `open_registry` takes it on any machine."""
+        return str(self.root)
 
     def list(self) -> Records:
         """Return all scenes, ordered by id. Opens no bundle; scenes with a malformed row are left out.
@@ -123,17 +131,21 @@ class SceneRegistry:
             rows, problems = self._index.read()
         return [self._record(row) for row in rows], problems
 
-    def revisions(self) -> dict[str, str]:
-        """Return {scene id: current revision} of all scenes, ordered by id; cheaper than `list`.
+    def revisions(self, ordered: bool = True, known_only: bool = False) -> dict[str, str]:
+        """Return {scene id: current revision} of all scenes; cheaper than `list`.
+
+        Args:
+            ordered: By scene id; otherwise in any order, which is faster.
+            known_only: Of a registry at an address, return what was listed before, without asking there.
 
         Raises:
             BundleError: As `list`.
         """
         self._check_links()
-        found = self._index.revisions()
+        found = self._index.revisions(ordered)
         if not found:
             self._check_lost()
-            found = self._index.revisions()
+            found = self._index.revisions(ordered)
         return found
 
     def get(self, scene_id: str) -> SceneRecord:
@@ -185,7 +197,7 @@ class SceneRegistry:
 
     def next_free_id(self) -> str:
         """Return the next free `sceneNNNN`. If other processes may ask at the same time, use `reserve_next_id`."""
-        return _scene_name(self._highest_number() + 1)
+        return scene_name(self._highest_number() + 1)
 
     @contextlib.contextmanager
     def hold(self, scene_id: str) -> Generator[None, None, None]:
@@ -212,7 +224,7 @@ class SceneRegistry:
         """Choose the next free id and lock it while the block runs; no two processes get the same id."""
         number = self._highest_number() + 1
         while True:
-            scene_id = _scene_name(number)
+            scene_id = scene_name(number)
             with contextlib.ExitStack() as stack:
                 try:
                     stack.enter_context(self.hold(scene_id))
@@ -299,12 +311,15 @@ class SceneRegistry:
         return SceneRecord(path=path, **vars(row))
 
     def _not_found(self, scene_id: str) -> str:
-        known = [row.scene_id for row in self._index.rows()]
+        known = self._known_ids()
         if not known:
             hint = "the registry is empty; make a scene with `simrecon reconstruct VIDEO`"
-            return f"scene {scene_id!r} is not in {self.root}: {hint}"
+            return f"scene {scene_id!r} is not in {self.where}: {hint}"
         shown = ", ".join(known[:10]) + (f" and {len(known) - 10} more" if len(known) > 10 else "")
-        return f"scene {scene_id!r} is not in {self.root}.{did_you_mean(scene_id, known)} There are: {shown}"
+        return f"scene {scene_id!r} is not in {self.where}.{did_you_mean(scene_id, known)} There are: {shown}"
+
+    def _known_ids(self) -> Names:
+        return list(self._index.revisions())
 
     def _folder_ids(self) -> Names:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -350,9 +365,14 @@ class SceneRegistry:
         return folder
 
     def _highest_number(self) -> int:
-        names = [row.scene_id for row in self._index.rows()] + self._folder_ids()
-        numbers = [int(m.group(1)) for n in names if (m := re.fullmatch(r"scene(\d{4,9})", n))]
-        return max(numbers, default=0)
+        """Return the highest number of the ids `sceneNNNN`, also of those whose row is not written yet."""
+        highest = highest_number(self._known_ids())
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            for folder in self.scenes_folder.iterdir():
+                number = highest_number([folder.name])
+                if number > highest and any(_revisions(folder)):
+                    highest = number
+        return highest
 
     # ---- Writing.
 
@@ -487,7 +507,13 @@ def _disk_errors(doing: str) -> Generator[None, None, None]:
         ) from error
 
 
-def _scene_name(number: int) -> str:
+def highest_number(scene_ids: Names) -> int:
+    """Return the highest number of the ids that are `sceneNNNN`; 0 if there are none."""
+    return max((int(m[1]) for name in scene_ids if (m := _NUMBERED.fullmatch(name))), default=0)
+
+
+def scene_name(number: int) -> str:
+    """Return the id `sceneNNNN` of a number."""
     return f"scene{number:04d}"
 
 
@@ -529,31 +555,5 @@ def _flush_tree(folder: Path) -> None:
         _flush(Path(parent))
 
 
-def _fits_index(key: str, value: Any) -> bool:
-    """Return whether a value of the physics report is one that the index takes."""
-    if not is_plain(key) or len(key) > 100:
-        return False
-    return isinstance(value, bool | float | str) or (isinstance(value, int) and abs(value) < 2**53)
-
-
 def _row_of(bundle: SceneBundle, scene_id: str, created_utc: str) -> SceneRow:
-    scene = bundle.scene
-    physics = scene["report"].get("physics", {})
-    rate = physics.get("stable_rate")
-    known = isinstance(rate, int | float) and not isinstance(rate, bool)
-    metrics = {key: value for key, value in physics.items() if _fits_index(key, value)}
-    metrics["scale_method"] = scene["scale"]["method"]
-    metrics["scale_uncertainty"] = scene["scale"].get("uncertainty")
-    metrics["n_dynamic"] = sum(item["dynamic"] for item in scene["objects"])
-    metrics["n_base"] = len(scene["base"])
-    return SceneRow(
-        scene_id=scene_id,
-        revision=bundle.revision,
-        schema_version=scene["schema"],
-        created_utc=created_utc,
-        source_file=scene["source"]["file"],
-        source_sha256=scene["source"]["sha256"],
-        n_objects=len(scene["objects"]),
-        status=("stable" if rate >= 1 else "unstable") if known else "unchecked",
-        metrics=metrics,
-    )
+    return row_of_scene(bundle.scene, bundle.revision, scene_id, created_utc)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from registry import SceneRegistry
+from registry import open_registry
 from simrecon_envs.registration import env_id, register_scenes
 
 
@@ -29,7 +29,7 @@ def add(
     """
     from registry.exchange import add_scene
 
-    catalog = SceneRegistry(None if registry is None else Path(registry))
+    catalog = open_registry(registry)
     added = add_scene(source, catalog, scene_id=name, replace=replace)
     register_scenes(registry)
     return env_id(added.scene_id)

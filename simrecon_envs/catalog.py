@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from registry import SceneRecord, SceneRegistry, UsageError
+from registry import SceneRecord, UsageError, open_registry
 from simrecon_envs.registration import NAMESPACE, env_id
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def list_scenes(
     """
     if status not in (None, "stable", "unstable", "unchecked"):
         raise UsageError(f"list_scenes: status {status!r} is not one of stable, unstable, unchecked")
-    catalog = SceneRegistry(None if registry is None else Path(registry))
+    catalog = open_registry(registry)
     wanted = {label.lower() for label in ([labels] if isinstance(labels, str) else labels)}
     most = float("inf") if max_objects is None else max_objects
 
@@ -104,7 +104,7 @@ def list_tasks(
         raise UsageError(f"list_tasks: {wrong[0]!r} is not a kind of task. Kinds: {', '.join(KINDS)}")
     check_robot(robot)
     name = scene.removeprefix(NAMESPACE + "/")
-    facts = scene_facts(SceneRegistry(None if registry is None else Path(registry)).load(name), robot)
+    facts = scene_facts(open_registry(registry).load(name), robot)
     entries = [entry for kind in KINDS if chosen is None or kind in chosen for entry in _entries(facts, kind)]
     return [entry for entry in entries if hard or not entry.problems]
 

@@ -8,7 +8,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from registry import SceneRegistry, UsageError
+from registry import UsageError, open_registry
 from simrecon_envs.registration import env_id, make_cpu, register_scenes
 from simrecon_envs.unwrapped import scene_of
 
@@ -54,7 +54,7 @@ class MultiSceneEnv(gym.Env):
             raise UsageError(f"Multi-v0: split {split!r} is not one of {', '.join(SPLITS)}")
         if cache_size < 1:
             raise UsageError(f"Multi-v0: cache_size={cache_size} is not at least 1")
-        catalog = SceneRegistry(None if registry is None else Path(registry))
+        catalog = open_registry(registry)
         known = list(catalog.revisions())
         wanted = scenes.split(",") if isinstance(scenes, str) else scenes
         missing = [scene for scene in wanted or () if scene not in known]

@@ -11,6 +11,9 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
+from dataclasses import fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,7 @@ import gymnasium as gym
 from gymnasium.envs import registration as gym_registration
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
-from registry import SceneRegistry, SimReconError, UsageError, default_registry_root
+from registry import SimReconError, UsageError, default_registry_root, open_registry, registry_folder
 from registry.errors import did_you_mean
 from simrecon_envs.errors import EnvNotFound
 
@@ -52,7 +55,7 @@ def register_scenes(root: Path | str | None = None) -> list[str]:
     Removed scenes of the same registry are unregistered. A scene with the same id in another registry is replaced.
 
     Args:
-        root: Folder of the registry; None for the default one.
+        root: Folder or address of the registry; None for the default one.
 
     Returns:
         The Gymnasium ids of this registry's scenes, in order.
@@ -60,18 +63,25 @@ def register_scenes(root: Path | str | None = None) -> list[str]:
     Raises:
         SimReconError: The registry's index is damaged or cannot be read.
     """
+    return sorted(_register(root))
+
+
+def _register(root: Path | str | None, known_only: bool = False) -> dict[str, EnvSpec]:
+    """Register as `register_scenes` does; return {id: spec} of the registry's scenes, in any order.
+
+    With `known_only` nothing is asked of an address: its scenes that were listed before are registered.
+    """
     # Absolute, because the working folder may change before the environment is made.
-    folder = str((default_registry_root() if root is None else Path(root).expanduser()).absolute())
+    folder = str(registry_folder(root).absolute())
     with _collection_paused():
-        revisions = SceneRegistry(Path(folder)).revisions()
-        ids = {env_id(scene): scene for scene in revisions}
+        # Not by `gym.register`, which searches the whole registry in every call and warns about replaced ids.
+        revisions = open_registry(folder).revisions(ordered=False, known_only=known_only)
+        specs = _scene_specs(revisions, folder)
         for known in [name for name, spec in gym.registry.items() if _registry_of(spec) == folder]:
-            if known not in ids:
+            if known not in specs:
                 del gym.registry[known]
-        for name, scene in ids.items():
-            # Not by `gym.register`, which searches the whole registry in every call and warns about replaced ids.
-            gym.registry[name] = _spec(name, scene, revisions[scene], folder)
-    return list(ids)
+        gym.registry.update(specs)
+    return specs
 
 
 @contextmanager
@@ -86,15 +96,14 @@ def _collection_paused() -> Iterator[None]:
             gc.enable()
 
 
-def register_default_scenes() -> list[str]:
+def register_default_scenes() -> None:
     """Register the scenes of the default registry; if it is damaged, only warn, so that the import succeeds."""
     gym.registry[MULTI_ID] = EnvSpec(id=MULTI_ID, entry_point="simrecon_envs.multi:MultiSceneEnv",
                                      disable_env_checker=True, order_enforce=False)  # fmt: skip
     try:
-        return register_scenes()
+        _register(None, known_only=True)
     except (SimReconError, RuntimeError) as error:  # RuntimeError: this user has no home folder
         warnings.warn(f"simrecon_envs: no scene was registered: {error}", RuntimeWarning, stacklevel=3)
-        return []
 
 
 def make(scene: str, *, registry: Path | str | None = None, **kwargs: Any) -> gym.Env:
@@ -148,7 +157,7 @@ def find_spec(name: str) -> EnvSpec | None:
             id=name, entry_point=_ENTRY_POINT, max_episode_steps=episode_steps(match["task"]), disable_env_checker=True,
             kwargs=kwargs, additional_wrappers=_WRAPPERS,
         )  # fmt: skip
-    ids = [known for known, spec in gym.registry.items() if _registry_of(spec) is not None]
+    ids = sorted(known for known, spec in gym.registry.items() if _registry_of(spec) is not None)
     raise EnvNotFound(_not_found(name, ids, None))
 
 
@@ -196,23 +205,50 @@ def answer_running_look_up() -> None:
 # Code of Gymnasium's own look-up, before `teach_gymnasium` wraps it.
 _GYMNASIUM_CODE = getattr(getattr(gym_registration, "_find_spec", None), "__code__", None)
 
-_TEMPLATE = vars(
-    EnvSpec(
-        id=f"{NAMESPACE}/template",
-        entry_point=_ENTRY_POINT,
-        max_episode_steps=MAX_EPISODE_STEPS,
-        # Gymnasium's checker does not support ManiSkill's batched tensors.
-        disable_env_checker=True,
-        additional_wrappers=_WRAPPERS,
-    )
-)
+
+class _SceneSpec(EnvSpec):
+    """Spec of a scene whose id and arguments are made when they are first read; copies of it are plain `EnvSpec`.
+
+    An import makes one for each scene. A whole `EnvSpec` is a kilobyte: 100,000 of them take a quarter of a second.
+    """
+
+    # Fields without an entry in the instance.
+    namespace, version, entry_point = NAMESPACE, None, _ENTRY_POINT
+    max_episode_steps = MAX_EPISODE_STEPS
+    disable_env_checker = True  # Gymnasium's checker does not support ManiSkill's batched tensors
+    additional_wrappers = _WRAPPERS
+    _revision: str
+    _registry: str
+
+    @cached_property
+    def id(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return env_id(self.name)
+
+    @cached_property
+    def kwargs(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return {"scene_id": self.name, "revision": self._revision, "registry": self._registry}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _plain, ({field.name: getattr(self, field.name) for field in fields(EnvSpec)},)
+
+    def __eq__(self, other: object) -> bool:
+        return copy(self) == (copy(other) if isinstance(other, _SceneSpec) else other)
+
+    __hash__ = None  # as of every EnvSpec
 
 
-def _spec(name: str, scene: str, revision: str, folder: str) -> EnvSpec:
-    # Skip the constructor, which parses the id: imports register up to tens of thousands of scenes.
+def _scene_specs(revisions: dict[str, str], registry: str) -> dict[str, EnvSpec]:
+    new, prefix = object.__new__, env_id("")
+    specs: dict[str, EnvSpec] = {}
+    for scene, revision in revisions.items():
+        specs[prefix + scene] = spec = new(_SceneSpec)  # the constructor parses the id
+        spec.name, spec._revision, spec._registry = scene, revision, registry
+    return specs
+
+
+def _plain(values: dict[str, Any]) -> EnvSpec:
     spec = object.__new__(EnvSpec)
-    kwargs = {"scene_id": scene, "revision": revision, "registry": folder}
-    spec.__dict__ = {**_TEMPLATE, "id": name, "name": scene, "kwargs": kwargs}
+    vars(spec).update(values)
     return spec
 
 
@@ -222,6 +258,8 @@ def episode_steps(task: str) -> int:
 
 
 def _registry_of(spec: EnvSpec) -> str | None:
+    if isinstance(spec, _SceneSpec):
+        return spec._registry
     return spec.kwargs.get("registry") if spec.entry_point == _ENTRY_POINT else None
 
 

@@ -1,7 +1,6 @@
 """Checks of `SceneEnv`'s options and loading of its bundle, before anything is built."""
 
 import warnings
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,9 +11,9 @@ from registry import (
     EnvironmentMissing,
     SceneBundle,
     SceneNotFound,
-    SceneRegistry,
     UsageError,
-    default_registry_root,
+    open_registry,
+    registry_folder,
 )
 from registry.errors import did_you_mean
 from simrecon_envs.errors import SceneAssetsMissing
@@ -85,9 +84,9 @@ def load_bundle(
         SceneNotFound: The registry has no such scene.
         SceneAssetsMissing: Its files are missing or damaged, or (with `strict`) the revision is another one.
     """
-    root = Path(registry) if registry is not None else default_registry_root()
+    root = registry_folder(registry)
     try:
-        bundle = SceneRegistry(root).load(scene_id)
+        bundle = open_registry(root).load(scene_id)
     except SceneNotFound as error:
         raise SceneNotFound(
             f"{error}. Call simrecon_envs.register_scenes() to see what the registry has now"

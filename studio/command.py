@@ -4,7 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
-from registry import SceneRegistry
+from registry import SceneRegistry, open_registry
 from registry.errors import EnvironmentMissing, UsageError
 
 # Parts of a page, `module:class`, in the order of their tabs.
@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.export is not None and scene_id is None:
         raise UsageError("--export: name the scene, as in `simrecon studio SCENE --export room.html`")
     check_viser()
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     if scene_id is not None:
         registry.get(scene_id)
         if arguments.export is not None:

@@ -19,7 +19,7 @@ from typing import Any
 from reconstruction.core.profiling import Usage
 from reconstruction.core.progress import StageListener
 from reconstruction.runner import Run
-from registry import SceneRegistry
+from registry import open_registry
 from studio.command import PARTS, check_viser
 from studio.refilm import FilmCheck, advice_on_poses, advice_on_things
 from studio.same_origin import same_origin_only
@@ -110,7 +110,7 @@ class LivePage:
         from studio.scene_view import StudioPage
 
         page = StudioPage(
-            SceneRegistry(registry_root), scene_id, parts=load_parts(PARTS), host=_HOST, port=self.port
+            open_registry(registry_root), scene_id, parts=load_parts(PARTS), host=_HOST, port=self.port
         )
         _tell_terminal(f"{self.url} stays until it is closed; Ctrl-C ends it, too")
         try:

@@ -16,6 +16,7 @@ from pathlib import Path
 import psutil
 
 from reconstruction.batch.outcomes import CURES, Outcome, classify, plain
+from registry import registry_folder
 
 _POLL_S = 0.25
 _GRACE_S = 30.0  # from SIGINT to SIGKILL
@@ -31,7 +32,7 @@ class Job:
     scene_id: str
     fingerprint: str
     arguments: tuple[str, ...]  # of `simrecon reconstruct`, without the work folder
-    registry: Path
+    registry: Path | str  # folder or address
     log: Path
     work_dir: str | None = None  # may hold $VARIABLES of the machine that runs it
     report: Path | None = None  # page of `simrecon report` to write, or None
@@ -79,7 +80,7 @@ def _reconstruct(job: Job, stop: threading.Event) -> Outcome:
         watched = _watch(command, job, stop, log)
     if watched.verdict is not None:
         return watched.verdict
-    folders = [folder for folder in (work, job.registry, job.log.parent) if folder is not None]
+    folders = [f for f in (work, registry_folder(job.registry), job.log.parent) if f is not None]
     outcome = classify(
         watched.exit_code,
         tail(job.log),

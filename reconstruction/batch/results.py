@@ -11,7 +11,7 @@ from PIL import Image
 from reconstruction.batch.figures import object_figures, scene_figures
 from reconstruction.batch.journal import VideoState
 from reconstruction.batch.rows import VideoRow
-from registry import SceneBundle, SceneRegistry
+from registry import SceneRegistry
 from registry.errors import SimReconError
 from registry.files import write_whole
 
@@ -56,10 +56,11 @@ class Results:
         key = (scene_id, revision)
         if key not in self._scenes:
             try:
-                folder = self._registry.scenes_folder / scene_id / revision
-                bundle = SceneBundle.open(folder, check_hashes=False)
+                bundle = self._registry.load(scene_id)
+                if bundle.revision != revision:
+                    return {}, []
                 self._scenes[key] = scene_figures(bundle), object_figures(bundle)
-                self._copy_preview(folder, scene_id)
+                self._copy_preview(bundle.root, scene_id)
             except (SimReconError, OSError):  # replaced or removed since
                 return {}, []
         return self._scenes[key]

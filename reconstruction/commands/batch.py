@@ -132,13 +132,13 @@ def run(arguments: argparse.Namespace) -> int:
     from reconstruction.batch.listing import read_rows
     from reconstruction.batch.plan import Choice, make_plan
     from reconstruction.batch.sources import local_path
-    from registry import SceneRegistry
+    from registry import open_registry
 
     _check_flags(arguments)
     place = local_path(arguments.videos)
     out = Path(arguments.out or f"{place.stem if place.is_file() else place.name}.batch").absolute()
     journal = Journal(out)
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     registry.root = registry.root.absolute()
     listing = read_rows(arguments.videos, _defaults(arguments), journal.known_ids())
     choice = Choice(arguments.retry_failed, arguments.rerun, arguments.replace)
@@ -256,7 +256,7 @@ def _tasks(
             scene_id=scene,
             fingerprint=step.fingerprint,
             arguments=(*step.row.arguments(), *common),
-            registry=registry.root,
+            registry=registry.where,
             log=out / "logs" / f"{scene}.log",
             work_dir=work_dir,
             report=None if arguments.no_reports else out / "reports" / f"{scene}.html",

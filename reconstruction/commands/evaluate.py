@@ -45,13 +45,13 @@ def run(arguments: argparse.Namespace) -> int:
     from reconstruction.commands.reporting import make_listener
     from reconstruction.measure import StageResults, evaluate_scene
     from reconstruction.measure.table import as_table
-    from registry import SceneRegistry
+    from registry import open_registry
 
     to_stdout = str(arguments.json) == "-"
     if arguments.json and not to_stdout:
         _check_writable(arguments.json)
     ground_truth, labels = split_truth(arguments.ground_truth)
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     bundle = registry.load(arguments.scene)
     listener = make_listener(quiet=arguments.quiet or to_stdout)
     with listener:

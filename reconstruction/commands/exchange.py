@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from reconstruction.commands.options import add_common, add_scene, add_verb
-from registry import SceneRegistry
+from registry import open_registry
 from registry.errors import SimReconError, UsageError
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def run_pack(arguments: argparse.Namespace) -> int:
     from registry.exchange import licence_of, pack_scene
     from registry.exchange.pack import with_licence
 
-    bundle = SceneRegistry(arguments.registry).load(arguments.scene)
+    bundle = open_registry(arguments.registry).load(arguments.scene)
     packed = pack_scene(bundle, arguments.out, licence=arguments.licence)
     licence = licence_of(with_licence(bundle, arguments.licence))
     if arguments.json:
@@ -164,7 +164,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     """Add a scene, and print its environment id."""
     from registry.exchange import add_scene
 
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     added = add_scene(arguments.source, registry, scene_id=arguments.name, replace=arguments.replace)
     if arguments.json:
         print(json.dumps(_added_json(added), indent=2))
@@ -183,7 +183,7 @@ def run_push(arguments: argparse.Namespace) -> int:
         arguments.scenes or arguments.all or arguments.catalog
     ):
         raise UsageError("name SCENEs before PLACE, or pass --all for all scenes of the registry")
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     scenes = list(registry.revisions()) if arguments.all else list(dict.fromkeys(arguments.scenes))
     for scene in scenes:
         registry.get(scene)  # all names are right before anything is uploaded
@@ -222,7 +222,7 @@ def run_pull(arguments: argparse.Namespace) -> int:
     wanted = _wanted(place, arguments)
     if arguments.name is not None and len(wanted) > 1:
         raise UsageError(f"--as names one scene, {len(wanted)} are to be pulled; pull them one by one")
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     rows: list[dict] = []
     failed: list[SimReconError] = []
     for name in wanted:

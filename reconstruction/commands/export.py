@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from reconstruction.commands.options import add_common, add_scene, add_verb
-from registry import SceneRegistry
+from registry import open_registry
 
 _FORMATS = ("mjcf", "urdf", "usd", "glb")  # reconstruction.exports.FORMATS, not imported for --help
 
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Export a scene, and print the main file of each format."""
     from reconstruction.exports import export_scene
 
-    bundle = SceneRegistry(arguments.registry).load(arguments.scene)
+    bundle = open_registry(arguments.registry).load(arguments.scene)
     result = export_scene(bundle, list(dict.fromkeys(arguments.to)), arguments.out)
     if arguments.json:
         files = {name: str(path) for name, path in result.main.items()}

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from registry.errors import EnvironmentMissing
+from registry.errors import EnvironmentMissing, SimReconError
 from registry.files import write_whole
+from registry.roots import registry_folder
 
 
 def add_verb(
@@ -30,13 +31,21 @@ def add_common(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
     """Add --registry, --verbose and, if asked for, --json."""
     parser.add_argument(
         "--registry",
-        type=Path,
-        metavar="DIR",
-        help="folder of the registry (default: $SIMRECON_HOME/registry, or ~/.simrecon/registry)",
+        type=_registry,
+        metavar="DIR|URL",
+        help="folder or address (s3://bucket/scenes) of the registry (default: $SIMRECON_REGISTRY, else "
+        "$SIMRECON_HOME/registry, else ~/.simrecon/registry)",
     )
     parser.add_argument("--verbose", action="store_true", help="log the decisions of each stage")
     if json:
         parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
+
+
+def _registry(text: str) -> Path:
+    try:
+        return registry_folder(text)
+    except SimReconError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 SEEDS = (0, 2**32 - 1)

@@ -212,9 +212,9 @@ def config_of(arguments: argparse.Namespace) -> "PipelineConfig":
 def _print_result(result: "Reconstruction", arguments: argparse.Namespace) -> None:
     from reconstruction.commands.scenes import describe_scene
     from reconstruction.costs import costs_json
-    from registry import SceneRegistry
+    from registry import open_registry
 
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     bundle = registry.load(result.record.scene_id)
     if arguments.json:
         summary = {

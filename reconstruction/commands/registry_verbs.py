@@ -4,7 +4,7 @@ import argparse
 import json
 
 from reconstruction.commands.options import add_common
-from registry import SceneRegistry
+from registry import open_registry
 from registry.plain_text import plain
 
 
@@ -21,7 +21,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
 
 def run_rebuild(arguments: argparse.Namespace) -> int:
     """Rebuild the index; print the scenes found and the folders left out. Return 1 if a folder was left out."""
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     records, problems = registry.rebuild()
     if arguments.json:
         found = {"scenes": {record.scene_id: record.revision for record in records}, "left_out": problems}
@@ -29,5 +29,5 @@ def run_rebuild(arguments: argparse.Namespace) -> int:
     else:
         for problem in problems:
             print(f"left out: {plain(problem)}")
-        print(f"{len(records)} scenes in the index of {registry.root}")
+        print(f"{len(records)} scenes in the index of {registry.where}")
     return 1 if problems else 0

@@ -41,14 +41,14 @@ def run(arguments: argparse.Namespace) -> int:
     from reconstruction.measure.report.collect import by_reason
     from reconstruction.measure.report.page import build_page, find_room_page, read_evaluation
     from reconstruction.measure.stage_results import StageResults
-    from registry import SceneRegistry
+    from registry import open_registry
     from registry.errors import UsageError
 
     out = arguments.out or Path(f"{arguments.scene}.html")
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise UsageError(f"--out {out}: give a file name in an existing folder")
     ground_truth, labels = split_truth(arguments.ground_truth)
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     bundle = registry.load(arguments.scene)
     stages = StageResults.find(bundle, registry.root, arguments.work_dir)
     evaluation = None if arguments.evaluation is None else read_evaluation(arguments.evaluation, bundle)

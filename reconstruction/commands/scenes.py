@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from reconstruction.commands.options import add_common, add_scene, add_verb, output_errors, write_output
-from registry import SceneBundle, SceneRecord, SceneRegistry
+from registry import SceneBundle, SceneRecord, open_registry
 from registry.errors import UsageError
 from registry.plain_text import plain
 
@@ -77,7 +77,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
 
 def run_list(arguments: argparse.Namespace) -> int:
     """Print one line for each scene."""
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     records, problems = registry.list_with_problems()
     for problem in problems:
         print(f"simrecon list: {plain(problem)}", file=sys.stderr)
@@ -85,7 +85,7 @@ def run_list(arguments: argparse.Namespace) -> int:
         print(json.dumps([_record_json(r) for r in records], indent=2))
         return 0
     if not records and not problems:
-        print(f"no scenes in {registry.root} yet; make one with: simrecon reconstruct VIDEO")
+        print(f"no scenes in {registry.where} yet; make one with: simrecon reconstruct VIDEO")
         return 0
     width = max((len(r.scene_id) for r in records), default=0)
     for record in records:
@@ -100,7 +100,7 @@ def run_list(arguments: argparse.Namespace) -> int:
 
 def run_show(arguments: argparse.Namespace) -> int:
     """Print one scene."""
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     record = registry.get(arguments.scene)
     bundle = registry.load(arguments.scene)
     _check_show_flags(arguments)
@@ -226,7 +226,7 @@ def describe_scene(record: SceneRecord, bundle: SceneBundle) -> str:
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Check the files of a scene against their hashes, and its physics if asked for."""
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     report = registry.verify(arguments.scene)
     result = asdict(report)
     if arguments.physics and report.ok:
@@ -272,7 +272,7 @@ def describe_physics(physics: dict) -> list[str]:
 
 def run_remove(arguments: argparse.Namespace) -> int:
     """Remove a scene; ask first if standard input is a terminal."""
-    registry = SceneRegistry(arguments.registry)
+    registry = open_registry(arguments.registry)
     record = registry.get(arguments.scene)
     if not arguments.yes and sys.stdin.isatty():
         answer = input(f"remove {record.scene_id} ({record.n_objects} objects, {record.path})? [y/N] ")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from reconstruction.doctor.check import Check
 from reconstruction.doctor.packages import PIP
-from registry import SceneRegistry, SimReconError, default_registry_root
+from registry import SimReconError, default_registry_root, open_registry
 
 _MIN_MEMORY_GB, _MIN_DISK_GB = 6.0, 3.0
 _PROJECT = Path(__file__).parents[2]
@@ -60,7 +60,7 @@ def registry_check() -> Check:
     if not _writable(root):
         return Check("registry", False, f"{root} cannot be written", fix, True)
     try:
-        count = len(SceneRegistry(root).list())
+        count = len(open_registry(root).list())
     except SimReconError as error:
         return Check("registry", False, str(error), "see the message on the left", True)
     return Check("registry", True, f"{root} can be written; {count} scenes", "", True)

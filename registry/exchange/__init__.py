@@ -7,7 +7,8 @@ from registry.exchange.adding import AddedScene, add_scene
 from registry.exchange.card import NOT_STATED, licence_of, scene_card
 from registry.exchange.pack import PackedScene, pack_scene
 from registry.exchange.place import Place, open_place
-from registry.exchange.sharing import PushedScene, SharedScene, list_place, pull_scene, push_scene
+from registry.exchange.pulling import pull_scene
+from registry.exchange.sharing import PushedScene, SharedScene, list_place, push_scene
 
 __all__ = [
     "NOT_STATED",

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from registry.bundle import SceneBundle
-from registry.errors import BundleError, EnvironmentMissing, SceneBusy, SceneNotFound, UsageError
+from registry.errors import BundleError, SceneBusy, SceneNotFound, UsageError
 from registry.exchange.card import licence_of
-from registry.exchange.layout import MAX_PACK_BYTES, extract_members, open_pack, read_members
+from registry.exchange.layout import MAX_PACK_BYTES
 from registry.exchange.place import download, local_path, shown
+from registry.exchange.unpacking import scratch_errors, unpack
 from registry.exchange.wholefile import scratch_folder
+from registry.opening import open_registry
 from registry.schema import check_scene_id
 from registry.store import SceneRecord, SceneRegistry
 
@@ -62,7 +64,7 @@ def add_scene(
         BundleError: The source is malformed, unsafe, damaged or too large, or is not the expected scene.
         EnvironmentMissing: A place cannot be reached, or a disk cannot be written.
     """
-    registry = SceneRegistry() if registry is None else registry
+    registry = open_registry() if registry is None else registry
     if scene_id is not None:
         check_scene_id(scene_id)
     label = shown(str(source))
@@ -77,7 +79,7 @@ def add_scene(
             before = _record(registry, name)
             if before is not None and before.revision != bundle.revision and not replace:
                 raise UsageError(
-                    f"the registry {registry.root} has scene {name} already, with revision {before.revision}; this is "
+                    f"the registry {registry.where} has scene {name} already, with revision {before.revision}; this is "
                     f"{bundle.revision}. Add it under another id with --as NAME, or replace yours with --replace"
                 )
             intact = before is not None and before.revision == bundle.revision and registry.verify(name).ok
@@ -93,7 +95,7 @@ def _bundle_of(source: Path | str, label: str) -> Generator[SceneBundle, None, N
         if path is None:
             path = local_path(str(source))
             if path is None:
-                with _scratch_errors():
+                with scratch_errors():
                     folder = stack.enter_context(scratch_folder(_SCRATCH))
                 path = folder / "download"
                 download(str(source), path, MAX_PACK_BYTES)
@@ -102,38 +104,9 @@ def _bundle_of(source: Path | str, label: str) -> Generator[SceneBundle, None, N
             return
         if not path.exists():
             raise UsageError(f"{label}: there is no such file or folder")
-        with _scratch_errors():
+        with scratch_errors():
             folder = stack.enter_context(scratch_folder(_SCRATCH))
         yield unpack(path, folder / "bundle", label)
-
-
-def unpack(path: Path, folder: Path, name: str) -> SceneBundle:
-    """Extract a pack to a new folder and open it with all checks of a bundle.
-
-    Raises:
-        BundleError: The pack is malformed, unsafe, damaged or too large.
-        EnvironmentMissing: The folder cannot be written.
-    """
-    with open_pack(path) as stream:
-        members = read_members(stream, name)
-        with _scratch_errors():
-            folder.mkdir()
-            extract_members(stream, members, folder, name)
-    try:
-        return SceneBundle.open(folder, check_hashes=True)
-    except BundleError as error:
-        raise BundleError(f"pack {name}: {str(error).removeprefix(f'bundle {folder}: ')}") from error
-
-
-@contextlib.contextmanager
-def _scratch_errors() -> Generator[None, None, None]:
-    try:
-        yield
-    except OSError as error:
-        raise EnvironmentMissing(
-            f"add: cannot write the temporary folder: {error.strerror} ({error.filename}). Free some space there, or "
-            "set TMPDIR to another folder; nothing was added"
-        ) from error
 
 
 @contextlib.contextmanager

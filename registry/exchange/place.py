@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import re
 from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from registry.errors import BundleError, EnvironmentMissing, SimReconError, Usag
 from registry.exchange.wholefile import whole_file
 
 _CHUNK = 1 << 20
+_AT_ONCE = 16
+_TAKEN = ("PreconditionFailed", "ConditionalRequestConflict")
 _BLOCK = 8 << 20  # bytes of a ranged request
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs", "hf": "hub"}
 _DEPTH = 2  # folders below `index` and `packs`, their files included
@@ -69,6 +72,22 @@ class Place:
             raise BundleError(f"{self.url}: {key} has more than {limit} bytes")
         return data
 
+    def read_many(self, keys: list[str], limit: int) -> list[bytes | None]:
+        """Return the contents of objects, read 16 at once; None where there is none, or it is larger than `limit`.
+
+        Raises:
+            EnvironmentMissing: The place cannot be reached.
+        """
+
+        def read(key: str) -> bytes | None:
+            try:
+                return self.read(key, limit)
+            except (FileNotFoundError, BundleError):
+                return None
+
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            return list(pool.map(read, keys))
+
     def fetch(self, key: str, target: Path, limit: int) -> None:
         """Download an object of at most `limit` bytes to a new file; errors as of `read`."""
         with place_errors(self.url, f"download {key}"):
@@ -87,6 +106,50 @@ class Place:
                     stream.write(data)
             else:
                 self.fs.pipe_file(self._path(key), data)
+
+    def create(self, key: str, data: bytes) -> bool:
+        """Write an object unless there is one; return whether it was written.
+
+        In a folder and on S3 only one of several writers gets True; other clients of fsspec look first.
+
+        Raises:
+            As `write`.
+        """
+        with self._writing(f"create {key}"):
+            path = self._path(key)
+            try:
+                if _is_local(self.fs):
+                    Path(path).parent.mkdir(parents=True, exist_ok=True)
+                    with Path(path).open("xb") as stream:
+                        stream.write(data)
+                else:
+                    self.fs.pipe_file(path, data, mode="create")
+            except FileExistsError:
+                return False
+            except OSError as error:  # how s3fs says that a condition failed
+                if getattr(error.__cause__, "response", {}).get("Error", {}).get("Code") not in _TAKEN:
+                    raise
+                return False
+        return True
+
+    def remove(self, keys: list[str]) -> None:
+        """Delete objects; absent ones are no error.
+
+        Raises:
+            UsageError: The place is read-only.
+            EnvironmentMissing: It cannot be reached or written.
+        """
+        for key in keys:
+            with self._writing(f"delete {key}"), contextlib.suppress(FileNotFoundError):
+                self.fs.rm_file(self._path(key))
+
+    def modified_s(self, key: str) -> float:
+        """Return when an object was written, as a POSIX timestamp; 0 if the client does not say."""
+        with place_errors(self.url, f"look up {key}"):
+            try:
+                return self.fs.modified(self._path(key)).timestamp()
+            except (NotImplementedError, AttributeError):
+                return 0.0
 
     def upload(self, key: str, source: Path) -> None:
         """Upload a local file as one object; errors as of `write`."""

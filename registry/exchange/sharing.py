@@ -1,4 +1,4 @@
-"""Push scenes to a place and pull them from it, without locks, renames or a server.
+"""Push scenes to a place and list them, without locks, renames or a server.
 
     packs/<scene id>/<revision>.simrecon        a pack; its name is the hash of its content, so it never changes
     packs/<scene id>/<revision>.md              its card
@@ -17,22 +17,22 @@ from dataclasses import dataclass
 from typing import Any
 
 from registry.bundle import SceneBundle
-from registry.errors import BundleError, SceneNotFound, UsageError, did_you_mean
-from registry.exchange.adding import AddedScene, add_scene
+from registry.errors import BundleError, EnvironmentMissing, SceneNotFound, UsageError, did_you_mean
 from registry.exchange.card import licence_of, scene_card, source_name
-from registry.exchange.layout import MAX_PACK_BYTES, SUFFIX
+from registry.exchange.layout import SUFFIX
 from registry.exchange.pack import pack_scene, with_licence
 from registry.exchange.place import Place
 from registry.exchange.wholefile import scratch_folder
-from registry.schema import check_scene_id
-from registry.store import SceneRegistry
+from registry.index_rows import SceneRow, row_of, row_of_scene
+from registry.schema import SCHEMA, check_scene_id
 
 CATALOG = "catalog.json"
 _CATALOG_FORMAT, _ENTRY_FORMAT = "simrecon.catalog/1", "simrecon.entry/1"
 _SCENE = r"[a-z0-9_]{1,64}"
 _KEY = re.compile(rf"(?P<scene>{_SCENE})/(?P<pushed>\d{{8}}T\d{{12}}Z)-(?P<revision>[0-9a-f]{{16}})\.json")
 _WANTED = re.compile(rf"(?P<scene>{_SCENE})(@(?P<revision>[0-9a-f]{{16}}))?")
-_MAX_CATALOG_BYTES, _MAX_ENTRY_BYTES = 32 << 20, 64 << 10
+_MAX_CATALOG_BYTES, _MAX_ENTRY_BYTES, _MAX_ROW_BYTES = 32 << 20, 64 << 10, 48 << 10
+_TRIES = 10
 
 
 @dataclass(frozen=True, order=True)
@@ -44,6 +44,12 @@ class SharedScene:
     revision: str
 
     @property
+    def pushed_utc(self) -> str:
+        """Return the time as ISO 8601, "2026-11-26T08:15:00+00:00"."""
+        p = self.pushed
+        return f"{p[:4]}-{p[4:6]}-{p[6:8]}T{p[9:11]}:{p[11:13]}:{p[13:15]}+00:00"
+
+    @property
     def pack_key(self) -> str:
         """Return the key of the pack."""
         return pack_key(self.scene_id, self.revision)
@@ -52,6 +58,11 @@ class SharedScene:
     def entry_key(self) -> str:
         """Return the key of the entry."""
         return f"index/{self.scene_id}/{self.pushed}-{self.revision}.json"
+
+    @property
+    def card_key(self) -> str:
+        """Return the key of the card."""
+        return f"packs/{self.scene_id}/{self.revision}.md"
 
 
 @dataclass(frozen=True)
@@ -105,61 +116,46 @@ def push_scene(bundle: SceneBundle, place: Place, *, licence: str | None = None)
         return PushedScene(known[-1], new=False, uploaded_bytes=0)
     now = datetime.datetime.now(datetime.timezone.utc).strftime("%Y%m%dT%H%M%S%fZ")
     # A clock that is behind does not hide what was pushed knowingly.
-    shared = SharedScene(scene_id, max([now, *(_after(known[-1].pushed) for _ in known[-1:])]), revision)
+    shared = SharedScene(scene_id, max([now, *(after(known[-1].pushed) for _ in known[-1:])]), revision)
     scene, size = with_licence(bundle, licence), 0
-    if not there:
-        with scratch_folder("simrecon-push-") as folder:
-            packed = pack_scene(bundle, folder / f"{scene_id}{SUFFIX}", licence=licence)
-            size = packed.bytes
-            place.upload(shared.pack_key, packed.path)
-        place.write(f"packs/{scene_id}/{revision}.md", scene_card(scene, revision).encode())
-    place.write(shared.entry_key, json.dumps(_entry(scene, shared, size), indent=1, sort_keys=True).encode())
-    return PushedScene(shared, new=True, uploaded_bytes=size)
+    for _ in range(_TRIES):
+        if not there:
+            with scratch_folder("simrecon-push-") as folder:
+                packed = pack_scene(bundle, folder / f"{scene_id}{SUFFIX}", licence=licence)
+                size = packed.bytes
+                place.upload(shared.pack_key, packed.path)
+            place.write(shared.card_key, scene_card(scene, revision).encode())
+        write_entry(place, scene, shared, size)
+        # `RemoteRegistry.remove` may have deleted the pack before it could see the entry, or both since.
+        there = place.exists(shared.pack_key)
+        if there or not place.exists(shared.entry_key):
+            return PushedScene(shared, new=True, uploaded_bytes=size)
+    raise EnvironmentMissing(f"{place.url}: somebody removes {scene_id} while it is pushed; run it again")
 
 
-def pull_scene(
-    place: Place,
-    wanted: str,
-    registry: SceneRegistry | None = None,
-    *,
-    scene_id: str | None = None,
-    replace: bool = False,
-) -> AddedScene:
-    """Download a scene, verify it and publish it in a registry. A revision that is there is not downloaded again.
+def write_entry(place: Place, scene: dict[str, Any], shared: SharedScene, size: int) -> None:
+    """Write the entry that makes a pack visible.
 
     Args:
-        place: Where from.
-        wanted: `SCENE` (its current revision) or `SCENE@REVISION`.
-        registry: Where to; None for the default registry.
-        scene_id: Id in the registry; None for the scene's own.
-        replace: Replace a scene that has this id and another revision.
-
-    Raises:
-        SceneNotFound: The place has no such scene or revision; names what it has.
-        UsageError: The id is taken by another revision.
-        BundleError: The pack is malformed, damaged, or of another scene or revision.
-        EnvironmentMissing: The place cannot be reached, or a disk cannot be written.
+        place: Where the pack is.
+        scene: Content of its scene.json.
+        shared: What the entry says.
+        size: Bytes of the pack; 0 if they are not known.
     """
-    registry = SceneRegistry() if registry is None else registry
-    name, revision = parse_wanted(wanted)
-    if revision is None:
-        revision = current(place, name).revision
-    mine = scene_id or name
-    there = _revision(registry, mine)
-    if there == revision and registry.verify(mine).ok:
-        return AddedScene(registry.get(mine), False, licence_of(registry.load(mine).scene))
-    if there is not None and there != revision and not replace:
-        raise UsageError(
-            f"the registry {registry.root} has scene {mine} already, with revision {there}; {place.url} has "
-            f"{revision}. Pull it under another id with --as NAME, or replace yours with --replace"
-        )
-    with scratch_folder("simrecon-pull-") as folder:
-        pack = folder / f"{name}{SUFFIX}"
-        try:
-            place.fetch(pack_key(name, revision), pack, MAX_PACK_BYTES)
-        except FileNotFoundError:
-            raise SceneNotFound(_no_revision(place, name, revision)) from None
-        return add_scene(pack, registry, scene_id=scene_id, replace=replace, expected=(name, revision))
+    entry = {
+        "format": _ENTRY_FORMAT,
+        "scene": shared.scene_id,
+        "revision": shared.revision,
+        "pushed": shared.pushed,
+        "bytes": size or None,
+        "objects": len(scene["objects"]),
+        "licence": licence_of(scene),
+        "video": {"name": source_name(scene), "sha256": scene["source"]["sha256"]},
+    }
+    row = vars(row_of_scene(scene, shared.revision, shared.scene_id, shared.pushed_utc))
+    if len(json.dumps(row)) <= _MAX_ROW_BYTES:
+        entry["row"] = row
+    place.write(shared.entry_key, json.dumps(entry, indent=1, sort_keys=True).encode())
 
 
 def list_place(place: Place, pattern: str = "*") -> list[SharedScene]:
@@ -178,6 +174,11 @@ def list_place(place: Place, pattern: str = "*") -> list[SharedScene]:
     for shared in sorted(found):
         newest[shared.scene_id] = shared
     return [shared for name, shared in newest.items() if fnmatch.fnmatchcase(name, pattern)]
+
+
+def entries_of(place: Place) -> list[SharedScene]:
+    """Return all pushed revisions of all scenes, ordered by id and time."""
+    return sorted(_parse(place.keys("index")))
 
 
 def revisions_of(place: Place, scene_id: str) -> list[SharedScene]:
@@ -208,10 +209,60 @@ def current(place: Place, scene_id: str) -> SharedScene:
 def read_entry(place: Place, shared: SharedScene) -> dict[str, Any]:
     """Return what the index says about a revision; {} if its entry cannot be read."""
     try:
-        entry = json.loads(place.read(shared.entry_key, _MAX_ENTRY_BYTES))
-    except (FileNotFoundError, BundleError, ValueError, RecursionError):
+        return _parse_entry(place.read(shared.entry_key, _MAX_ENTRY_BYTES))
+    except (FileNotFoundError, BundleError):
+        return {}
+
+
+def read_rows(place: Place, shared: list[SharedScene]) -> tuple[list[SceneRow], list[str]]:
+    """Read the entries of revisions, many at once, as rows of an index of scenes.
+
+    Entries that older versions wrote have no figures of physics: their rows have the status "unchecked".
+
+    Returns:
+        The valid rows, and one line about each entry that is malformed. Entries that were removed meanwhile are
+        left out.
+    """
+    rows: list[SceneRow] = []
+    problems: list[str] = []
+    found = place.read_many([one.entry_key for one in shared], _MAX_ENTRY_BYTES)
+    for one, data in zip(shared, found, strict=True):
+        try:
+            rows.append(_row(_parse_entry(data or b""), one))
+        except (BundleError, KeyError, TypeError, ValueError) as error:
+            if data is None and not place.exists(one.entry_key):
+                continue
+            said = str(error) if isinstance(error, BundleError) else "it is malformed"
+            problems.append(f"scene {one.scene_id}: its entry {one.entry_key}: {said}; push it again")
+    return rows, problems
+
+
+def _parse_entry(data: bytes) -> dict[str, Any]:
+    try:
+        entry = json.loads(data)
+    except (ValueError, RecursionError):
         return {}
     return entry if isinstance(entry, dict) and entry.get("format") == _ENTRY_FORMAT else {}
+
+
+def _row(entry: dict[str, Any], shared: SharedScene) -> SceneRow:
+    video = entry["video"]
+    plain = {
+        "schema_version": SCHEMA,
+        "source_file": video["name"],
+        "source_sha256": video["sha256"],
+        "n_objects": entry["objects"],
+        "status": "unchecked",
+        "metrics": {},
+    }
+    said = plain | entry.get("row", {})
+    names = ("schema_version", "source_file", "source_sha256", "n_objects", "status")
+    version, file, digest, count, status = (said[name] for name in names)
+    metrics = json.dumps(said["metrics"])
+    # Scene, revision and time are those of the entry's name.
+    return row_of(
+        (shared.scene_id, shared.revision, version, shared.pushed_utc, file, digest, count, status, metrics)
+    )
 
 
 def write_catalog(place: Place) -> int:
@@ -220,7 +271,7 @@ def write_catalog(place: Place) -> int:
     It shows the moment of its writing: write it again after pushes, once they are done.
     """
     scenes: dict[str, list[list[str]]] = {}
-    for shared in sorted(_parse(place.keys("index"))):
+    for shared in entries_of(place):
         scenes.setdefault(shared.scene_id, []).append([shared.pushed, shared.revision])
     text = json.dumps({"format": _CATALOG_FORMAT, "scenes": scenes}, separators=(",", ":"), sort_keys=True)
     place.write(CATALOG, text.encode())
@@ -252,38 +303,10 @@ def _parse(keys: Any) -> list[SharedScene]:
     return [SharedScene(m["scene"], m["pushed"], m["revision"]) for m in matches if m is not None]
 
 
-def _entry(scene: dict[str, Any], shared: SharedScene, size: int) -> dict[str, Any]:
-    return {
-        "format": _ENTRY_FORMAT,
-        "scene": shared.scene_id,
-        "revision": shared.revision,
-        "pushed": shared.pushed,
-        "bytes": size or None,
-        "objects": len(scene["objects"]),
-        "licence": licence_of(scene),
-        "video": {"name": source_name(scene), "sha256": scene["source"]["sha256"]},
-    }
-
-
-def _after(pushed: str) -> str:
+def after(pushed: str) -> str:
     """Return the time one microsecond after that of an entry."""
     try:
         moment = datetime.datetime.strptime(pushed, "%Y%m%dT%H%M%S%fZ") + datetime.timedelta(microseconds=1)
     except (ValueError, OverflowError):
         return ""
     return moment.strftime("%Y%m%dT%H%M%S%fZ")
-
-
-def _revision(registry: SceneRegistry, scene_id: str) -> str | None:
-    try:
-        return registry.get(scene_id).revision
-    except SceneNotFound:
-        return None
-
-
-def _no_revision(place: Place, scene_id: str, revision: str) -> str:
-    known = revisions_of(place, scene_id)
-    if not known:
-        current(place, scene_id)  # raises with what there is
-    others = ", ".join(dict.fromkeys(shared.revision for shared in reversed(known)))
-    return f"{place.url} has no pack of {scene_id}, revision {revision}; its revisions, the newest first: {others}"

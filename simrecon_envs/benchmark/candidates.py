@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-from registry import SceneRegistry, UsageError
+from registry import UsageError, open_registry
 from simrecon_envs.registration import env_id
 from simrecon_envs.tasks import KINDS, TaskSpec, kind_of, list_specs
 from simrecon_envs.tasks.facts import SceneFacts
@@ -50,7 +50,7 @@ def scene_candidates(
         SceneNotFound: there is no such scene.
         UsageError: there is no such robot.
     """
-    bundle = SceneRegistry(registry).load(scene)
+    bundle = open_registry(registry).load(scene)
     queues = []
     for robot in robots:
         facts = SceneFacts(bundle, robot)

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from registry import SceneNotFound, SceneRegistry, UsageError
+from registry import SceneNotFound, UsageError, open_registry
 from simrecon_envs.benchmark.reporting import Reporter
 from simrecon_envs.benchmark.suite import SuiteTask
 
@@ -41,7 +41,7 @@ def fetch_scenes(
     """
     from registry.exchange import open_place, pull_scene
 
-    catalog = SceneRegistry(None if registry is None else Path(registry))
+    catalog = open_registry(registry)
     known = catalog.revisions()
     missing = [
         f"{scene}@{revision}" for scene, revision in wanted_scenes(tasks).items() if scene not in known

@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from registry import SceneRegistry, UsageError
+from registry import UsageError, open_registry
 from simrecon_envs.benchmark.candidates import SEQUENCE, Candidate, check_kinds, composites, scene_candidates
 from simrecon_envs.benchmark.feasibility import Proof, ProofSettings, prove
 from simrecon_envs.benchmark.parallel import Workers
@@ -112,7 +112,7 @@ def check_scenes(scenes: list[str], registry: Path | None) -> list[str]:
     Raises:
         UsageError: scenes are missing; lists them and the existing ones.
     """
-    catalog = SceneRegistry(registry)
+    catalog = open_registry(registry)
     known = list(catalog.revisions())
     wanted = list(dict.fromkeys(scene.removeprefix("SimRecon/") for scene in scenes)) or known
     missing = [scene for scene in wanted if scene not in known]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from registry import SceneRegistry, UsageError
+from registry import UsageError, open_registry
 from simrecon_envs.benchmark.episodes import Episode, run_episode
 from simrecon_envs.benchmark.fetching import how_to_get, wanted_scenes
 from simrecon_envs.benchmark.parallel import Workers
@@ -119,7 +119,7 @@ def check_revisions(tasks: list[SuiteTask], settings: RunSettings) -> list[str]:
     Raises:
         UsageError: scenes are missing, or have another revision without `any_revision`; lists all of them.
     """
-    catalog = SceneRegistry(None if settings.registry is None else Path(settings.registry))
+    catalog = open_registry(settings.registry)
     known = catalog.revisions()
     wanted = wanted_scenes(tasks)
     missing = [scene for scene in wanted if scene not in known]

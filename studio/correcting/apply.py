@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from registry import SceneRegistry
+from registry import open_registry
 from registry.errors import UsageError
 from registry.files import write_whole
 from studio.correcting.origin import Origin
@@ -118,7 +118,7 @@ class ApplyRun:
             return ApplyState(
                 False, error=_failure(lines, code), elapsed_s=elapsed, reused=reused, computed=begun
             )
-        revision = SceneRegistry(self._registry_root).get(self._scene_id).revision
+        revision = open_registry(self._registry_root).get(self._scene_id).revision
         return ApplyState(False, "", 1.0, "done", "", revision, elapsed, reused, begun)
 
     def cancel(self) -> None:

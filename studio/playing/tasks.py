@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from registry import SceneBundle, SceneRegistry
+from registry import SceneBundle, open_registry
 from registry.errors import UsageError
 
 KINDS: tuple[str, ...] = ("pick", "reach", "place", "put", "stack", "push", "rearrange", "navigate")
@@ -23,7 +23,7 @@ def tasks_of(scene: str, registry: str, revision: str, robot: str) -> tuple[str,
     from simrecon_envs.tasks.facts import scene_facts
 
     check_robot(robot)
-    folder = SceneRegistry(Path(registry)).scenes_folder / scene / revision
+    folder = open_registry(registry).scenes_folder / scene / revision
     facts = scene_facts(SceneBundle.open(folder, check_hashes=False), robot)
     return tuple(spec.name for spec in list_specs(facts) if not spec.problems)
 

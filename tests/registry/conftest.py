@@ -1,12 +1,13 @@
 """Fixtures for a small handmade bundle: a floor, a table and a cup on it."""
 
 import copy
+import logging
 from pathlib import Path
 
 import pytest
-from small_bundle import OBJ_TEXT, SCENE, pack_glb, triangle_document
 
 from registry import seal_bundle
+from synthetic.small_bundle import SCENE, pack_glb, triangle_document, write_small_bundle, write_small_files
 
 
 def _glb_bytes(document: dict | None = None) -> bytes:
@@ -28,7 +29,7 @@ def glb_bytes():
 @pytest.fixture
 def write_files():
     """Return a function that writes the mesh files named in `scene`."""
-    return _write_files
+    return write_small_files
 
 
 @pytest.fixture
@@ -38,19 +39,11 @@ def make_staging(tmp_path):
 
     def make(scene: dict | None = None, marker: str = "") -> Path:
         folder = tmp_path / f"staging{next(count)}"
-        _write_files(folder, marker)
+        write_small_files(folder, marker)
         seal_bundle(folder, copy.deepcopy(SCENE) if scene is None else scene)
         return folder
 
     return make
-
-
-def _write_files(folder: Path, marker: str = "") -> None:
-    for name in ("base/floor.glb", "objects/002/visual.glb", "objects/003/visual.glb"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(_glb_bytes())
-    for name in ("base/floor_000.obj", "objects/002/collision_000.obj", "objects/003/collision_000.obj"):
-        (folder / name).write_text(f"# {marker}\n{OBJ_TEXT}")
 
 
 @pytest.fixture(scope="session")
@@ -59,8 +52,32 @@ def make_bundle(tmp_path_factory):
 
     def make(scene_id: str = "room", marker: str = "") -> Path:
         folder = tmp_path_factory.mktemp("bundle")
-        _write_files(folder, marker)
-        seal_bundle(folder, copy.deepcopy(SCENE) | {"id": scene_id})
+        write_small_bundle(folder, scene_id, marker)
         return folder
 
     return make
+
+
+@pytest.fixture(scope="session")
+def s3():
+    """Start an S3 server in this process; return its address. Its clients find it by the environment."""
+    pytest.importorskip("s3fs", reason="S3 is tested with the extra s3")
+    server_module = pytest.importorskip("moto.server", reason="S3 is tested with moto")
+    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    host, port = server.get_host_and_port()
+    settings = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in settings.items():
+            patch.setenv(name, value)
+        import s3fs
+
+        s3fs.S3FileSystem(use_listings_cache=False).mkdir("lab")
+        yield settings["AWS_ENDPOINT_URL"]
+    server.stop()

@@ -4,8 +4,12 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from registry import BundleError, EnvironmentMissing, SceneRegistry, db, migrations
+from registry.index_rows import are_revisions, are_scene_ids, is_revision
+from registry.schema import is_scene_id
 
 V1_DUMP = Path(__file__).with_name("registry_v1.sql")
 
@@ -94,3 +98,29 @@ def test_transactions_nest(tmp_path):
         connection.execute("no SQL")
     assert connection.execute("SELECT x FROM t").fetchall() == [(1,), (3,)]
     connection.close()
+
+
+TEXTS = st.text(alphabet="a0_f\n A\x00\u0661", max_size=18)
+
+
+@given(
+    st.lists(
+        st.one_of(TEXTS, st.from_regex(r"[a-z0-9_]{1,64}|[0-9a-f]{16}", fullmatch=True), st.integers()),
+        max_size=4,
+    )
+)
+def test_many_values_are_checked_as_each_is(values):
+    assert are_scene_ids(values) == all(map(is_scene_id, values))
+    assert are_revisions(values) == all(map(is_revision, values))
+
+
+def test_revisions_leave_out_malformed_rows_and_are_ordered(tmp_path):
+    index = db.Index(tmp_path / "index.sqlite")
+    rest = ("ab" * 8, "simrecon.scene/1", db.utc_text(), "v.mp4", "ab" * 32, 1, "stable", {})
+    index.put(*(db.SceneRow(name, *rest) for name in ("room", "attic", "hall")))
+    assert list(index.revisions()) == ["attic", "hall", "room"]
+    assert index.revisions(ordered=False) == index.revisions()
+    with sqlite3.connect(index.path) as connection:
+        connection.execute("UPDATE scenes SET scene_id = 'a' || char(10) || 'b' WHERE scene_id = 'hall'")
+        connection.execute("UPDATE scenes SET revision = '../room' WHERE scene_id = 'room'")
+    assert list(index.revisions()) == list(index.revisions(ordered=False)) == ["attic"]

@@ -9,10 +9,10 @@ from pathlib import Path
 import hostile
 import numpy as np
 import pytest
-from small_bundle import OBJ_TEXT, SCENE, TRIANGLE, pack_glb, triangle_document
 
 from registry import BundleError, SceneBundle, SceneRegistry
 from registry.plain_text import is_plain
+from synthetic.small_bundle import OBJ_TEXT, SCENE, TRIANGLE, pack_glb, triangle_document
 
 pytestmark = pytest.mark.stage
 

@@ -2,13 +2,14 @@
 
 import http.server
 import json
-import logging
 import os
 import shutil
 import subprocess
 import sys
 import threading
+import time
 import uuid
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import exchange_worker
@@ -23,31 +24,6 @@ from registry.exchange.sharing import read_entry, revisions_of, write_catalog
 pytestmark = pytest.mark.stage
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="session")
-def s3():
-    """Start an S3 server in this process; return its address. Its clients find it by the environment."""
-    pytest.importorskip("s3fs", reason="S3 is tested with the extra s3")
-    server_module = pytest.importorskip("moto.server", reason="S3 is tested with moto")
-    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    host, port = server.get_host_and_port()
-    settings = {
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in settings.items():
-            patch.setenv(name, value)
-        import s3fs
-
-        s3fs.S3FileSystem(use_listings_cache=False).mkdir("lab")
-        yield settings["AWS_ENDPOINT_URL"]
-    server.stop()
 
 
 @pytest.fixture(params=["folder", "memory", "s3"])
@@ -121,6 +97,21 @@ def test_a_lost_pack_is_uploaded_again(address, bundles, mine):
         pull_scene(place, "room", mine)
     assert push_scene(bundles[0], place).uploaded_bytes > 0
     assert pull_scene(place, "room", mine).new
+
+
+def test_one_of_many_creates_an_object(address):
+    place = open_place(address)
+    many = [1] if address.startswith("memory") else range(8)  # fsspec's memory looks first
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda number: place.create("ids/room", f"{number}".encode()), many))
+    assert sum(made) == 1
+    assert place.read("ids/room", 10) == f"{list(many)[made.index(True)]}".encode()
+    assert not place.create("ids/room", b"later")
+    assert abs(time.time() - place.modified_s("ids/room")) < 100
+    assert place.read_many(["ids/room", "ids/none"], 10) == [place.read("ids/room", 10), None]
+    place.remove(["ids/room", "ids/none"])
+    assert place.keys("ids") == []
+    assert place.create("ids/room", b"later")
 
 
 def test_foreign_files_and_wrong_packs_are_not_trusted(address, bundles, mine, tmp_path):
@@ -258,7 +249,6 @@ def test_many_processes_push_and_lose_nothing(kind, processes, each, request, tm
             [
                 sys.executable,
                 exchange_worker.__file__,
-                "push",
                 address,
                 *map(str, bundles[n * each : (n + 1) * each]),
             ],

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 import simrecon_envs
 from reconstruction.cli import main
-from registry import SceneRegistry, UsageError
+from registry import SceneRegistry, UsageError, open_registry, registry_folder
 from registry.exchange import open_place, pack_scene, push_scene
 from simrecon_envs.benchmark.fetching import fetch_scenes
 from simrecon_envs.benchmark.reporting import Reporter
@@ -60,6 +61,51 @@ def test_added_scenes_are_registered_at_once(pack, tmp_path):
         simrecon_envs.add(tmp_path / "none.simrecon", registry=tmp_path / "registry")
     simrecon_envs.register_scenes()
     del gym.registry[name]
+
+
+def test_scenes_of_a_registry_at_an_address_are_environments(scenes_root, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("SIMRECON_HOME", str(tmp_path / "publisher"))
+    address = f"file://{tmp_path / 'lab'}"
+    local, shared = SceneRegistry(scenes_root), open_registry(address)
+    for scene in ("bare", "room"):
+        shared.publish(local.load(scene).root, f"lab_{scene}")
+
+    monkeypatch.setenv("SIMRECON_HOME", str(tmp_path / "user"))
+    assert simrecon_envs.register_scenes(address) == ["SimRecon/lab_bare", "SimRecon/lab_room"]
+    copy = registry_folder(address)
+    assert not (copy / "scenes").exists()
+    env = gym.make("SimRecon/lab_room", obs_mode="state")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+    assert [folder.name for folder in (copy / "scenes").iterdir()] == ["lab_room"]  # only what was opened
+    assert [record.scene_id for record in simrecon_envs.list_scenes(registry=address)] == [
+        "lab_bare",
+        "lab_room",
+    ]
+
+    for verb in (["show", "lab_room"], ["verify", "lab_room"], ["remove", "lab_room", "--yes"], ["list"]):
+        assert main([*verb, "--registry", address]) == 0
+    listed = capsys.readouterr().out.splitlines()[-1]
+    assert listed.startswith("SimRecon/lab_bare")
+    assert main(["registry", "rebuild", "--registry", address]) == 0
+    assert "1 scenes" in capsys.readouterr().out
+    simrecon_envs.register_scenes(address)
+    assert "SimRecon/lab_room" not in gym.registry
+    monkeypatch.setenv("SIMRECON_REGISTRY", address)
+    env = simrecon_envs.make("lab_bare", obs_mode="state")
+    assert env.unwrapped.scene_id == "lab_bare"
+    env.close()
+    del gym.registry["SimRecon/lab_bare"]
+    shutil.rmtree(tmp_path / "lab")  # importing asks no place
+    simrecon_envs.registration.register_default_scenes()
+    assert "SimRecon/lab_bare" in gym.registry
+    with pytest.raises(SystemExit) as refused:
+        main(["list", "--registry", "s3://key:secret@host/x"])
+    assert refused.value.code == 2
+    assert "secret" not in capsys.readouterr().err
+    for name in ("bare", "room"):
+        gym.registry.pop(f"SimRecon/lab_{name}", None)
 
 
 def test_a_suite_names_what_is_missing_and_pulls_it(suite, place, tmp_path):

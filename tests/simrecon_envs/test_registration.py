@@ -1,7 +1,10 @@
 """Importing registers scenes without heavy imports; ids and specs conform to Gymnasium."""
 
+import copy
+import dataclasses
 import json
 import os
+import pickle
 import sqlite3
 import subprocess
 import sys
@@ -100,8 +103,43 @@ def test_spec_round_trips_through_json(scenes_root: Path) -> None:
     assert set(json.loads(text)["kwargs"]) == {"scene_id", "revision", "registry"}
 
 
+def test_specs_of_scenes_are_those_that_gymnasium_would_make(scenes_root: Path) -> None:
+    simrecon_envs.register_scenes(scenes_root)
+    spec = gym.registry["SimRecon/room"]
+    made = EnvSpec(
+        id="SimRecon/room",
+        entry_point="simrecon_envs.scene_env:SceneEnv",
+        max_episode_steps=200,
+        disable_env_checker=True,
+        kwargs={
+            "scene_id": "room",
+            "revision": SceneRegistry(scenes_root).get("room").revision,
+            "registry": str(scenes_root),
+        },
+        additional_wrappers=spec.additional_wrappers,
+    )
+    assert {field.name: getattr(spec, field.name) for field in dataclasses.fields(EnvSpec)} == vars(made)
+    assert spec == made
+    assert made == spec
+    assert spec != dataclasses.replace(made, max_episode_steps=7)
+    assert dataclasses.asdict(spec) == dataclasses.asdict(made)
+    assert "id=SimRecon/room" in spec.pprint(disable_print=True)
+    for copied in (copy.copy(spec), copy.deepcopy(spec), pickle.loads(pickle.dumps(spec))):
+        assert type(copied) is EnvSpec
+        assert copied == made
+    changed = dataclasses.replace(spec, max_episode_steps=7)
+    assert (changed.max_episode_steps, spec.max_episode_steps) == (7, 200)
+    copied = copy.deepcopy(spec)
+    copied.kwargs["task"] = "pick_box"
+    assert spec == made
+    spec.kwargs["seed"] = 3  # as of any entry of Gymnasium's registry, a change stays
+    assert copy.deepcopy(gym.spec("SimRecon/room")).kwargs["seed"] == 3
+    simrecon_envs.register_scenes(scenes_root)
+    assert gym.spec("SimRecon/room") == made
+
+
 def test_unknown_scene_lists_what_there_is_and_the_nearest(scenes_root: Path) -> None:
-    expected = r"Did you mean 'SimRecon/room'\?.*SimRecon/bare, SimRecon/room, SimRecon/things"
+    expected = r"Did you mean 'SimRecon/room'\?.*SimRecon/bare, SimRecon/room, .*SimRecon/things"
     with pytest.raises(SceneNotFound, match=expected):
         simrecon_envs.make("rooms", registry=scenes_root)
     simrecon_envs.register_scenes(scenes_root)
