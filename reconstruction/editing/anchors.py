@@ -216,10 +216,10 @@ def _nearest_pixel(mask: np.ndarray, pixel: np.ndarray) -> tuple[int, int, float
 
 
 def _in_box(item: Instance, point: np.ndarray) -> bool:
-    return bool((np.abs(_to_box(item) @ (point - item.center)) <= 0.5 * np.asarray(item.extents_m)).all())
+    return bool((np.abs(box_axes(item) @ (point - item.center)) <= 0.5 * np.asarray(item.extents_m)).all())
 
 
-def _to_box(item: Instance) -> np.ndarray:
+def box_axes(item: Instance) -> np.ndarray:
     """Return the rotation (3, 3) from the world to the axes of an object's box."""
     c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0, 0, 1.0]])
@@ -227,7 +227,7 @@ def _to_box(item: Instance) -> np.ndarray:
 
 def _entry(item: Instance, eye: np.ndarray, ray: np.ndarray) -> float:
     """Return how far along a ray (3,), in lengths of it, it enters an object's box; infinity if it misses."""
-    start, along = _to_box(item) @ (eye - item.center), _to_box(item) @ ray
+    start, along = box_axes(item) @ (eye - item.center), box_axes(item) @ ray
     along = np.where(np.abs(along) < 1e-12, 1e-12, along)
     half = 0.5 * np.asarray(item.extents_m)
     ends = np.sort(np.stack([(-half - start) / along, (half - start) / along]), axis=0)

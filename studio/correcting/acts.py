@@ -154,6 +154,14 @@ class Acts:
             object_id, {"move": {"to": place, "wxyz": turn}}, f"{self._named(object_id)} is moved by hand"
         )
 
+    def size(self, object_id: int, size_m: Sequence[float]) -> Act:
+        """Give an object the sides of its box along its own axes, metres."""
+        sides = [_short(side) for side in size_m]
+        if len(sides) != 3 or not all(0.001 <= side <= 20 for side in sides):
+            raise UsageError("size: give three lengths in metres, 0.001 to 20")
+        words = " x ".join(f"{100 * side:.4g}" for side in sides)
+        return self._of(object_id, {"size_m": sides}, f"{self._named(object_id)} is {words} cm large")
+
     def drop_to_surface(self, object_id: int) -> Act:
         """Let an object down until it rests on what is below it."""
         return self._of(
