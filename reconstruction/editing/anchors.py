@@ -9,6 +9,7 @@ from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Surface
 from reconstruction.editing.addresses import Address
 from reconstruction.editing.film import Film
 from reconstruction.instances.id_maps import seen_vertices
+from reconstruction.instances.partition.seeded import Affinities
 from registry.errors import UsageError
 
 NEAR_M = 0.3  # largest distance of `near` to the object's box
@@ -21,6 +22,15 @@ class Footage(Film):
     """The film in world space with the surface that was reconstructed from it."""
 
     surface: Surface
+
+    @cached_property
+    def affinities(self) -> Affinities:
+        """Learned affinities of the surface's superpoints; the first access takes seconds.
+
+        Raises:
+            EnvironmentMissing: the weights cannot be read.
+        """
+        return Affinities.of(self.surface, self.posed, self.depth)
 
     def seen_vertices(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Return the surface vertex int32 (h, w) at each pixel at depth resolution, -1 = none."""

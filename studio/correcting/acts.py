@@ -60,9 +60,20 @@ def _same_but(action: str, a: dict, b: dict) -> bool:
 class Acts:
     """Makes acts for one revision of a scene."""
 
-    def __init__(self, anchors: Anchors, name_of: Callable[[int], str]) -> None:
-        """Remember where addresses and names (which may be hostile) come from."""
-        self._anchors, self._name_of = anchors, name_of
+    def __init__(
+        self,
+        anchors: Anchors,
+        name_of: Callable[[int], str],
+        joined: Callable[[int], int] = lambda number: number,
+    ) -> None:
+        """Remember where addresses and names (which may be hostile) come from.
+
+        Args:
+            anchors: addresses of this revision.
+            name_of: name of an object or base entity.
+            joined: one id for all objects that acts not applied yet have merged.
+        """
+        self._anchors, self._name_of, self._joined = anchors, name_of, joined
 
     def relabel(self, object_id: int, label: str) -> Act:
         """Name an object."""
@@ -87,9 +98,10 @@ class Acts:
         clicks = [click for part in parts for click in part]
         if len(parts) < 2 or not all(parts):
             raise UsageError("split: click at least two parts of one thing")
-        owners = {click.id for click in clicks}
+        owners = {None if click.id is None else self._joined(click.id) for click in clicks}
         if len(owners) > 1 or None in owners:
-            names = " and ".join("nothing" if o is None else self._named(o) for o in sorted(owners, key=str))
+            hit = sorted({click.id for click in clicks}, key=str)
+            names = " and ".join("nothing" if o is None else self._named(o) for o in hit)
             raise UsageError(f"split: all clicks must be on one thing; they are on {names}")
         owner = clicks[0].id
         assert owner is not None

@@ -188,6 +188,21 @@ def test_the_preview_follows_the_acts(session):
     assert "shows" in session.previewer.full(again.entries).error
 
 
+def test_things_that_were_merged_can_be_split_at_once(session):
+    """Two things that were cut along a wrong line: merge, then click what is what, before Apply."""
+    pointer = session.previewer.pointer()
+    owner, points = np.asarray(pointer.found.vertex_instance), np.asarray(pointer.surface.vertices, float)
+    first, second = (o.id for o in session.bundle.objects[:2])
+    spots = [[click(i, points[np.flatnonzero(owner == i)[0]])] for i in (first, second)]
+    with pytest.raises(UsageError, match="all clicks must be on one thing"):
+        session.acts.split(spots)
+    session.perform(session.acts.merge([first, second]))
+    state = session.perform(session.acts.split(spots))
+    assert session.previewer.full(state.entries).error == ""
+    after = Overrides(state.entries).apply_to_instances(pointer)
+    assert len(after.objects) == len(pointer.found.objects)
+
+
 def test_wrong_clicks_are_said(session):
     acts, number = session.acts, session.bundle.objects[0].id
     spot = session.bundle.objects[0].world_from_object[:3, 3]
