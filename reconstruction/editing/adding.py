@@ -290,6 +290,6 @@ def _drawn_into(
     mine[chosen] = True
     replaced = {0, *np.unique(before[chosen]).tolist()}
     for row, ids in enumerate(maps):
-        seen = footage.seen_vertices(np.asarray(footage.posed.world_from_camera[row]))
+        seen = footage.seen_in_keyframe(row)
         ids[(seen >= 0) & mine[seen] & np.isin(ids, list(replaced))] = number
     return maps

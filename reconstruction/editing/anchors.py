@@ -36,6 +36,16 @@ class Footage(Film):
         """Return the surface vertex int32 (h, w) at each pixel at depth resolution, -1 = none."""
         return seen_vertices(self.surface, self.depth.camera, world_from_camera)[0]
 
+    def seen_in_keyframe(self, row: int) -> np.ndarray:
+        """Return `seen_vertices` of a keyframe by its row; each is rendered once."""
+        if row not in self._seen:
+            self._seen[row] = self.seen_vertices(np.asarray(self.posed.world_from_camera[row]))
+        return self._seen[row]
+
+    @cached_property
+    def _seen(self) -> dict[int, np.ndarray]:
+        return {}
+
 
 @dataclass(frozen=True)
 class Pointer:

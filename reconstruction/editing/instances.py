@@ -156,10 +156,7 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
     labels = np.array(found.vertex_instance)
     labels[chosen] = numbers[part]
     maps = np.array(found.id_maps)
-    split_maps(
-        maps, lambda row: footage.seen_vertices(np.asarray(footage.posed.world_from_camera[row])), labels,
-        item.id, numbers.tolist(),
-    )  # fmt: skip
+    split_maps(maps, footage.seen_in_keyframe, labels, item.id, numbers.tolist())
     parts = [replace(item, id=int(number)) for number in numbers]
     others = tuple(parts[0] if o.id == item.id else o for o in found.objects)
     out = replace(found, vertex_instance=labels, id_maps=maps, objects=(*others, *parts[1:]))

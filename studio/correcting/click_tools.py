@@ -7,7 +7,7 @@ import numpy as np
 
 from registry.errors import SimReconError, UsageError
 from studio.correcting.acts import Act, Outline
-from studio.correcting.shown import COLORS
+from studio.correcting.shown import COLOR_NAMES, COLORS
 from studio.selection import Click
 
 if TYPE_CHECKING:
@@ -17,6 +17,11 @@ _DOT_M = 0.008
 _NEAR = 0.14  # metres before the camera, where outlines are drawn: nearer than the photograph
 
 _NOTHING: tuple[str, ...] = ("none",)
+_NEW_PART: tuple[str, ...] = ("a new part",)
+
+
+def _part_name(number: int) -> str:
+    return f"part {number + 1} ({COLOR_NAMES[number % len(COLOR_NAMES)]})"
 
 
 class ClickTools:
@@ -28,6 +33,7 @@ class ClickTools:
         self._outlines: list[Outline] = []
         self._nodes: list = []
         self._finish: Callable[[], Act] | None = None
+        self._last_split: tuple[dict, list[list[Click]]] | None = None  # its entry, and what was clicked
         self._auto: int | None = None  # number of clicks after which the tool is done by itself
         gui = self._page.server.gui
         with gui.add_folder("By clicks"):
@@ -35,6 +41,11 @@ class ClickTools:
                 "Split",
                 self._split,
                 "click each part of one thing; Shift and click: another point of the same part",
+            )
+            part.button(
+                "More points",
+                self._more_points,
+                "after a split whose colors are wrong: its points are kept, and you add others",
             )
             self._relation = gui.add_dropdown(
                 "Relation", ("supported_by", "attached_to"), initial_value="supported_by"
@@ -54,12 +65,14 @@ class ClickTools:
             )
             part.button("Next frame", self._next_outline, "go on with the outline in another frame")
         self._hint = gui.add_markdown("", visible=False)
+        self._onto = gui.add_dropdown("Part", _NEW_PART, initial_value=_NEW_PART[0], visible=False)
         self._done = part.button("Done", self._end, "write the act")
         self._cancel = part.button("Cancel", self.cancel, "forget these clicks")
         self._done.visible = self._cancel.visible = False
 
     def fill(self) -> None:
         """Offer the frames whose photographs are kept; reads the stage cache."""
+        self._last_split = None  # its clicks are on another revision
         frames = tuple(str(index) for index in self._page.frames.photographed)
         if frames:
             self._frame.options = frames
@@ -77,7 +90,7 @@ class ClickTools:
         for node in self._nodes:
             node.remove()
         self._nodes = []
-        self._hint.visible = self._done.visible = self._cancel.visible = False
+        self._hint.visible = self._done.visible = self._cancel.visible = self._onto.visible = False
 
     def _begin(self, hint: str, finish: Callable[[], Act], auto: int | None = None) -> None:
         self.cancel()
@@ -90,6 +103,8 @@ class ClickTools:
         if self._finish is None:
             return
         act = self._finish()  # where it fails, the clicks stay and the tool goes on
+        if "split" in act.entry:
+            self._last_split = act.entry, self._clicks
         self.cancel()
         self._part.perform(act)
 
@@ -97,15 +112,22 @@ class ClickTools:
         try:
             if click.point_world is None or click.id is None:
                 raise UsageError("nothing is there; click a surface of the scene")
-            if click.modifier == "shift" and self._clicks:
-                self._clicks[-1].append(click)
-            else:
-                self._clicks.append([click])
-            self._dot(click, COLORS[(len(self._clicks) - 1) % len(COLORS)])
+            number = self._part_of(click)
+            if number == len(self._clicks):
+                self._clicks.append([])
+            self._clicks[number].append(click)
+            self._dot(click, COLORS[number % len(COLORS)])
             if self._auto is not None and len(self._clicks) >= self._auto:
                 self._end()
         except SimReconError as error:
             self._part.fail(error)
+
+    def _part_of(self, click: Click) -> int:
+        """Return the number of the part that gets a click; the next free one is a new part."""
+        if self._onto.visible and self._onto.value in self._onto.options[:-1]:
+            return self._onto.options.index(self._onto.value)
+        again = click.modifier == "shift" and self._clicks
+        return len(self._clicks) - 1 if again else len(self._clicks)
 
     def _dot(self, click: Click, color: tuple[int, int, int]) -> None:
         assert click.point_world is not None
@@ -123,6 +145,25 @@ class ClickTools:
             "**Split**: click each part once. Shift and click adds a point to the last part. Then *Done*.",
             lambda: self._part.session.acts.split(self._clicks),
         )
+
+    def _more_points(self) -> None:
+        """Take the last split back, and go on with its clicks."""
+        entries = self._part.session.document.state().entries
+        if self._last_split is None or entries[-1:] != [self._last_split[0]]:
+            raise UsageError("more points: the last act is no split that was made here; press Split")
+        clicks = self._last_split[1]
+        self._part.show(self._part.session.document.undo())
+        self._split()
+        self._clicks = [list(part) for part in clicks]
+        for number, part in enumerate(self._clicks):
+            for click in part:
+                self._dot(click, COLORS[number % len(COLORS)])
+        self._hint.content = (
+            "**More points**: choose a part below, and click where its color is missing. Then *Done*."
+        )
+        names = tuple(_part_name(number) for number in range(len(self._clicks)))
+        self._onto.options = (*names, *_NEW_PART)
+        self._onto.value, self._onto.visible = names[0], True
 
     def _parent(self) -> None:
         child = self._part.selected()

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from studio.scene_view import StudioPage
 
 COLORS = ((230, 120, 30), (60, 140, 220), (120, 190, 60), (190, 80, 190), (220, 190, 40), (60, 190, 190))
+COLOR_NAMES = ("orange", "blue", "green", "violet", "yellow", "teal")
 _POINT_M = 0.006
 _LIFT_M = 0.03  # of a name over its thing
 
