@@ -45,6 +45,7 @@ _PART = 0.35  # a true object of which this share of the seen surface is in a th
 _LEAST = 60  # vertices; fewer are borders
 _MOSTLY = 0.6
 _RIGHT = 0.75  # of a part that a look at the preview accepts
+_GOOD_ENOUGH = 0.6  # of a part: the best of several tries is kept
 _MIXED = 0.2  # of a true object, and of a thing: with less in common, a thing is not taken for a piece of it
 _TRIES = 5  # of a split, each with more clicks
 _BOX_RIGHT = 0.5  # IoU of boxes from which on a size is not corrected
@@ -84,6 +85,7 @@ class User:
 
     def __init__(self, session: Session, truth: GroundTruth, played: Played) -> None:
         self.session, self.truth, self.played = session, truth, played
+        self.told: set[tuple[int, int, str]] = set()  # relations that were set already
         self.look()
 
     def look(self) -> None:
@@ -150,30 +152,38 @@ class User:
     def split(self, thing: int, entities: list[TrueEntity]) -> None:
         """Split a thing into true objects: by a click each, then by more clicks where the preview is wrong.
 
-        If all tries fail, outlines go around all but the largest part, one frame each.
+        Of tries that are all wrong the best is kept if it is good enough; else outlines go around all but the largest
+        part, one frame each.
         """
         mine = self.owner == thing
         rows = [np.flatnonzero(mine & (self.true == entity.id)) for entity in entities]
         parts = [[self.middle_of(part)] for part in rows]
-        shown: list[np.ndarray] = []
-
-        def good(after: np.ndarray) -> bool:
-            shown.append(after)
-            return self._pure(after, thing, entities) >= _RIGHT
-
-        clicks, tries = 2 + len(parts), 0  # Split, Done
+        tried: list[tuple[float, list[list[Click]]]] = []
+        after: list[np.ndarray] = []
+        clicks = 2 + len(parts)  # Split, a click each, Done
         for _ in range(_TRIES):
             clicked = [list(part) for part in parts]
+
+            def good(owner: np.ndarray, clicked: list[list[Click]] = clicked) -> bool:
+                after.append(owner)
+                tried.append((self._pure(owner, thing, entities), clicked))
+                return tried[-1][0] >= _RIGHT
+
+            before = len(tried)
             if self.do(lambda c=clicked: self.session.acts.split(c), clicks, good):
                 return
-            refused = len(shown) == tries
-            tries = len(shown)
-            if refused or not self._more_clicks(parts, rows, shown[-1]):
+            if len(tried) == before:
+                break  # refused
+            added = self._more_clicks(parts, rows, after[-1])
+            if not added:
                 break
-            added = sum(map(len, parts)) - sum(map(len, clicked))
             clicks = (
                 1 + 3 * added
-            )  # More points takes the place of Undo; each point: open the list, its part, the spot
+            )  # Done, and for each point: open the list, its part, the spot; More points is the undo
+        purity, best = max(tried, key=lambda one: one[0], default=(0.0, []))
+        if purity >= _GOOD_ENOUGH:
+            self.do(lambda: self.session.acts.split(best), 1)  # Redo
+            return
         for k, entity in enumerate(entities):
             if k != int(np.argmax([len(part) for part in rows])):
                 self.add(entity, 1)
@@ -342,6 +352,9 @@ class User:
                 near = self.points[rows] - self.points[self.owner == child].mean(axis=0)
                 where = _click(parent, self.points[rows[np.argmin(np.linalg.norm(near, axis=1))]])
             relation = entity.relation or "supported_by"
+            if (child, parent, relation) in self.told:
+                continue  # said before, and the simulation showed otherwise
+            self.told.add((child, parent, relation))
             self.do(lambda c=child, w=where, r=relation: self.session.acts.parent(c, w, r), 3)
 
     def _base(self) -> dict[int, int]:
