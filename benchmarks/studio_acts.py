@@ -177,9 +177,8 @@ class User:
             added = self._more_clicks(parts, rows, after[-1])
             if not added:
                 break
-            clicks = (
-                1 + 3 * added
-            )  # Done, and for each point: open the list, its part, the spot; More points is the undo
+            # Done, and for each point its color and the spot; More points takes the place of the undo.
+            clicks = 1 + 2 * added
         purity, best = max(tried, key=lambda one: one[0], default=(0.0, []))
         if purity >= _GOOD_ENOUGH:
             self.do(lambda: self.session.acts.split(best), 1)  # Redo

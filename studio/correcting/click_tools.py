@@ -17,11 +17,6 @@ _DOT_M = 0.008
 _NEAR = 0.14  # metres before the camera, where outlines are drawn: nearer than the photograph
 
 _NOTHING: tuple[str, ...] = ("none",)
-_NEW_PART: tuple[str, ...] = ("a new part",)
-
-
-def _part_name(number: int) -> str:
-    return f"part {number + 1} ({COLOR_NAMES[number % len(COLOR_NAMES)]})"
 
 
 class ClickTools:
@@ -34,6 +29,9 @@ class ClickTools:
         self._nodes: list = []
         self._finish: Callable[[], Act] | None = None
         self._last_split: tuple[dict, list[list[Click]]] | None = None  # its entry, and what was clicked
+        self._onto: int | None = (
+            None  # part of a split that gets the next points; None: a new one, or by Shift the last
+        )
         self._auto: int | None = None  # number of clicks after which the tool is done by itself
         gui = self._page.server.gui
         with gui.add_folder("By clicks"):
@@ -65,7 +63,10 @@ class ClickTools:
             )
             part.button("Next frame", self._next_outline, "go on with the outline in another frame")
         self._hint = gui.add_markdown("", visible=False)
-        self._onto = gui.add_dropdown("Part", _NEW_PART, initial_value=_NEW_PART[0], visible=False)
+        self._colors = gui.add_button_group(
+            "Next point", COLOR_NAMES, visible=False, hint="which part of a split gets the next points"
+        )
+        self._colors.on_click(lambda _: self._choose(COLOR_NAMES.index(self._colors.value)))
         self._done = part.button("Done", self._end, "write the act")
         self._cancel = part.button("Cancel", self.cancel, "forget these clicks")
         self._done.visible = self._cancel.visible = False
@@ -86,11 +87,11 @@ class ClickTools:
     def cancel(self) -> None:
         """Give the clicks back, and forget those that were made."""
         self._page.grab_clicks(None)
-        self._finish, self._auto, self._clicks, self._outlines = None, None, [], []
+        self._finish, self._auto, self._clicks, self._outlines, self._onto = None, None, [], [], None
         for node in self._nodes:
             node.remove()
         self._nodes = []
-        self._hint.visible = self._done.visible = self._cancel.visible = self._onto.visible = False
+        self._hint.visible = self._done.visible = self._cancel.visible = self._colors.visible = False
 
     def _begin(self, hint: str, finish: Callable[[], Act], auto: int | None = None) -> None:
         self.cancel()
@@ -124,8 +125,8 @@ class ClickTools:
 
     def _part_of(self, click: Click) -> int:
         """Return the number of the part that gets a click; the next free one is a new part."""
-        if self._onto.visible and self._onto.value in self._onto.options[:-1]:
-            return self._onto.options.index(self._onto.value)
+        if self._onto is not None:
+            return min(self._onto, len(self._clicks))
         again = click.modifier == "shift" and self._clicks
         return len(self._clicks) - 1 if again else len(self._clicks)
 
@@ -142,9 +143,11 @@ class ClickTools:
 
     def _split(self) -> None:
         self._begin(
-            "**Split**: click each part once. Shift and click adds a point to the last part. Then *Done*.",
+            "**Split**: click each part once. Shift and click adds a point to the last part, a color below to another "
+            "one. Then *Done*.",
             lambda: self._part.session.acts.split(self._clicks),
         )
+        self._colors.visible = True
 
     def _more_points(self) -> None:
         """Take the last split back, and go on with its clicks."""
@@ -158,12 +161,14 @@ class ClickTools:
         for number, part in enumerate(self._clicks):
             for click in part:
                 self._dot(click, COLORS[number % len(COLORS)])
+        self._choose(0)
+
+    def _choose(self, number: int) -> None:
+        """Give the next points to a part of a split, by its number; beyond the last one it is a new part."""
+        self._onto = number
         self._hint.content = (
-            "**More points**: choose a part below, and click where its color is missing. Then *Done*."
+            f"**Split**: points that you click now are of the **{COLOR_NAMES[number]}** part. Then *Done*."
         )
-        names = tuple(_part_name(number) for number in range(len(self._clicks)))
-        self._onto.options = (*names, *_NEW_PART)
-        self._onto.value, self._onto.visible = names[0], True
 
     def _parent(self) -> None:
         child = self._part.selected()
