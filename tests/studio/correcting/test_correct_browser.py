@@ -169,6 +169,9 @@ def play(studio: StudioPage, browser: Page) -> None:
     assert viewer.part.preview.merged == [{first, second}]
     viewer.press("Undo")
     viewer.until(lambda: len(viewer.acts()) == 1, "the merge is undone")
+    viewer.until(
+        lambda: "are one thing" not in browser.text(), "the list is shorter: it moves the buttons below it"
+    )
     viewer.press("Redo")
     viewer.until(lambda: len(viewer.acts()) == 2, "the merge is redone")
     viewer.press("Undo")
