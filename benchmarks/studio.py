@@ -3,9 +3,13 @@
     python -m benchmarks.studio SCENE [--registry DIR] [--width 960] [--height 640]
 
 Headless Chromium renders in software (SwiftShader): figures depend on the processor, whose load is printed beside them.
+Frames are those that were drawn. What the renderer itself allows is measured beside it: the same page with nothing in
+view, and a page of viser alone with one box, as viser sets it up and without its lights.
 """
 
 import argparse
+import contextlib
+import io
 import os
 import sys
 import tempfile
@@ -21,6 +25,36 @@ _BLANK = 8.0  # standard deviation of pixel values below which a view counts as 
 _LIMIT_S = 120.0
 _MOVES_S = 6.0
 _RATE_HZ = 30.0  # of poses that a running simulation sends
+_ADAPTS_S = 12.0  # until a page has loaded, and viser has lowered its resolution
+_PANEL_WIDTH_PX = 360  # as in the studio
+_RENDERER = """(() => {
+  const canvas = [...document.querySelectorAll("canvas")].sort((a, b) => b.width - a.width)[0];
+  const gl = canvas.getContext("webgl2");
+  const name = gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info").UNMASKED_RENDERER_WEBGL);
+  return `${name}, ${gl.getParameter(gl.SAMPLES)} samples a pixel`;
+})()"""
+_COUNT_DRAWN = """(() => {
+  if (window.drawn) return;
+  window.drawn = { frames: 0, calls: 0, triangles: 0, now: false };
+  const made = WebGL2RenderingContext.prototype;
+  const counted = (name, corners) => {
+    const draw = made[name];
+    made[name] = function (...a) {
+      drawn.now = true;
+      if (corners) { drawn.calls++; drawn.triangles += corners(a) / 3; }
+      return draw.apply(this, a);
+    };
+  };
+  counted("clear", null);
+  counted("drawElements", (a) => a[1]);
+  counted("drawElementsInstanced", (a) => a[1] * a[4]);
+  counted("drawArrays", (a) => a[2]);
+  counted("drawArraysInstanced", (a) => a[2] * a[3]);
+  (function frame() {
+    if (drawn.now) { drawn.frames++; drawn.now = false; }
+    requestAnimationFrame(frame);
+  })();
+})()"""
 
 
 def main() -> None:
@@ -56,12 +90,21 @@ def main() -> None:
             seconds, busy = until_seen(tab, address, arguments.width, arguments.height)
             print(f"{visit}: room seen after {seconds:.1f} s, {busy:.1f} s of processor time in the browser")
         tab.settle(2.0)
-        rate, busy = frame_rate(tab)
-        print(
-            f"frames per second while looking around: {rate:.1f}, {1000 * busy:.0f} ms of processor time a frame "
-            f"({canvas_size(tab)})"
-        )
+        print(f"renderer: {tab.evaluate(_RENDERER)}")
+        tell(tab, "while looking around")
+        tab.open(server.url(arguments.scene), arguments.width, arguments.height)
+        tab.settle(_ADAPTS_S)
+        tell(tab, "... at the resolution that viser chooses")
+        tab.open(address, arguments.width, arguments.height)
+        tab.settle(_ADAPTS_S)
+        handles = [*page.object_handles().values(), *page.room_handles()]
+        for handle in handles:
+            handle.visible = False
+        tell(tab, "... with nothing in view")
+        for handle in handles:
+            handle.visible = True
         print(f"state of all objects moving at {_RATE_HZ:.0f} Hz: {state_rate(page) / 1e6:.3f} MB/s")
+        tell_of_viser_alone(tab, arguments.width, arguments.height)
     server.stop()
     print(f"export: {len(export_html(registry, arguments.scene).encode()) / 1e6:.1f} MB")
     print(f"load of this machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
@@ -83,16 +126,53 @@ def until_seen(tab, address: str, width: int, height: int) -> tuple[float, float
     raise TimeoutError(f"the 3D view is blank after {_LIMIT_S:.0f} s")
 
 
-def frame_rate(tab) -> tuple[float, float]:
-    """Return frames per second while the camera turns with the mouse, and the browser's processor seconds a frame."""
-    tab.evaluate("window.frames_ = 0; (function f() { window.frames_++; requestAnimationFrame(f); })()")
+def tell(tab, what: str) -> None:
+    """Print the rate of drawn frames while the camera turns with the mouse."""
+    tab.settle(1.0)
+    rate, busy, draws, triangles = frame_rate(tab)
+    print(
+        f"frames per second {what}: {rate:.1f}, {1000 * busy:.0f} ms of processor time a frame; "
+        f"{draws:.0f} draw calls, {triangles / 1000:.0f},000 triangles ({canvas_size(tab)})"
+    )
+
+
+def tell_of_viser_alone(tab, width: int, height: int) -> None:
+    """Print the rate of a page of viser with one box, without anything of the studio."""
+    import viser
+
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(port=0, verbose=False)
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(_PANEL_WIDTH_PX)
+    server.scene.add_box("/box", dimensions=(0.3, 0.3, 0.3))
+    tab.open(f"http://127.0.0.1:{server.get_port()}/?fixedDpr=1", width, height)
+    tab.settle(4.0)
+    tell(tab, "of viser alone, one box")
+    server.scene.configure_default_lights(enabled=False)
+    server.scene.configure_environment_map(None)
+    tell(tab, "of viser alone, one box, no lights")
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def frame_rate(tab) -> tuple[float, float, float, float]:
+    """Return drawn frames per second while the camera turns with the mouse, and what a frame takes.
+
+    Returns:
+        Frames per second, the browser's processor seconds a frame, draw calls a frame, triangles a frame.
+    """
+    tab.evaluate(_COUNT_DRAWN)
     x, y = 220, 300
-    first, start, before = tab.evaluate("window.frames_"), time.monotonic(), _browser_seconds()
+    start, before = time.monotonic(), _browser_seconds()
+    tab.evaluate("drawn.frames = drawn.calls = drawn.triangles = 0")
     while time.monotonic() - start < _MOVES_S:
         tab.drag((x, y), (x + 90, y + 20), steps=15, pause_s=0.03)
         tab.drag((x + 90, y + 20), (x, y), steps=15, pause_s=0.03)
-    frames = tab.evaluate("window.frames_") - first
-    return frames / (time.monotonic() - start), (_browser_seconds() - before) / frames
+    frames, calls, triangles = tab.evaluate("[drawn.frames, drawn.calls, drawn.triangles]")
+    seconds = time.monotonic() - start
+    return (
+        frames / seconds, (_browser_seconds() - before) / frames, calls / frames, triangles / frames
+    )  # fmt: skip
 
 
 def canvas_size(tab) -> str:

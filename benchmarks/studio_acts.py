@@ -2,11 +2,13 @@
 
     python -m benchmarks.studio_acts --home HOME --scene default --truth CAPTURE/ground_truth --video FILE --out FILE
 
-The user sees the things of the scene and the true room. In each round they click the parts of wrong merges (split),
-draw outlines of missed things in two frames, merge pieces, drop others, and press Apply; from the second round on they
-also set wrong relations. Everything goes through `studio.correcting` as in the page, but for the browser. Reported:
-acts, clicks, the time of the acts (computing, and of a person at 3 s a click), the time of Apply, and figures before
-and after.
+The user sees the things of the scene and the true room. In each round they merge what was cut along a wrong line, click
+the parts of wrong merges (split), draw outlines of missed things in two frames, merge pieces, drop others, give the
+true size and place to things whose box is wrong, and press Apply; from the second round on they also set wrong
+relations. A split whose preview is wrong gets more points, each in the middle of the largest wrong spot of a part.
+Everything goes through `studio.correcting` as in the page, but for the browser. Reported: acts, clicks (undone tries
+included), the time of the acts (computing, and of a person at 3 s a click), the time of Apply, and figures before and
+after.
 """
 
 import argparse
@@ -18,17 +20,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
+from reconstruction.core.mesh_graph import MeshGraph, pieces
 from reconstruction.editing.overrides import Overrides
 from reconstruction.measure.alignment import align
 from reconstruction.measure.ground_truth import GroundTruth, TrueEntity
-from reconstruction.measure.matching import match_base
+from reconstruction.measure.matching import box_iou, match_base
 from reconstruction.measure.object_scores import score_graph, score_objects
 from reconstruction.measure.scene import bundle_poses, placed_meshes
 from reconstruction.measure.surfaces import nearest_entities
 from registry import SceneRegistry
 from registry.errors import SimReconError
+from registry.geometry import invert_rigid, rigid, transform_points
 from studio.correcting.acts import Act, Outline
 from studio.correcting.session import Session
 from studio.remembered import remember
@@ -40,6 +45,11 @@ _PART = 0.35  # a true object of which this share of the seen surface is in a th
 _LEAST = 60  # vertices; fewer are borders
 _MOSTLY = 0.6
 _RIGHT = 0.75  # of a part that a look at the preview accepts
+_GOOD_ENOUGH = 0.6  # of a part: the best of several tries is kept
+_MIXED = 0.2  # of a true object, and of a thing: with less in common, a thing is not taken for a piece of it
+_TRIES = 5  # of a split, each with more clicks
+_BOX_RIGHT = 0.5  # IoU of boxes from which on a size is not corrected
+_SAME = 0.1  # IoU of boxes at which a user takes a box without surface for the true thing
 _FIGURES = (
     "object_recall_25",
     "object_recall_50",
@@ -75,6 +85,7 @@ class User:
 
     def __init__(self, session: Session, truth: GroundTruth, played: Played) -> None:
         self.session, self.truth, self.played = session, truth, played
+        self.told: set[tuple[int, int, str]] = set()  # relations that were set already
         self.look()
 
     def look(self) -> None:
@@ -85,7 +96,14 @@ class User:
         assert pointer is not None
         self.pointer = pointer
         self.points = np.asarray(pointer.surface.vertices, np.float64)
+        self.graph = MeshGraph.from_surface(pointer.surface)
         self.owner = np.asarray(pointer.found.vertex_instance)
+        self.shown = self.owner  # ids that clicks in the page have, until Apply
+        self.changed: set[int] = set()  # things whose cut was corrected since the last Apply
+        surface = set(np.unique(self.owner).tolist())
+        placed = [m.moved(self.alignment.true_from_estimated) for m in placed_meshes(bundle)]
+        self.box_of = {m.id: m.bounds for m in placed if not m.base}
+        self.without_surface = [m for m in placed if not m.base and m.id not in surface]
         true = nearest_entities(self.alignment.to_true(self.points), self.truth.entities, _SAMPLES, _NEAR_M)
         self.true = np.asarray(true)
         self.things = [item.id for item in bundle.objects]
@@ -111,6 +129,7 @@ class User:
                 self.played.clicks += 1
                 return False
             self.pointer = replace(self.pointer, found=after)
+            self.owner = np.asarray(after.vertex_instance)
         except SimReconError as error:
             self.session.document.undo()
             self.played.refused.append(str(error))
@@ -124,51 +143,67 @@ class User:
         """Return the vertices int (k,) of a true object."""
         return np.flatnonzero(self.true == entity.id)
 
-    def parts_of(self, thing: int) -> list[TrueEntity]:
-        """Return the true objects that are to a good part in a thing."""
-        mine = self.owner == thing
-        out = []
-        for entity in self.truth.evaluated:
-            rows = self.seen(entity)
-            inside = int(mine[rows].sum())
-            if inside >= _LEAST and inside >= _PART * len(rows):
-                out.append(entity)
-        return out
-
-    def clicks_on(self, thing: int, entity: TrueEntity, count: int) -> list[Click]:
-        """Return clicks deep inside a part, far from each other."""
-        mine = np.flatnonzero((self.owner == thing) & (self.true == entity.id))
-        other = np.flatnonzero((self.owner == thing) & (self.true != entity.id) & (self.true > 0))
-        deep = cKDTree(self.points[other]).query(self.points[mine])[0] if len(other) else np.ones(len(mine))
-        chosen: list[int] = []
-        score = deep.copy()
-        for _ in range(count):
-            row = int(np.argmax(score))
-            chosen.append(mine[row])
-            score = np.minimum(score, np.linalg.norm(self.points[mine] - self.points[mine[row]], axis=1))
-        return [_click(thing, self.points[row]) for row in chosen]
+    def middle_of(self, rows: np.ndarray) -> Click:
+        """Return a click in the middle of the upper fifth of some vertices (k,), which a view from above shows."""
+        high = rows[np.argsort(-self.points[rows, 2])[: max(20, len(rows) // 5)]]
+        row = high[np.argmin(np.linalg.norm(self.points[high] - self.points[high].mean(axis=0), axis=1))]
+        return _click(int(self.shown[row]), self.points[row])
 
     def split(self, thing: int, entities: list[TrueEntity]) -> None:
-        """Split a thing into true objects: by a click each, then by more clicks on the largest, then by outlines.
+        """Split a thing into true objects: by a click each, then by more clicks where the preview is wrong.
 
-        A try whose preview looks wrong is undone. Outlines go around all but the largest part, one frame each.
+        Of tries that are all wrong the best is kept if it is good enough; else outlines go around all but the largest
+        part, one frame each.
         """
-        sizes = [int(((self.owner == thing) & (self.true == e.id)).sum()) for e in entities]
-        largest = int(np.argmax(sizes))
+        mine = self.owner == thing
+        rows = [np.flatnonzero(mine & (self.true == entity.id)) for entity in entities]
+        parts = [[self.middle_of(part)] for part in rows]
+        tried: list[tuple[float, list[list[Click]]]] = []
+        after: list[np.ndarray] = []
+        clicks = 2 + len(parts)  # Split, a click each, Done
+        for _ in range(_TRIES):
+            clicked = [list(part) for part in parts]
 
-        def good(after: np.ndarray) -> bool:
-            return self._pure(after, thing, entities) >= _RIGHT
+            def good(owner: np.ndarray, clicked: list[list[Click]] = clicked) -> bool:
+                after.append(owner)
+                tried.append((self._pure(owner, thing, entities), clicked))
+                return tried[-1][0] >= _RIGHT
 
-        for on_largest in (1, 3):
-            parts = [
-                self.clicks_on(thing, entity, on_largest if k == largest else 1)
-                for k, entity in enumerate(entities)
-            ]
-            if self.do(lambda parts=parts: self.session.acts.split(parts), 2 + sum(map(len, parts)), good):
+            before = len(tried)
+            if self.do(lambda c=clicked: self.session.acts.split(c), clicks, good):
                 return
+            if len(tried) == before:
+                break  # refused
+            added = self._more_clicks(parts, rows, after[-1])
+            if not added:
+                break
+            # Done, and for each point its color and the spot; More points takes the place of the undo.
+            clicks = 1 + 2 * added
+        purity, best = max(tried, key=lambda one: one[0], default=(0.0, []))
+        if purity >= _GOOD_ENOUGH:
+            self.do(lambda: self.session.acts.split(best), 1)  # Redo
+            return
         for k, entity in enumerate(entities):
-            if k != largest:
+            if k != int(np.argmax([len(part) for part in rows])):
                 self.add(entity, 1)
+
+    def _more_clicks(self, parts: list[list[Click]], rows: list[np.ndarray], after: np.ndarray) -> int:
+        """Add a click to each part with a spot that was given to another one, in its middle; return how many."""
+        added = 0
+        for part, mine in zip(parts, rows):
+            first = part[0].point_world
+            assert first is not None
+            own = after[int(np.argmin(np.linalg.norm(self.points - first, axis=1)))]
+            wrong = mine[after[mine] != own]
+            spot = self._largest_spot(wrong) if len(wrong) else wrong
+            if len(spot) >= _LEAST // 2:
+                part.append(self.middle_of(spot))
+                added += 1
+        return added
+
+    def _largest_spot(self, rows: np.ndarray) -> np.ndarray:
+        """Return the largest of the connected spots of some vertices."""
+        return pieces(self.graph, np.sort(rows))[0]
 
     def add(self, entity: TrueEntity, frames: int) -> None:
         """Outline a true object in one or two frames: it becomes a thing of its own."""
@@ -218,28 +253,82 @@ class User:
         return out
 
     def correct_cut(self) -> None:
-        """Mend the cut: splits, additions, merges, drops."""
-        for thing in self.things:
-            entities = self.parts_of(thing)
+        """Mend the cut: merges, splits, additions, drops."""
+        for things, entities in self.mixtures():
+            if len(things) > 1:
+                self.do(lambda t=things: self.session.acts.merge(t), len(things) + 1)
+            owner = max(things, key=lambda t: int((self.owner == t).sum()))
+            self.changed |= set(things)
             if len(entities) > 1:
-                self.split(thing, entities)
+                self.split(owner, entities)
         for entity in self.truth.evaluated:
-            rows = self.seen(entity)
-            held = np.bincount(self.owner[rows], minlength=1) if len(rows) else np.zeros(1, int)
-            holders = [t for t in self.things if t < len(held) and held[t] >= max(_LEAST, _PART * len(rows))]
-            if not holders:
+            if not self.holders(entity):
                 self.add(entity, 2)
-                continue
-            pieces = [
-                t for t in self.things if t < len(held) and held[t] >= _LEAST and self._mostly(t, entity.id)
-            ]
-            if len(pieces) > 1:
-                self.do(lambda p=pieces: self.session.acts.merge(p), len(pieces) + 1)
         known = {e.id for e in self.truth.evaluated}
         for thing in self.things:
-            mine = self.true[self.owner == thing]
+            mine = self.true[self.shown == thing]
             if len(mine) and np.isin(mine, list(known)).mean() < 0.2:
                 self.do(lambda t=thing: self.session.acts.drop(t), 2)
+
+    def mixtures(self) -> list[tuple[list[int], list[TrueEntity]]]:
+        """Return the things and true objects that belong together, but for those that are one and the same."""
+        entities = [e for e in self.truth.evaluated if len(self.seen(e))]
+        count = len(self.things)
+        links = []
+        for k, entity in enumerate(entities):
+            held = np.bincount(self.owner[self.seen(entity)], minlength=max(self.things) + 1)
+            for row, thing in enumerate(self.things):
+                shared = int(held[thing])
+                whole = int((self.owner == thing).sum())
+                most = shared >= _PART * len(self.seen(entity))
+                piece = shared >= _MIXED * len(self.seen(entity)) and shared >= _MIXED * whole
+                if shared >= _LEAST and (most or piece):
+                    links.append((row, count + k))
+        ends = np.array(links, int).reshape(-1, 2)
+        size = count + len(entities)
+        group = connected_components(
+            coo_matrix((np.ones(len(ends)), ends.T), shape=(size, size)), directed=False
+        )[1]
+        out = []
+        for number in np.unique(group[:count]):
+            things = [self.things[row] for row in np.flatnonzero(group[:count] == number)]
+            inside = [entities[k] for k in np.flatnonzero(group[count:] == number)]
+            if inside and (len(things) > 1 or len(inside) > 1):
+                out.append((things, inside))
+        return out
+
+    def holders(self, entity: TrueEntity) -> list[int]:
+        """Return the things that a user sees where a true object is."""
+        rows = self.seen(entity)
+        owners = np.unique(self.owner[rows]) if len(rows) else np.zeros(0, int)
+        base = {b.id for b in self.session.bundle.base}
+        share = {int(o): int((self.owner[rows] == o).sum()) for o in owners if o > 0 and o not in base}
+        found = [o for o, held in share.items() if held >= max(_LEAST, _PART * len(rows))]
+        boxes = [m for m in self.without_surface if box_iou(m.bounds, entity.bounds)[0, 0] > _SAME]
+        return found + [m.id for m in boxes]
+
+    def correct_sizes(self) -> None:
+        """Give the true size and place to things whose cut is right and whose box is not."""
+        for entity in self.truth.evaluated:
+            for thing in self.holders(entity):
+                if thing not in self.box_of or thing in self.changed or not self._mostly(thing, entity.id):
+                    continue
+                if box_iou(self.box_of[thing], entity.bounds)[0, 0] >= _BOX_RIGHT:
+                    continue
+                item = next(o for o in self.session.bundle.objects if o.id == thing)
+                pose = np.asarray(item.world_from_object, np.float64)
+                local = transform_points(invert_rigid(pose), self.to_estimated(entity.mesh.vertices))
+                low, high = local.min(axis=0), local.max(axis=0)
+                bottom = np.array([*(0.5 * (low + high))[:2], low[2]])
+                target = rigid(pose[:3, :3], transform_points(pose, bottom[None])[0])
+                self.do(lambda t=thing, s=high - low: self.session.acts.size(t, s), 8)
+                self.do(lambda t=thing, p=target: self.session.acts.move(t, p), 4)
+
+    def to_estimated(self, points: np.ndarray) -> np.ndarray:
+        """Move points (n, 3) of the true world to that of the scene."""
+        return transform_points(
+            np.linalg.inv(self.alignment.true_from_estimated), np.asarray(points, np.float64)
+        )
 
     def _mostly(self, thing: int, true_id: int) -> bool:
         mine = self.true[self.owner == thing]
@@ -262,6 +351,9 @@ class User:
                 near = self.points[rows] - self.points[self.owner == child].mean(axis=0)
                 where = _click(parent, self.points[rows[np.argmin(np.linalg.norm(near, axis=1))]])
             relation = entity.relation or "supported_by"
+            if (child, parent, relation) in self.told:
+                continue  # said before, and the simulation showed otherwise
+            self.told.add((child, parent, relation))
             self.do(lambda c=child, w=where, r=relation: self.session.acts.parent(c, w, r), 3)
 
     def _base(self) -> dict[int, int]:
@@ -287,6 +379,7 @@ def play(home: Path, scene_id: str, truth_folder: Path, video: Path, rounds: int
         count = len(played.acts)
         if round_ < rounds - 1:
             user.correct_cut()
+            user.correct_sizes()
         if round_ > 0:
             user.correct_relations(objects)
         if len(played.acts) == count:

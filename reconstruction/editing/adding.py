@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.core.rasterize import rasterize_mesh
 from reconstruction.core.types import Camera, Instance, InstanceSet, Surface
-from reconstruction.editing.anchors import Footage
+from reconstruction.editing.anchors import Footage, box_axes
 from reconstruction.editing.outlined_hull import Cone, box_between
 from reconstruction.editing.outlined_wall import hung_on, wall_around
 from reconstruction.editing.outlines import Added, Outline
@@ -30,6 +30,8 @@ _FACES_ALIKE = 0.9  # least cosine between the normals of a plane and of vertice
 _LEAST_BAND_M = 0.008  # half thickness of a plane, unless the surface is sampled more coarsely
 _DEEPER = 1.5  # largest depth behind the front, relative to the size across
 _SAME_THING = 0.5  # an existing object with more than this share of its surface inside is the outlined thing
+_SAME_BOX = 0.5  # one without surface, whose box and the new one overlap by more than this share of the smaller, is it
+_GRID = 12  # points along each side of a box, to measure an overlap
 _PIECE = 0.1  # least size of a connected piece, relative to the largest
 _HUNG_M, _FOOT_M = (
     0.05,
@@ -85,6 +87,7 @@ def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Add
         drawn = [(view.polygon, view.world_from_camera) for view in views]
         hung = wall and hung_on(found, wall, drawn, number, added.label, footage.posed, footage.depth)
         if hung is not None:
+            _refuse_known_box(found, hung.objects[-1], added)
             return hung
         cones = [Cone(view.world_from_camera, view.polygon, view.outline) for view in views]
         under = [
@@ -92,6 +95,7 @@ def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Add
         ]
         box = box_between(cones, footage.depth.camera, surface, found, under, added.label, shown)
         item = Instance(number, added.label, 1.0, box.center, box.yaw_rad, box.extents_m, 0, False)
+        _refuse_known_box(found, item, added)
         return replace(found, objects=(*found.objects, item))
     _refuse_known(found, chosen, added)
     item = _described(found, graph, chosen, number, added.label)
@@ -217,6 +221,30 @@ def _share_shown(chosen: np.ndarray, views: list[_View], surface: Surface, foota
     return shown / max(sum(view.area_px for view in views), 1.0)
 
 
+def _refuse_known_box(found: InstanceSet, item: Instance, added: Added) -> None:
+    """Raise UsageError if the box of outlines without surface is that of an object without surface."""
+    with_surface = set(np.unique(found.vertex_instance).tolist())
+    for other in found.objects:
+        if other.id in with_surface:
+            continue
+        small, large = sorted((item, other), key=lambda o: float(np.prod(o.extents_m)))
+        if _share_inside(small, large) > _SAME_BOX:
+            where = " and ".join(map(str, added.outlines))
+            raise UsageError(
+                f"overrides: add {added.label}: {where} shows {other.label} {other.id}, "
+                "which is a thing already; relabel that one, or drop it first"
+            )
+
+
+def _share_inside(small: Instance, large: Instance) -> float:
+    """Return the share of one object's box that lies in another's."""
+    steps = (np.arange(_GRID) + 0.5) / _GRID - 0.5
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = (grid * small.extents_m) @ box_axes(small) + small.center
+    away = np.abs((points - large.center) @ box_axes(large).T)
+    return float((away <= 0.5 * np.asarray(large.extents_m)).all(axis=1).mean())
+
+
 def _refuse_known(found: InstanceSet, chosen: np.ndarray, added: Added) -> None:
     """Raise UsageError if the outlines show an object that exists."""
     owner = np.asarray(found.vertex_instance)
@@ -262,6 +290,6 @@ def _drawn_into(
     mine[chosen] = True
     replaced = {0, *np.unique(before[chosen]).tolist()}
     for row, ids in enumerate(maps):
-        seen = footage.seen_vertices(np.asarray(footage.posed.world_from_camera[row]))
+        seen = footage.seen_in_keyframe(row)
         ids[(seen >= 0) & mine[seen] & np.isin(ids, list(replaced))] = number
     return maps

@@ -9,6 +9,7 @@ from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Surface
 from reconstruction.editing.addresses import Address
 from reconstruction.editing.film import Film
 from reconstruction.instances.id_maps import seen_vertices
+from reconstruction.instances.partition.seeded import Affinities
 from registry.errors import UsageError
 
 NEAR_M = 0.3  # largest distance of `near` to the object's box
@@ -22,9 +23,28 @@ class Footage(Film):
 
     surface: Surface
 
+    @cached_property
+    def affinities(self) -> Affinities:
+        """Learned affinities of the surface's superpoints; the first access takes seconds.
+
+        Raises:
+            EnvironmentMissing: the weights cannot be read.
+        """
+        return Affinities.of(self.surface, self.posed, self.depth)
+
     def seen_vertices(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Return the surface vertex int32 (h, w) at each pixel at depth resolution, -1 = none."""
         return seen_vertices(self.surface, self.depth.camera, world_from_camera)[0]
+
+    def seen_in_keyframe(self, row: int) -> np.ndarray:
+        """Return `seen_vertices` of a keyframe by its row; each is rendered once."""
+        if row not in self._seen:
+            self._seen[row] = self.seen_vertices(np.asarray(self.posed.world_from_camera[row]))
+        return self._seen[row]
+
+    @cached_property
+    def _seen(self) -> dict[int, np.ndarray]:
+        return {}
 
 
 @dataclass(frozen=True)
@@ -216,10 +236,10 @@ def _nearest_pixel(mask: np.ndarray, pixel: np.ndarray) -> tuple[int, int, float
 
 
 def _in_box(item: Instance, point: np.ndarray) -> bool:
-    return bool((np.abs(_to_box(item) @ (point - item.center)) <= 0.5 * np.asarray(item.extents_m)).all())
+    return bool((np.abs(box_axes(item) @ (point - item.center)) <= 0.5 * np.asarray(item.extents_m)).all())
 
 
-def _to_box(item: Instance) -> np.ndarray:
+def box_axes(item: Instance) -> np.ndarray:
     """Return the rotation (3, 3) from the world to the axes of an object's box."""
     c, s = np.cos(item.yaw_rad), np.sin(item.yaw_rad)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0, 0, 1.0]])
@@ -227,7 +247,7 @@ def _to_box(item: Instance) -> np.ndarray:
 
 def _entry(item: Instance, eye: np.ndarray, ray: np.ndarray) -> float:
     """Return how far along a ray (3,), in lengths of it, it enters an object's box; infinity if it misses."""
-    start, along = _to_box(item) @ (eye - item.center), _to_box(item) @ ray
+    start, along = box_axes(item) @ (eye - item.center), box_axes(item) @ ray
     along = np.where(np.abs(along) < 1e-12, 1e-12, along)
     half = 0.5 * np.asarray(item.extents_m)
     ends = np.sort(np.stack([(-half - start) / along, (half - start) / along]), axis=0)

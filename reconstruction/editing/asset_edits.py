@@ -1,4 +1,4 @@
-"""Corrections of the assets: mass, friction, material, mesh, pose."""
+"""Corrections of the assets: mass, friction, material, mesh, size, pose."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from reconstruction.editing.addresses import parse_address
 from reconstruction.editing.anchors import Pointer
 from reconstruction.editing.moves import carried_by, moved, parse_move
 from reconstruction.editing.resting import rest_of
+from reconstruction.editing.sizes import parse_size, resized
 from reconstruction.scene_graph.surfaces import sample_base, sample_object
 from registry.errors import UsageError
 from registry.geometry import invert_rigid, rigid
@@ -23,7 +24,7 @@ _WORTH_SAYING_M = 0.001
 def edited_assets(
     assets: AssetSet, entries: list[dict], folder: Path, pointer: Pointer, progress: Progress
 ) -> AssetSet:
-    """Apply entries in their order; within one: mesh, physics, move, drop_to_surface.
+    """Apply entries in their order; within one: mesh, size, physics, move, drop_to_surface.
 
     Args:
         assets: the assets to correct.
@@ -40,6 +41,8 @@ def edited_assets(
         item = addressed(entry, objects, pointer)
         if "mesh" in entry:
             item = replace_mesh(item, folder / entry["mesh"])
+        if "size_m" in entry:
+            item = resized(item, parse_size(entry["size_m"], "overrides: size_m"))
         objects[item.id] = _with_physics(item, entry)
         taken: set[int] = set()
         if "move" in entry:

@@ -1,4 +1,4 @@
-"""Split one object into parts by region growing over its surface, from clicks on each part."""
+"""Split one object into parts, from clicks on each part: by learned affinities, within a superpoint by geodesics."""
 
 from collections.abc import Callable
 
@@ -10,10 +10,51 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.core.types import Surface
+from reconstruction.instances.partition.seeded import Affinities
 
 _COLOR_STEP, _FOLD_RAD = 5.0, 0.10  # CIELAB difference and concave angle that double the cost of an edge
 _FLAT_RAD = 0.08  # smaller concave angles are noise
 _BRIDGE = 3.0  # vertices within this many spacings are connected across gaps, at four times the cost
+
+
+def clicked_parts(
+    surface: Surface, affinities: Affinities, vertices: np.ndarray, seeds: list[list[int]]
+) -> np.ndarray:
+    """Assign each vertex of an object to the part that it belongs to by the affinities that also cut the surface.
+
+    A superpoint with clicks on several parts is cut by `grown_parts` first. Vertices that no borders connect with a
+    click get the part of the nearest other vertex in space.
+
+    Args:
+        surface: the whole surface.
+        affinities: of its superpoints.
+        vertices: int (k,) vertices of the object, ascending.
+        seeds: for each part, vertices of the object that belong to it.
+
+    Returns:
+        Part of each vertex int (k,), from 0.
+    """
+    region = affinities.graph.region.astype(np.int64)
+    inside = np.zeros(len(region), bool)
+    inside[vertices] = True
+    fresh = affinities.graph.count
+    for number in {int(region[v]) for part in seeds for v in part}:
+        hit = [[v for v in part if affinities.graph.region[v] == number] for part in seeds]
+        clicked = [points for points in hit if points]
+        if len(clicked) > 1:
+            rows = np.flatnonzero(inside & (region == number))
+            region[rows] = fresh + grown_parts(surface, rows, clicked)
+            fresh += len(clicked)
+    out = affinities.seeded(vertices, region, seeds)
+    return _filled(out, np.asarray(surface.vertices, np.float64)[vertices])
+
+
+def _filled(part: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return parts (k,) with those below 0 replaced by that of the nearest of the other points (k, 3)."""
+    out, known = part.copy(), np.flatnonzero(part >= 0)
+    if len(known) < len(part):
+        out[part < 0] = part[known[cKDTree(points[known]).query(points[part < 0])[1]]]
+    return out
 
 
 def grown_parts(surface: Surface, vertices: np.ndarray, seeds: list[list[int]]) -> np.ndarray:
@@ -48,11 +89,7 @@ def grown_parts(surface: Surface, vertices: np.ndarray, seeds: list[list[int]]) 
     part_of = np.full(len(vertices), -1, np.int64)
     part_of[starts] = np.concatenate([np.full(len(part), k) for k, part in enumerate(seeds)])
     source = dijkstra(adjacency, False, starts, return_predecessors=True, min_only=True)[2]
-    out = np.where(source >= 0, part_of[np.maximum(source, 0)], -1)
-    if (out < 0).any():
-        known = np.flatnonzero(out >= 0)
-        out[out < 0] = out[known[cKDTree(points[known]).query(points[out < 0])[1]]]
-    return out
+    return _filled(np.where(source >= 0, part_of[np.maximum(source, 0)], -1), points)
 
 
 def _lengths(graph: MeshGraph, edges: np.ndarray) -> np.ndarray:

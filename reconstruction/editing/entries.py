@@ -6,13 +6,14 @@ from reconstruction.editing.addresses import KINDS, parse_address, parse_address
 from reconstruction.editing.moves import parse_move
 from reconstruction.editing.outlines import parse_add
 from reconstruction.editing.scene_entries import parse_scene_entry
+from reconstruction.editing.sizes import parse_size
 from registry.errors import UsageError, did_you_mean
 
 # Actions of an entry, by the stage that applies them.
 ACTIONS: dict[str, tuple[str, ...]] = {
     "world": ("scale", "up", "floor"),
     "instances": ("add", "relabel", "drop", "merge", "split", "make_base"),
-    "assets": ("mass_kg", "material", "friction", "mesh", "move", "drop_to_surface"),
+    "assets": ("mass_kg", "material", "friction", "mesh", "size_m", "move", "drop_to_surface"),
     "scene_graph": ("parent",),
     "assembly": ("dynamic",),
 }
@@ -28,11 +29,12 @@ _NOT_WITH = {  # of the first there is no thing left, or several, for the others
         "material",
         "friction",
         "mesh",
+        "size_m",
         "move",
         "parent",
         "dynamic",
     ),
-    "make_base": ("split", "relabel", "mass_kg", "material", "friction", "mesh", "move", "dynamic"),
+    "make_base": ("split", "relabel", "mass_kg", "material", "friction", "mesh", "size_m", "move", "dynamic"),
 }
 _LONGEST_LABEL, _LONGEST_TEXT = 100, 4096
 
@@ -86,6 +88,8 @@ def _check_values(entry: dict, where: str) -> None:
             f"{where}: drop_to_surface must be true, got {entry['drop_to_surface']!r}; leave it out to keep the thing "
             "where it is"
         )
+    if "size_m" in entry:
+        parse_size(entry["size_m"], f"{where}: size_m")
     if "move" in entry:
         parse_move(entry["move"], f"{where}: move")
     if entry.get("relation", "supported_by") not in ("supported_by", "attached_to"):

@@ -9,7 +9,7 @@ from reconstruction.core.types import BaseEntity, Instance, InstanceSet, Plane, 
 from reconstruction.editing.adding import add_thing
 from reconstruction.editing.addresses import KINDS, parse_address, parse_addresses, parse_parts, vector
 from reconstruction.editing.anchors import Footage, Pointer
-from reconstruction.editing.clicked_split import grown_parts, split_maps
+from reconstruction.editing.clicked_split import clicked_parts, split_maps
 from reconstruction.editing.outlines import parse_add
 from reconstruction.instances.base import BASE_LABELS
 from reconstruction.instances.boxes import UprightBox, upright_box
@@ -150,16 +150,13 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
             raise UsageError(
                 f"overrides: split of {item.label} {item.id}: two points are the same spot of it; move one of them"
             )
-        part = grown_parts(surface, chosen, seeds)
+        part = clicked_parts(surface, footage.affinities, chosen, seeds)
     first = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
     numbers = np.array([item.id, *range(first, first + int(part.max()))])
     labels = np.array(found.vertex_instance)
     labels[chosen] = numbers[part]
     maps = np.array(found.id_maps)
-    split_maps(
-        maps, lambda row: footage.seen_vertices(np.asarray(footage.posed.world_from_camera[row])), labels,
-        item.id, numbers.tolist(),
-    )  # fmt: skip
+    split_maps(maps, footage.seen_in_keyframe, labels, item.id, numbers.tolist())
     parts = [replace(item, id=int(number)) for number in numbers]
     others = tuple(parts[0] if o.id == item.id else o for o in found.objects)
     out = replace(found, vertex_instance=labels, id_maps=maps, objects=(*others, *parts[1:]))

@@ -99,7 +99,7 @@ class Overrides:
     def apply_to_assets(
         self, assets: "AssetSet", pointer: "Pointer", progress: Progress = NO_PROGRESS
     ) -> "AssetSet":
-        """Apply mass_kg, material, friction, mesh, move and drop_to_surface."""
+        """Apply mass_kg, material, friction, mesh, size_m, move and drop_to_surface."""
         from reconstruction.editing.asset_edits import edited_assets
 
         return edited_assets(assets, self.of_stage("assets"), self.folder, pointer, progress)

@@ -60,9 +60,20 @@ def _same_but(action: str, a: dict, b: dict) -> bool:
 class Acts:
     """Makes acts for one revision of a scene."""
 
-    def __init__(self, anchors: Anchors, name_of: Callable[[int], str]) -> None:
-        """Remember where addresses and names (which may be hostile) come from."""
-        self._anchors, self._name_of = anchors, name_of
+    def __init__(
+        self,
+        anchors: Anchors,
+        name_of: Callable[[int], str],
+        joined: Callable[[int], int] = lambda number: number,
+    ) -> None:
+        """Remember where addresses and names (which may be hostile) come from.
+
+        Args:
+            anchors: addresses of this revision.
+            name_of: name of an object or base entity.
+            joined: one id for all objects that acts not applied yet have merged.
+        """
+        self._anchors, self._name_of, self._joined = anchors, name_of, joined
 
     def relabel(self, object_id: int, label: str) -> Act:
         """Name an object."""
@@ -87,9 +98,10 @@ class Acts:
         clicks = [click for part in parts for click in part]
         if len(parts) < 2 or not all(parts):
             raise UsageError("split: click at least two parts of one thing")
-        owners = {click.id for click in clicks}
+        owners = {None if click.id is None else self._joined(click.id) for click in clicks}
         if len(owners) > 1 or None in owners:
-            names = " and ".join("nothing" if o is None else self._named(o) for o in sorted(owners, key=str))
+            hit = sorted({click.id for click in clicks}, key=str)
+            names = " and ".join("nothing" if o is None else self._named(o) for o in hit)
             raise UsageError(f"split: all clicks must be on one thing; they are on {names}")
         owner = clicks[0].id
         assert owner is not None
@@ -153,6 +165,14 @@ class Acts:
         return self._of(
             object_id, {"move": {"to": place, "wxyz": turn}}, f"{self._named(object_id)} is moved by hand"
         )
+
+    def size(self, object_id: int, size_m: Sequence[float]) -> Act:
+        """Give an object the sides of its box along its own axes, metres."""
+        sides = [_short(side) for side in size_m]
+        if len(sides) != 3 or not all(0.001 <= side <= 20 for side in sides):
+            raise UsageError("size: give three lengths in metres, 0.001 to 20")
+        words = " x ".join(f"{100 * side:.4g}" for side in sides)
+        return self._of(object_id, {"size_m": sides}, f"{self._named(object_id)} is {words} cm large")
 
     def drop_to_surface(self, object_id: int) -> Act:
         """Let an object down until it rests on what is below it."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from registry.errors import SimReconError, UsageError
 from studio.correcting.acts import Act, Outline
-from studio.correcting.shown import COLORS
+from studio.correcting.shown import COLOR_NAMES, COLORS
 from studio.selection import Click
 
 if TYPE_CHECKING:
@@ -28,6 +28,10 @@ class ClickTools:
         self._outlines: list[Outline] = []
         self._nodes: list = []
         self._finish: Callable[[], Act] | None = None
+        self._last_split: tuple[dict, list[list[Click]]] | None = None  # its entry, and what was clicked
+        self._onto: int | None = (
+            None  # part of a split that gets the next points; None: a new one, or by Shift the last
+        )
         self._auto: int | None = None  # number of clicks after which the tool is done by itself
         gui = self._page.server.gui
         with gui.add_folder("By clicks"):
@@ -35,6 +39,11 @@ class ClickTools:
                 "Split",
                 self._split,
                 "click each part of one thing; Shift and click: another point of the same part",
+            )
+            part.button(
+                "More points",
+                self._more_points,
+                "after a split whose colors are wrong: its points are kept, and you add others",
             )
             self._relation = gui.add_dropdown(
                 "Relation", ("supported_by", "attached_to"), initial_value="supported_by"
@@ -54,12 +63,17 @@ class ClickTools:
             )
             part.button("Next frame", self._next_outline, "go on with the outline in another frame")
         self._hint = gui.add_markdown("", visible=False)
+        self._colors = gui.add_button_group(
+            "Next point", COLOR_NAMES, visible=False, hint="which part of a split gets the next points"
+        )
+        self._colors.on_click(lambda _: self._choose(COLOR_NAMES.index(self._colors.value)))
         self._done = part.button("Done", self._end, "write the act")
         self._cancel = part.button("Cancel", self.cancel, "forget these clicks")
         self._done.visible = self._cancel.visible = False
 
     def fill(self) -> None:
         """Offer the frames whose photographs are kept; reads the stage cache."""
+        self._last_split = None  # its clicks are on another revision
         frames = tuple(str(index) for index in self._page.frames.photographed)
         if frames:
             self._frame.options = frames
@@ -73,11 +87,11 @@ class ClickTools:
     def cancel(self) -> None:
         """Give the clicks back, and forget those that were made."""
         self._page.grab_clicks(None)
-        self._finish, self._auto, self._clicks, self._outlines = None, None, [], []
+        self._finish, self._auto, self._clicks, self._outlines, self._onto = None, None, [], [], None
         for node in self._nodes:
             node.remove()
         self._nodes = []
-        self._hint.visible = self._done.visible = self._cancel.visible = False
+        self._hint.visible = self._done.visible = self._cancel.visible = self._colors.visible = False
 
     def _begin(self, hint: str, finish: Callable[[], Act], auto: int | None = None) -> None:
         self.cancel()
@@ -90,6 +104,8 @@ class ClickTools:
         if self._finish is None:
             return
         act = self._finish()  # where it fails, the clicks stay and the tool goes on
+        if "split" in act.entry:
+            self._last_split = act.entry, self._clicks
         self.cancel()
         self._part.perform(act)
 
@@ -97,15 +113,22 @@ class ClickTools:
         try:
             if click.point_world is None or click.id is None:
                 raise UsageError("nothing is there; click a surface of the scene")
-            if click.modifier == "shift" and self._clicks:
-                self._clicks[-1].append(click)
-            else:
-                self._clicks.append([click])
-            self._dot(click, COLORS[(len(self._clicks) - 1) % len(COLORS)])
+            number = self._part_of(click)
+            if number == len(self._clicks):
+                self._clicks.append([])
+            self._clicks[number].append(click)
+            self._dot(click, COLORS[number % len(COLORS)])
             if self._auto is not None and len(self._clicks) >= self._auto:
                 self._end()
         except SimReconError as error:
             self._part.fail(error)
+
+    def _part_of(self, click: Click) -> int:
+        """Return the number of the part that gets a click; the next free one is a new part."""
+        if self._onto is not None:
+            return min(self._onto, len(self._clicks))
+        again = click.modifier == "shift" and self._clicks
+        return len(self._clicks) - 1 if again else len(self._clicks)
 
     def _dot(self, click: Click, color: tuple[int, int, int]) -> None:
         assert click.point_world is not None
@@ -120,8 +143,31 @@ class ClickTools:
 
     def _split(self) -> None:
         self._begin(
-            "**Split**: click each part once. Shift and click adds a point to the last part. Then *Done*.",
+            "**Split**: click each part once. Shift and click adds a point to the last part, a color below to another "
+            "one. Then *Done*.",
             lambda: self._part.session.acts.split(self._clicks),
+        )
+        self._colors.visible = True
+
+    def _more_points(self) -> None:
+        """Take the last split back, and go on with its clicks."""
+        entries = self._part.session.document.state().entries
+        if self._last_split is None or entries[-1:] != [self._last_split[0]]:
+            raise UsageError("more points: the last act is no split that was made here; press Split")
+        clicks = self._last_split[1]
+        self._part.show(self._part.session.document.undo())
+        self._split()
+        self._clicks = [list(part) for part in clicks]
+        for number, part in enumerate(self._clicks):
+            for click in part:
+                self._dot(click, COLORS[number % len(COLORS)])
+        self._choose(0)
+
+    def _choose(self, number: int) -> None:
+        """Give the next points to a part of a split, by its number; beyond the last one it is a new part."""
+        self._onto = number
+        self._hint.content = (
+            f"**Split**: points that you click now are of the **{COLOR_NAMES[number]}** part. Then *Done*."
         )
 
     def _parent(self) -> None:

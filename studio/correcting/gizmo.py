@@ -1,4 +1,4 @@
-"""Move and turn the selected thing by a gizmo; each release is an act."""
+"""Place of the selected thing: move and turn by a gizmo (each release is an act), drop to surface, size."""
 
 from typing import TYPE_CHECKING
 
@@ -27,12 +27,22 @@ class Gizmo:
             self._on = gui.add_checkbox("Move and turn", False)
             self._tilt = gui.add_checkbox("Tilt, too", False)
             part.act("Drop to surface", lambda: part.session.acts.drop_to_surface(part.selected()))
+            self._sides = [
+                gui.add_number(f"{name} (m)", 0.1, min=0.001, max=20.0, step=0.001)
+                for name in ("Width", "Depth", "Height")
+            ]
+            part.act(
+                "Set size",
+                lambda: part.session.acts.size(part.selected(), [float(side.value) for side in self._sides]),
+                "along its red, green and blue arrow; its bottom center stays",
+            )
         for box in (self._on, self._tilt):
             box.on_update(lambda _: self.follow(self._page.selection.last))
 
     def follow(self, object_id: int | None) -> None:
-        """Put the gizmo at an object, if it is switched on."""
+        """Put the gizmo at an object, if it is switched on, and show its size."""
         self.remove()
+        self._show_size(object_id)
         if not self._on.value or object_id not in self._page.object_handles():
             return
         pose = self._page.pose_of(object_id)
@@ -44,6 +54,12 @@ class Gizmo:
             rotation_limits=(sideways, sideways, (-9, 9)),
         )  # fmt: skip
         self.handle.on_update(self._moved)
+
+    def _show_size(self, object_id: int | None) -> None:
+        known = {item.id: item.scale for item in self._page.bundle.objects}
+        size = None if object_id is None else self._part.preview.sizes.get(object_id, known.get(object_id))
+        for field, side in zip(self._sides, () if size is None else size):
+            field.value = round(float(side), 3)
 
     def remove(self) -> None:
         """Take the gizmo away."""

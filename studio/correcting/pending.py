@@ -18,6 +18,9 @@ class Preview:
     merged: list[set[int]] = field(default_factory=list)
     split: set[int] = field(default_factory=set)
     poses: dict[int, np.ndarray] = field(default_factory=dict)
+    sizes: dict[int, np.ndarray] = field(
+        default_factory=dict
+    )  # sides (3,) of the box along the object's axes, metres
     parts: list[np.ndarray] = field(default_factory=list)  # points (n, 3) of each part of the split objects
     error: str = ""  # of the first entry that cannot be applied
 

@@ -91,6 +91,8 @@ class Previewer:
             out.hidden |= group
         if "split" in entry:
             out.split.add(number)
+        if "size_m" in entry:
+            out.sizes |= dict.fromkeys(group, np.array(entry["size_m"], np.float64))
         if "move" in entry:
             self._move(out, number, entry["move"])
 

@@ -63,7 +63,7 @@ class Session:
     @cached_property
     def acts(self) -> Acts:
         """Acts for this revision."""
-        return Acts(self.anchors, self.name_of)
+        return Acts(self.anchors, self.name_of, self._joined)
 
     @cached_property
     def previewer(self) -> "Previewer":
@@ -78,6 +78,11 @@ class Session:
             if item.id == number:
                 return item.name or item.label
         return next((base.label for base in self.bundle.base if base.id == number), "thing")
+
+    def _joined(self, number: int) -> int:
+        """Return the least id of the objects that acts not applied yet have merged with one."""
+        merged = self.preview(self.document.state()).merged
+        return next((min(group) for group in merged if number in group), number)
 
     def perform(self, act: Act) -> DocumentState:
         """Write an act to the file."""

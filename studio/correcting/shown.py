@@ -11,18 +11,20 @@ if TYPE_CHECKING:
     from studio.scene_view import StudioPage
 
 COLORS = ((230, 120, 30), (60, 140, 220), (120, 190, 60), (190, 80, 190), (220, 190, 40), (60, 190, 190))
+COLOR_NAMES = ("orange", "blue", "green", "violet", "yellow", "teal")
 _POINT_M = 0.006
 _LIFT_M = 0.03  # of a name over its thing
 
 
 class Shown:
-    """Draws previews in a page: hides, moves, paints and renames objects."""
+    """Draws previews in a page: hides, moves, stretches, paints and renames objects."""
 
     def __init__(self, page: "StudioPage") -> None:
         self._page = page
         self._nodes: list = []
         self._hidden: set[int] = set()
         self._moved: set[int] = set()
+        self._stretched: set[int] = set()
 
     def draw(self, preview: Preview) -> None:
         """Show a preview in place of the last one."""
@@ -30,6 +32,7 @@ class Shown:
             self._remove()
             self._hide(preview.hidden)
             self._move(preview)
+            self._stretch(preview)
             for number, group in enumerate(preview.merged):
                 for object_id in group:
                     self._paint(object_id, COLORS[number % len(COLORS)])
@@ -44,6 +47,7 @@ class Shown:
             self._remove()
             self._hide(set())
             self._move(Preview())
+            self._stretch(Preview())
 
     def _remove(self) -> None:
         for node in self._nodes:
@@ -68,6 +72,18 @@ class Shown:
             if object_id in poses:
                 self._page.set_pose(object_id, pose)
         self._moved = set(preview.poses)
+
+    def _stretch(self, preview: Preview) -> None:
+        """Stretch the meshes about the bottom center of their boxes; clicks meet them as they were."""
+        meshes = self._page.object_handles()
+        for object_id in (self._stretched | preview.sizes.keys()) & meshes.keys():
+            x, y, z = preview.sizes.get(object_id, self._sides(object_id)) / self._sides(object_id)
+            meshes[object_id].scale = (x, z, y)  # glTF is +y up
+        self._stretched = set(preview.sizes)
+
+    def _sides(self, object_id: int) -> np.ndarray:
+        """Return the sides (3,) of an object's box in its own axes, metres."""
+        return np.maximum(np.ptp(self._page.pickable.geometry(object_id).vertices, axis=0), 1e-6)
 
     def _paint(self, object_id: int, color: tuple[int, int, int]) -> None:
         """Lay a colored skin over an object."""

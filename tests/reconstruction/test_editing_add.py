@@ -172,3 +172,14 @@ def test_a_picture_flat_on_a_wall_needs_one_outline():
     assert pointer.thing(Address("pixel", frame=0, pixel=(float(x), float(y)))).id == picture.id
     assert (out.id_maps[1] == picture.id).any()
     assert not (out.id_maps[2] == picture.id).any()  # from behind
+    # It has no surface, but it is a thing: outlined again, in another frame and less exactly, it is not a second one.
+    again = {"add": {"label": "picture", "outline": outline_of(footage, 1, low, high, 4.0)}}
+    with pytest.raises(UsageError, match=f"shows picture {picture.id}, which is a thing already"):
+        apply_overrides(out, surface, [again], footage)
+    beside = {
+        "add": {
+            "label": "poster",
+            "outline": outline_of(footage, 0, low - [0.7, 0, 0], high - [0.7, 0, 0], 0.5),
+        }
+    }
+    assert len(apply_overrides(out, surface, [beside], footage).objects) == len(out.objects) + 1

@@ -26,6 +26,10 @@ def load(tmp_path, *entries) -> Overrides:
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
+        ({"id": 3, "size_m": 2}, "size_m must be three numbers"),
+        ({"id": 3, "size_m": [0.2, 0.3, 0]}, "size_m must be three lengths of 0.001 to 20 m"),
+        ({"id": 3, "size_m": [20, 30, 40]}, "size_m must be three lengths of 0.001 to 20 m"),
+        ({"id": 3, "drop": True, "size_m": [1, 1, 1]}, "drop cannot be combined with size_m"),
         ({"id": 3, "move": {}}, "move needs `move: {by:"),
         ({"id": 3, "move": [1, 2, 3]}, "move needs"),
         ({"id": 3, "move": {"by": [1, 2]}}, "by must be three numbers"),

@@ -1,5 +1,7 @@
 """Poses by the user: moves, and the height at which a thing rests on what is below it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from boxes import box, room, thing, tilt, tray
@@ -134,3 +136,43 @@ def test_graph_and_assembly_see_the_moved_thing():
     placed = {p.id: p for p in assemble(after, graph, AssemblyConfig()).placed}
     np.testing.assert_allclose(placed[11].world_from_object[:3, 3], [1.2, 0, 0.3], atol=5e-3)
     assert placed[11].stable
+
+
+def test_a_size_stretches_the_thing_about_its_bottom_center():
+    before = scene()
+    after = edited(before, {"id": 11, "size_m": [0.3, 0.06, 0.24]})[11]
+    old = before.objects[1]
+    points = after.visual.vertices
+    np.testing.assert_allclose(np.ptp(points, axis=0), [0.3, 0.06, 0.24], atol=1e-6)
+    np.testing.assert_allclose(points.min(axis=0)[2], old.visual.vertices.min(axis=0)[2], atol=1e-6)
+    np.testing.assert_array_equal(after.world_from_object, old.world_from_object)
+    corners = np.concatenate([part.vertices for part in after.collision])
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.3, 0.06, 0.24], atol=1e-6)
+    assert after.physics.mass_kg == pytest.approx(6 * old.physics.mass_kg)
+    assert after.physics.ranges.mass_kg == pytest.approx([6 * m for m in old.physics.ranges.mass_kg])
+    assert "size by the user" in after.provenance.geometry
+    again = edited(before, {"id": 11, "size_m": [0.3, 0.06, 0.24]}, {"id": 11, "size_m": [0.1, 0.06, 0.12]})[
+        11
+    ]
+    np.testing.assert_allclose(again.visual.vertices, old.visual.vertices, atol=1e-6)
+    np.testing.assert_allclose(again.physics.inertia, old.physics.inertia, rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(0.1, 0.2, 0.3), (0.5, 0.02, 0.1)])
+def test_the_inertia_of_a_resized_box_is_that_of_a_box_of_this_size(size):
+    """A solid box: m / 12 (b^2 + c^2), and its center of mass is in its middle."""
+    start = box(11, (0.1, 0.06, 0.12), (0.2, 0.1, 0.4), hint=10)
+    sides = np.ptp(start.visual.vertices, axis=0).astype(float)
+    start = replace(
+        start,
+        physics=replace(
+            start.physics,
+            center_of_mass=np.array([0, 0, sides[2] / 2]),
+            inertia=start.physics.mass_kg / 12 * np.diag((sides**2).sum() - sides**2),
+        ),
+    )
+    after = edited(room(box(10, **TABLE), start), {"id": 11, "size_m": list(size), "mass_kg": 2.0})[11]
+    wanted = 2.0 / 12 * np.diag((np.array(size) ** 2).sum() - np.array(size) ** 2)
+    np.testing.assert_allclose(after.physics.inertia, wanted, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(after.physics.center_of_mass, [0, 0, size[2] / 2], atol=1e-6)
+    assert after.physics.mass_kg == 2.0  # given beside the size, it is the mass of the resized thing

@@ -130,6 +130,9 @@ def test_the_stages_take_each_act(session):
     pose[:2, 3] += 0.25
     moved = Overrides([acts.move(mug, pose).entry]).apply_to_assets(stages.get("assets"), pointer)
     assert np.abs(next(o for o in moved.objects if o.id == mug).world_from_object - pose).max() < 2e-4
+    large = Overrides([acts.size(mug, [0.3, 0.2, 0.1]).entry]).apply_to_assets(stages.get("assets"), pointer)
+    stretched = next(o for o in large.objects if o.id == mug).visual.vertices
+    np.testing.assert_allclose(np.ptp(stretched, axis=0), [0.3, 0.2, 0.1], atol=1e-5)
     floor = next(b for b in session.bundle.base if b.label == "floor")
     rows = np.flatnonzero(np.asarray(pointer.found.vertex_instance) == floor.id)
     spot = np.asarray(pointer.surface.vertices, float)[rows[len(rows) // 2]]
@@ -172,15 +175,32 @@ def test_the_preview_follows_the_acts(session):
     first, second = (o.id for o in session.bundle.objects[:2])
     session.perform(session.acts.merge([first, second]))
     session.perform(session.acts.relabel(second, "pair"))
+    session.perform(session.acts.size(first, [0.3, 0.2, 0.1]))
     state = session.perform(session.acts.drop(first))
     shown = session.previewer.full(state.entries)
     assert shown.merged == [{first, second}]
     assert shown.labels == {first: "pair", second: "pair"}
     assert shown.hidden == {first, second}
     assert shown.error == ""
-    assert shown.pending == 3
+    assert shown.sizes.keys() == {first, second}
+    assert shown.pending == 4
     again = session.perform(session.acts.relabel(first, "ghost"))
     assert "shows" in session.previewer.full(again.entries).error
+
+
+def test_things_that_were_merged_can_be_split_at_once(session):
+    """Two things that were cut along a wrong line: merge, then click what is what, before Apply."""
+    pointer = session.previewer.pointer()
+    owner, points = np.asarray(pointer.found.vertex_instance), np.asarray(pointer.surface.vertices, float)
+    first, second = (o.id for o in session.bundle.objects[:2])
+    spots = [[click(i, points[np.flatnonzero(owner == i)[0]])] for i in (first, second)]
+    with pytest.raises(UsageError, match="all clicks must be on one thing"):
+        session.acts.split(spots)
+    session.perform(session.acts.merge([first, second]))
+    state = session.perform(session.acts.split(spots))
+    assert session.previewer.full(state.entries).error == ""
+    after = Overrides(state.entries).apply_to_instances(pointer)
+    assert len(after.objects) == len(pointer.found.objects)
 
 
 def test_wrong_clicks_are_said(session):
@@ -194,6 +214,8 @@ def test_wrong_clicks_are_said(session):
         acts.parent(number, number)
     with pytest.raises(UsageError, match="at least 3 points"):
         acts.add("mug", [Outline(0, ((1, 1), (2, 2)))])
+    with pytest.raises(UsageError, match="three lengths in metres"):
+        acts.size(number, [0.1, 0.2, 30])
     with pytest.raises(UsageError, match="type a name"):
         acts.relabel(number, "\x07 \n")
 

@@ -169,6 +169,9 @@ def play(studio: StudioPage, browser: Page) -> None:
     assert viewer.part.preview.merged == [{first, second}]
     viewer.press("Undo")
     viewer.until(lambda: len(viewer.acts()) == 1, "the merge is undone")
+    viewer.until(
+        lambda: "are one thing" not in browser.text(), "the list is shorter: it moves the buttons below it"
+    )
     viewer.press("Redo")
     viewer.until(lambda: len(viewer.acts()) == 2, "the merge is redone")
     viewer.press("Undo")
@@ -182,8 +185,29 @@ def play(studio: StudioPage, browser: Page) -> None:
     viewer.press("Done")
     viewer.until(lambda: "split" in viewer.acts()[-1], "the split is written")
     viewer.until(lambda: len(viewer.part.preview.parts) == 2, "both parts are shown", 120)
+    viewer.press("More points")
+    viewer.until(lambda: "split" not in viewer.acts()[-1], "the split is taken back")
+    viewer.press("blue")
+    viewer.click(spots[np.argsort(np.linalg.norm(spots - apart[1], axis=1))[1]])
+    viewer.press("Done")
+    viewer.until(lambda: "split" in viewer.acts()[-1], "the split with one point more is written")
+    lone, pair = viewer.acts()[-1]["split"]
+    assert isinstance(lone, dict)
+    assert len(pair) == 2
     viewer.press("Undo")
     viewer.until(lambda: "split" not in viewer.acts()[-1], "the split is undone")
+
+    viewer.select(large)
+    size = [float(side) for side in next(o.scale for o in studio.bundle.objects if o.id == large)]
+    viewer.fill("Width (m)", f"{2 * size[0]:.3f}")
+    viewer.browser.key("Enter")
+    viewer.press("Set size")
+    viewer.until(lambda: "size_m" in viewer.acts()[-1], "the size is written")
+    assert viewer.acts()[-1]["size_m"] == pytest.approx([2 * size[0], *size[1:]], abs=2e-3)
+    assert studio.object_handles()[large].scale == pytest.approx((2.0, 1.0, 1.0), rel=0.02)
+    viewer.press("Undo")
+    viewer.until(lambda: "size_m" not in viewer.acts()[-1], "the size is undone")
+    viewer.until(lambda: np.allclose(studio.object_handles()[large].scale, 1.0), "it has its size again")
 
     to_move = next(thing for thing in things[1:] if free_arrow(viewer, thing) is not None)
     viewer.select(to_move)
