@@ -40,6 +40,11 @@ def main(arguments: list[str] | None = None) -> int:
         "--set", action="append", default=[], metavar="A=B,C=D", help="a variant of DepthConfig"
     )
     parser.add_argument("--json", type=Path, help="write all figures there")
+    parser.add_argument(
+        "--pictures",
+        type=Path,
+        help="write a picture of each room there: frame, depth by variant, true depth",
+    )
     options = parser.parse_args(arguments)
     variants = {
         text: _config(text, parser) for text in options.set or ["prior=none", "prior=mending", "prior=both"]
@@ -56,10 +61,17 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"{split} {number}: left out, {error}", flush=True)
                 continue
             names = {i: str(i) for view in views for i in np.unique(view.ids) if i > film.base_entities}
+            middle, shown = views[len(views) // 2], []
             for text, config in variants.items():
                 maps = estimate_depth(posed, config)
+                shown.append(maps.depth[middle.row])
                 figures[text][split].append(depth_figures(maps, 1.0, views, names))
                 print(split, number, text or "default", _row(figures[text][split][-1:]), flush=True)
+            if options.pictures:
+                options.pictures.mkdir(parents=True, exist_ok=True)
+                _draw(
+                    options.pictures / f"{split}_{number}.jpg", posed.images[middle.row], shown, middle.depth
+                )
     print("\n| variant | split | rooms | " + " | ".join(FIGURES) + " |\n|" + " --- |" * (3 + len(FIGURES)))
     for text in variants:
         for split in options.splits:
@@ -87,6 +99,21 @@ def filmed(film: Film, frames: int) -> tuple[PosedFrames, list[TrueView]]:
     camera = sized_camera(posed.camera, DepthConfig().depth_side_px)
     truth = [render_truth(film.film_set, camera, pose) for pose in path]
     return posed, [TrueView(row, z, ids.astype(np.int32)) for row, (z, ids) in enumerate(truth)]
+
+
+def _draw(path: Path, frame: np.ndarray, maps: list[np.ndarray], truth: np.ndarray) -> None:
+    """Write a frame, depth maps (h, w) of it and the true one side by side; near is red, unknown black."""
+    import cv2
+
+    far, near = np.quantile(1 / truth[truth > 0], (0.01, 0.99))
+
+    def color(depth: np.ndarray) -> np.ndarray:
+        share = (1 / np.maximum(depth, 1e-6) - far) / max(near - far, 1e-9)
+        out = cv2.applyColorMap((255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_TURBO)
+        return np.where(depth[..., None] > 0, out, 0).astype(np.uint8)
+
+    picture = cv2.resize(frame[..., ::-1], truth.shape[::-1], interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(path), np.hstack([picture, *(color(depth) for depth in [*maps, truth])]))
 
 
 def _row(found: list[dict]) -> str:

@@ -197,4 +197,4 @@ def test_an_import_without_a_home_only_warns(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delenv("SIMRECON_HOME", raising=False)
     monkeypatch.setattr(pwd, "getpwuid", nobody)
     with pytest.warns(RuntimeWarning, match="no scene was registered"):
-        assert register_default_scenes() == []
+        register_default_scenes()
