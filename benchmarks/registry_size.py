@@ -1,4 +1,4 @@
-"""What a registry of many scenes costs: import, look-ups, lists, splits, publishing, rebuilding, pulling one.
+"""Time a registry of many scenes: import, look-ups, lists, splits, publishing, rebuilding, pulling one scene.
 
 Usage:
     python -m benchmarks.registry_size --scenes 100000 [--home DIR] [--rebuild] [--json FILE]
@@ -81,9 +81,9 @@ def make_home(home: Path, scenes: int) -> None:
     index = Index(registry.root / "index.sqlite")
     row = index.row("model")
     assert row is not None
-    bundle = SceneBundle.open(model.path)
-    folders = sorted({str(Path(name).parent) for name in bundle.files} - {"."})
-    linked = [name for name in bundle.files if name != "scene.json"]
+    files = SceneBundle.open(model.path).files
+    folders = sorted({str(Path(name).parent) for name in files} - {"."})
+    linked = [name for name in files if name != "scene.json"]
     text = (model.path / "scene.json").read_text()
     manifest = json.loads((model.path / "manifest.json").read_text())
     names = [scene_name(number) for number in range(scenes)]
@@ -105,7 +105,6 @@ def make_home(home: Path, scenes: int) -> None:
         files = {**manifest["files"], "scene.json": entry}
         (folder / "manifest.json").write_text(json.dumps({**manifest, "files": files}))
     index.put(*(replace(row, scene_id=name) for name in names))
-    del bundle
     registry.remove("model")
     place = open_place(home / "place")
     pushed = [push_scene(registry.load(name), place).shared for name in names[:_PACKS]]

@@ -133,7 +133,7 @@ def run_writers(home: Path, target: str, address: str, processes: int, publishes
 
 
 def judge_registry(home: Path, address: str, pushed: set[tuple[str, str]]) -> list[str]:
-    """Return what a registry has lost, and what is wrong with it; rebuild its index."""
+    """Check a registry against what was published, rebuild its index; return one line for each loss or fault."""
     registry = SceneRegistry(Path(address))
     problems = list(check_registry(registry, {scene for scene, _ in pushed}))
     found = registry.revisions()
@@ -148,7 +148,7 @@ def judge_registry(home: Path, address: str, pushed: set[tuple[str, str]]) -> li
 
 
 def judge_place(home: Path, address: str, pushed: set[tuple[str, str]]) -> list[str]:
-    """Return what a place has lost, and what is wrong with it; pull everything."""
+    """Check a place against what was pushed, pull all of it; return one line for each loss or fault."""
     place, mine = open_place(address), SceneRegistry(home / "pulled")
     entries = {
         (s.scene_id, s.revision) for scene in {s for s, _ in pushed} for s in revisions_of(place, scene)
@@ -170,7 +170,7 @@ def judge_place(home: Path, address: str, pushed: set[tuple[str, str]]) -> list[
 
 
 def judge_remote(home: Path, address: str, pushed: set[tuple[str, str]]) -> list[str]:
-    """Return what a registry at an address has lost; rebuild its index from its packs, and judge again."""
+    """Check a registry at an address as a place, then rebuild its index from its packs and check that."""
     problems = judge_place(home, address, pushed)
     place = open_place(address)
     place.remove([shared.entry_key for shared in entries_of(place)])

@@ -9,10 +9,8 @@ if it had not been stopped. On a CPU all is float32; where there is CUDA, bfloat
 
 import argparse
 import json
-import os
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -82,39 +80,6 @@ def draw_batch(task, rooms: list[Room], config: TrainConfig, step: int) -> list[
     )
 
 
-class Batches(torch.utils.data.Dataset):
-    """Batches by step, for processes that draw them."""
-
-    def __init__(self, task, rooms: list[Room], config: TrainConfig) -> None:
-        """Draw from these rooms."""
-        self._task, self._rooms, self._config = task, rooms, config
-
-    def __len__(self) -> int:
-        """Return the number of steps."""
-        return self._config.steps
-
-    def __getitem__(self, step: int) -> list[torch.Tensor]:
-        """Return the samples of a step."""
-        return draw_batch(self._task, self._rooms, self._config, step)
-
-
-def loaded(task, rooms: list[Room], config: TrainConfig, steps: range) -> Iterator[list[torch.Tensor]]:
-    """Yield the batches of steps, drawn by as many processes as there are cores."""
-    loader = torch.utils.data.DataLoader(
-        Batches(task, rooms, config), sampler=list(steps), batch_size=None, num_workers=os.cpu_count() or 1,
-        pin_memory=True, prefetch_factor=4, worker_init_fn=_one_thread,
-    )  # fmt: skip
-    return iter(loader)
-
-
-def _one_thread(_: int) -> None:
-    import cv2
-    import numba
-
-    cv2.setNumThreads(1)
-    numba.set_num_threads(1)
-
-
 def rate_at(step: int, config: TrainConfig, seconds: float = 0.0) -> float:
     """Return the learning rate: a linear start, then half a cosine down to zero, over steps or over time."""
     if step < config.warm_up:
@@ -166,8 +131,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     held: dict[str, list[Room]] = {}
     started, seen = time.perf_counter(), 0
     ahead, coming = ThreadPoolExecutor(1), None
-    pool = task.POOL(device) if device == "cuda" and hasattr(task, "POOL") else None
-    drawn: Iterator[list[torch.Tensor]] = iter(())
+    pool = task.POOL(device) if device == "cuda" else None
     losses = torch.compile(task.losses) if config.compiled and device == "cuda" else task.losses
     for step in range(first, config.steps):
         if not rooms or step % config.refresh_every == 0:
@@ -179,22 +143,16 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
                 if coming is not None:
                     pool.take(coming.result())
                 coming = ahead.submit(pool.read, rooms)
-            elif device == "cuda":
-                drawn = loaded(
-                    task, rooms, config, range(step, min(step + config.refresh_every, config.steps))
-                )
         seconds = time.perf_counter() - started
         last = step + 1 == config.steps or 0 < 60 * config.minutes <= seconds
         for group in optimizer.param_groups:
             group["lr"] = rate_at(step, config, seconds)
         if pool is not None:
             batch = pool.draw(config.batch, torch.Generator().manual_seed(config.seed * 1_000_003 + step))
-        elif device == "cuda":
-            batch = [tensor.to(device, non_blocking=True) for tensor in next(drawn)]
         else:
             # The next samples are drawn while this step is computed, but for those that may come from newer rooms.
             coming = coming or ahead.submit(draw_batch, task, rooms, config, step)
-            batch = [tensor.to(device) for tensor in coming.result()]
+            batch = coming.result()
             fresh = (step + 1) % config.refresh_every == 0 or last
             coming = None if fresh else ahead.submit(draw_batch, task, rooms, config, step + 1)
         net.train()

@@ -9,7 +9,7 @@ from reconstruction.core.types import ConvexPart, ObjectAsset, PhysicalAttribute
 from reconstruction.editing.addresses import vector
 from registry.errors import UsageError
 
-_LEAST_M, _MOST_M = 0.001, 20.0  # of a side; beyond it is a slip of the pen in metres
+_LEAST_M, _MOST_M = 0.001, 20.0  # of a side; other lengths are taken for a mistake of units
 
 
 def parse_size(value: Any, where: str) -> tuple[float, float, float]:
