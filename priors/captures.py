@@ -10,7 +10,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from priors.rooms import SPLITS, Film, draw_film
+from priors.rooms import SPLITS, Film, Sources, draw_film
 from registry.errors import InputError, UsageError
 from synthetic.capture import write_ground_truth
 from synthetic.film import iterate_film
@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     add("--rooms", type=int, default=3, help="of each split (default: %(default)s)")
     add("--first", type=int, default=90_000, help="number of the first room (default: %(default)s)")
     add("--frames", type=int, default=140, help="length of the film (default: %(default)s)")
-    add("--photographs", type=Path, help="folder of pictures that materials may show")
+    Sources.add_options(parser)
     options = parser.parse_args(arguments)
     for split in options.splits:
         number, made = options.first, 0
@@ -42,9 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
             folder = options.out / f"{split}_{number}"
             try:
                 if not (folder / "ground_truth" / "scene.json").is_file():
-                    write_film(
-                        draw_film(split, number, photographs=options.photographs), folder, options.frames
-                    )
+                    write_film(draw_film(split, number, Sources.of(options)), folder, options.frames)
                 made += 1
                 print(f"{folder}: there", flush=True)
             except (InputError, UsageError) as error:

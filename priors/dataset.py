@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from priors.rooms import SPLITS, Film, draw_film
+from priors.rooms import SPLITS, Film, Sources, draw_film
 from reconstruction.core.types import DepthMaps, PosedFrames
 from reconstruction.depth import DepthConfig
 from registry.errors import InputError, UsageError
@@ -61,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rooms", type=int, default=100, help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="number of the first room (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=20, help="keyframes a room (default: %(default)s)")
-    parser.add_argument("--photographs", type=Path, help="folder of pictures that materials may show")
+    Sources.add_options(parser)
     parser.add_argument(
         "--keep",
         nargs="+",
@@ -109,7 +109,7 @@ def _write_room(options: argparse.Namespace, number: int) -> str:
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     started = time.process_time()
-    film = draw_film(options.split, number, photographs=options.photographs)
+    film = draw_film(options.split, number, Sources.of(options))
     arrays = measure_film(
         film, options.frames, options.cameras, set(options.keep), not options.no_predictions
     )

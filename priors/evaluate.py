@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.depth_figures import TrueView, depth_figures
 from priors.dataset import film_frames
-from priors.rooms import SPLITS, Film, draw_film
+from priors.rooms import SPLITS, Film, Sources, draw_film
 from reconstruction.core.types import PosedFrames
 from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.depth.images import sized_camera
@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--first", type=int, default=90_000, help="number of the first room (default: %(default)s)"
     )
     parser.add_argument("--frames", type=int, default=16, help="keyframes a room (default: %(default)s)")
-    parser.add_argument("--photographs", type=Path, help="folder of pictures that materials may show")
+    Sources.add_options(parser)
     parser.add_argument(
         "--set", action="append", default=[], metavar="A=B,C=D", help="a variant of DepthConfig"
     )
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     for split in options.splits:
         for number in range(options.first, options.first + options.rooms):
             try:
-                film = draw_film(split, number, photographs=options.photographs)
+                film = draw_film(split, number, Sources.of(options))
                 posed, views = filmed(film, options.frames)
             except (InputError, UsageError) as error:
                 print(f"{split} {number}: left out, {error}", flush=True)

@@ -38,7 +38,7 @@ from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, Example
 from priors.partition_targets import Targets
 from priors.partition_trees import PAIRS, PROPOSALS, fit_trees, mean_of
-from priors.rooms import HELD_OUT
+from priors.rooms import HELD_OUT, MODELS_SPLIT, Sources
 from priors.samples import Room, open_rooms
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
@@ -128,7 +128,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _trained(splits: dict[str, list[Room]], cache: Path, options: argparse.Namespace) -> Scorers:
     """Fit networks and trees for pairs to the rooms of "train"; each half is scored by those of the other half."""
     examples = {
-        name: examples_of(rooms, cache, options.photographs, options.processes)
+        name: examples_of(rooms, cache, Sources.of(options), options.processes)
         for name, rooms in splits.items()
     }
     fit = replace(_SUPERPOINTS, steps=options.steps or _SUPERPOINTS.steps)
@@ -153,7 +153,7 @@ def _shipped(splits: dict[str, list[Room]], cache: Path, options: argparse.Names
     """Read networks and trees for pairs from the weights that ship; the rooms have to be others than theirs."""
     models = load_models()
     proposals = {
-        name: shipped_proposals(rooms, cache, options.photographs, options.processes)
+        name: shipped_proposals(rooms, cache, Sources.of(options), options.processes)
         for name, rooms in splits.items()
     }
     return Scorers(models.superpoints, models.pairs, proposals)
@@ -185,7 +185,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("data", type=Path, help="folder of the dataset")
     parser.add_argument("--out", type=Path, required=True, help="folder for weights and figures")
     parser.add_argument("--cache", type=Path, help="folder for graphs (default: OUT/cache)")
-    parser.add_argument("--photographs", type=Path, help="folder of pictures that the rooms were made with")
+    Sources.add_options(parser)
     parser.add_argument(
         "--steps",
         type=int,
@@ -255,7 +255,7 @@ def ensemble_of(networks: list[Network]) -> Ensemble:
 
 def _split_rooms(data: Path) -> dict[str, list[Room]]:
     """Return rooms by split: those trained on, those of the same families kept out, and other families."""
-    rooms = open_rooms(data / "train", NEEDED)
+    rooms = [room for name in ("train", MODELS_SPLIT) for room in open_rooms(data / name, NEEDED)]
     kept_out = [room for room in rooms if int(room.folder.name) % _KEPT_OUT == _KEPT_OUT - 1]
     out = {"train": [room for room in rooms if room not in kept_out], "kept_out": kept_out}
     out |= {name: open_rooms(data / name, NEEDED) for name in HELD_OUT}

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from priors.partition_rooms import TRIMMED, Example, cached, digest_of, example, room_view, write_arrays
+from priors.rooms import Sources
 from priors.samples import Room
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
@@ -72,11 +73,9 @@ class RoomProposals:
     example: Example
 
 
-def examples_of(
-    rooms: Sequence[Room], cache: Path, photographs: Path | None, processes: int
-) -> list[Example]:
+def examples_of(rooms: Sequence[Room], cache: Path, sources: Sources, processes: int) -> list[Example]:
     """Return each room's graph of superpoints with its truth (`priors.partition_rooms.example`), cached."""
-    return _each(_example, [(room, cache, photographs) for room in rooms], processes)
+    return _each(_example, [(room, cache, sources) for room in rooms], processes)
 
 
 def _example(job: tuple[Room, Path, Path | None]) -> Example:
@@ -113,15 +112,15 @@ def proposals_of(
 
 
 def shipped_proposals(
-    rooms: Sequence[Room], cache: Path, photographs: Path | None, processes: int
+    rooms: Sequence[Room], cache: Path, sources: Sources, processes: int
 ) -> list[RoomProposals]:
     """Return the proposals of each room by the networks and trees for pairs that ship, cached."""
-    return _each(_shipped_proposals_of, [(room, cache, photographs) for room in rooms], processes)
+    return _each(_shipped_proposals_of, [(room, cache, sources) for room in rooms], processes)
 
 
 def _shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
-    room, cache, photographs = job
-    models, known = load_models(), example(room, cache, photographs)
+    room, cache, sources = job
+    models, known = load_models(), example(room, cache, sources)
     digest = digest_of(["reconstruction.instances.partition.cut"])  # weights included
     file = cached(room, cache, f"proposals-{digest}").with_suffix(".npz")
     if not file.is_file():

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from priors.rooms import Film, draw_film
+from priors.rooms import Film, Sources, draw_film
 from priors.samples import Room
 from priors.surfaces import true_ids
 from reconstruction.code_digest import code_digest, tree_digest
@@ -144,11 +144,11 @@ def room_view(room: Room, cache: Path) -> View:
     return View.of(shell.graph, surface, sightings(surface, *frames_and_depth(room, cache)))
 
 
-def example(room: Room, cache: Path, photographs: Path | None) -> Example:
+def example(room: Room, cache: Path, sources: Sources) -> Example:
     """Return the graph of a room with its truth, from the cache if the code that made it is the same."""
     file = cached(room, cache, f"graphs-{digest_of(_FEATURE_MODULES)}").with_suffix(".npz")
     if not file.is_file():
-        write_example(file, _made(room, cache, photographs))
+        write_example(file, _made(room, cache, sources))
     return read_example(file)
 
 
@@ -163,20 +163,20 @@ def read_example(file: Path) -> Example:
         return Example(**{f.name: stored[f.name] for f in fields(Example)})
 
 
-def _made(room: Room, cache: Path, photographs: Path | None) -> Example:
+def _made(room: Room, cache: Path, sources: Sources) -> Example:
     view = room_view(room, cache)
     graph = region_graph(view.mesh)
     nodes, edges = features(view, graph)
     centers = Shapes.of(view.mesh, graph).center.astype(np.float32)
-    truth = _truth(room, view.surface, cache, photographs)
+    truth = _truth(room, view.surface, cache, sources)
     return Example(nodes, edges, graph.pairs, centers, graph.region, view.mesh.areas, **truth)
 
 
-def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) -> dict[str, np.ndarray]:
+def _truth(room: Room, surface: Surface, cache: Path, sources: Sources) -> dict[str, np.ndarray]:
     """Return the last fields of a room's example, from the cache if they are there."""
     file = cached(room, cache, "truths").with_suffix(".npz")
     if not file.is_file():
-        film = film_of(room, photographs)
+        film = film_of(room, sources)
         eyes = np.asarray(room.arrays["world_from_camera"])[:, :3, 3]
         ids = true_ids(film.film_set, np.asarray(surface.vertices, np.float64), eyes)
         exact = np.asarray(room.arrays["exact_ids"])
@@ -190,16 +190,16 @@ def _truth(room: Room, surface: Surface, cache: Path, photographs: Path | None) 
         return dict(stored)
 
 
-def film_of(room: Room, photographs: Path | None) -> Film:
+def film_of(room: Room, sources: Sources) -> Film:
     """Draw the film again that a room on disk was made of.
 
     Raises:
         UsageError: it is another one: drawn by other code or with other photographs.
     """
-    film = draw_film(room.folder.parent.name, int(room.folder.name), photographs=photographs)
+    film = draw_film(room.folder.parent.name, int(room.folder.name), sources)
     made = json.loads((room.folder / "room.json").read_text())["film"]
     if json.loads(json.dumps(film.describe())) != made:
-        raise UsageError(f"{room.folder}: made by other code or with other photographs, make it anew")
+        raise UsageError(f"{room.folder}: made by other code or with other sources, make it anew")
     return film
 
 

@@ -4,6 +4,7 @@
 occurs in "train": figures of those splits say what is to be expected of rooms that nobody generated.
 """
 
+import argparse
 import zlib
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -19,6 +20,8 @@ from synthetic.furniture_families import FURNITURE_FAMILIES
 from synthetic.layout import RoomShape
 from synthetic.lighting import draw_light
 from synthetic.materials import MaterialMix, repaint
+from synthetic.model_library import PREFIX as MODELS
+from synthetic.model_library import use_models
 from synthetic.photographs import load_photographs
 from synthetic.procedural import RoomSpec, furnish, plan_room
 from synthetic.random_rooms import draw_room
@@ -32,7 +35,11 @@ HELD_OUT: dict[str, dict[str, tuple[str, ...]]] = {
     "rooms": {"furniture": ("seating", "beds"), "materials": ("photograph",)},
 }
 """Families by held-out split: of small things; of furniture and materials."""
-SPLITS = ("train", *HELD_OUT)
+MODELS_SPLIT = "models"
+"""Rooms to train on, furnished with the shapes and furniture of "train" and with models of others, see
+`synthetic.model_library`; materials are photographs, too, where there are any."""
+SPLITS = ("train", MODELS_SPLIT, *HELD_OUT)
+MODELS_TABLE = Path(__file__).with_name("models.yaml")
 _WALK_FRAMES = 300  # of a whole film
 _SKETCH = (80, 60)  # pixels at which keyframes are chosen
 _STEPS = (0.035, 0.07)  # between keyframes, as a share of the longer side; the frames stage asks for .045
@@ -48,9 +55,34 @@ _OPEN = 0.4  # share of rooms without one or two of their walls: nothing stands 
 _AS_FURNISHED = (
     0.4  # share of rooms with the generator's own materials, which windows measure nearly everywhere
 )
+_PHOTOGRAPHS = 2.5  # weight of photographs among the materials of "models"
+_WITH_MODELS = 0.85  # share of the rooms of "models" that hold small ones
 _USUAL = MaterialMix(
     print=2.0, text=0.7, noise=1.6, blank=1.0, dark=0.25, gloss=0.5, gradient=0.3, wood=1.0, tiles=0.6
 )
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Folders of what others made, on this machine and no part of the repository; None: rooms do without."""
+
+    photographs: Path | None = None
+    models: Path | None = None
+
+    @staticmethod
+    def add_options(parser: argparse.ArgumentParser) -> None:
+        """Add `--photographs` and `--models`."""
+        add = parser.add_argument
+        add("--photographs", type=Path, help="folder of pictures that materials may show")
+        add(
+            "--models", type=Path,
+            help='folder of the files in priors/models.yaml; rooms of the split "models" need it',
+        )  # fmt: skip
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> "Sources":
+        """Read the options."""
+        return cls(options.photographs, options.models)
 
 
 @dataclass(frozen=True)
@@ -75,9 +107,11 @@ def families_of(split: str) -> Families:
     mix = {name: weight * (name in kept) for name, weight in usual.items()}
     if own:  # beside blank walls, which every room may have
         mix = usual | dict.fromkeys(own, 6.0)
-    return Families(
-        chosen("shapes", SHAPE_FAMILIES), chosen("furniture", FURNITURE_FAMILIES), MaterialMix(**mix)
-    )
+    shapes, furniture = chosen("shapes", SHAPE_FAMILIES), chosen("furniture", FURNITURE_FAMILIES)
+    if split == MODELS_SPLIT:
+        mix["photograph"] = _PHOTOGRAPHS
+        furniture = (*furniture, MODELS, MODELS)  # each family of a room is drawn; twice: nearly always
+    return Families(shapes, furniture, MaterialMix(**mix))
 
 
 def _flow_px(depth: np.ndarray, camera: Camera, walk: np.ndarray, row: int) -> np.ndarray:
@@ -203,19 +237,29 @@ def _without_walls(room: Room, rng: np.random.Generator) -> Room:
     return replace(room, entities=tuple(e for e in room.entities if e.id not in gone))
 
 
-def draw_film(split: str, number: int, *, photographs: Path | None = None) -> Film:
-    """Draw, furnish, paint and light the room of this number in a split, and a walk through it."""
+def draw_film(split: str, number: int, sources: Sources | None = None) -> Film:
+    """Draw, furnish, paint and light the room of this number in a split, and a walk through it.
+
+    Raises:
+        InputError: The split is "models", and `sources.models` holds no file of `priors/models.yaml`.
+    """
+    sources = sources or Sources()
+    if split == MODELS_SPLIT and sources.models is None:
+        raise InputError('rooms of the split "models" need --models: a folder of models, see docs/priors.md')
+    use_models(MODELS_TABLE, sources.models if split == MODELS_SPLIT else None)
     rng = np.random.default_rng((zlib.crc32(split.encode()), number))
     families = families_of(split)
     spec = draw_room(
         int(rng.integers(1 << 30)), shapes=families.shapes, furniture=families.furniture, objects=_OBJECTS
     )
+    if split == MODELS_SPLIT and rng.random() < _WITH_MODELS:
+        spec = replace(spec, families=(*spec.families[:2], MODELS))
     plan = plan_room(spec)
     usual = asdict(families.materials)
     mix = MaterialMix(
         **{f.name: usual[f.name] * float(np.exp(rng.normal(0, 0.6))) for f in fields(MaterialMix)}
     )
-    pictures = load_photographs(photographs, 40, rng) if photographs else None
+    pictures = load_photographs(sources.photographs, 40, rng) if sources.photographs else None
     room, finishes = furnish(plan), {}
     drawn = np.random.default_rng((number, 9))
     if drawn.random() >= _AS_FURNISHED or mix.photograph > 0:

@@ -12,6 +12,8 @@ import numpy as np
 from synthetic.furnishing import CENTER_KINDS, SIDE_KINDS, WALL_KINDS
 from synthetic.furniture_families import FURNITURE_FAMILIES, furniture_keys
 from synthetic.layout import Item, Layout, RoomIsFull, RoomShape, Shape
+from synthetic.model_library import PREFIX as MODELS
+from synthetic.model_library import library
 
 if TYPE_CHECKING:
     from synthetic.procedural import RoomSpec
@@ -38,33 +40,42 @@ class Choice:
             return []
         return [f"{family}_{kind}" for kind in (kinds or FURNITURE_FAMILIES[family])]
 
+    def _models(self, *uses: str) -> list[str]:
+        return library().keys(*uses) if MODELS in self.spec.furniture else []
+
     def _or(self, offered: list[str], household: Sequence[str]) -> list[str]:
         return [*offered, *(household if self.household or not offered else ())]
 
     def middle(self) -> list[str]:
         """Tables to walk around."""
-        return self._or(self._of("tables"), tuple(CENTER_KINDS))
+        return self._or([*self._of("tables"), *self._models("table", "low_table")], tuple(CENTER_KINDS))
 
     def low_tables(self) -> list[str]:
         """Tables before a sofa."""
-        return self._or(self._of("tables", _LOW_TABLES), tuple(CENTER_KINDS))
+        return self._or([*self._of("tables", _LOW_TABLES), *self._models("low_table")], tuple(CENTER_KINDS))
 
     def high_tables(self) -> list[str]:
         """Tables to eat at."""
-        return self._of("tables", _HIGH_TABLES) or list(CENTER_KINDS)
+        return [*self._of("tables", _HIGH_TABLES), *self._models("table")] or list(CENTER_KINDS)
 
     def wall_mains(self) -> list[str]:
         """What one may work at with a wall behind it."""
         mains = self._of("tables", _DESKS) + self._of("storage", ("sideboard", "dresser", "counter"))
-        return self._or(mains + self._of("seating", ("sofa",)), ("table", "bench", "cabinet"))
+        mains += self._of("seating", ("sofa",)) + self._models("table", "couch")
+        return self._or(mains, ("table", "bench", "cabinet"))
 
     def couches(self) -> list[str]:
         """Sofas."""
-        return self._of("seating", ("sofa",)) or self._of("beds", ("daybed",)) or ["bench"]
+        return (
+            self._of("seating", ("sofa",)) + self._models("couch")
+            or self._of("beds", ("daybed",))
+            or ["bench"]
+        )
 
     def chairs(self) -> list[str]:
         """Chairs to sit at a table."""
-        return self._or(self._of("seating", ("chair", "chair", "stool", "office_chair")), ("chair", "stool"))
+        seats = self._of("seating", ("chair", "chair", "stool", "office_chair")) + self._models("seat")
+        return self._or(seats, ("chair", "stool"))
 
     def soft_seats(self) -> list[str]:
         """What stands around a low table."""
@@ -74,12 +85,12 @@ class Choice:
         """What stands along walls."""
         stored = self._of("storage", ("open_shelf", "wardrobe", "dresser", "trolley", "sideboard", "fridge"))
         seats = self._of("seating", ("bench", "pouf", "stool", "chair", "armchair"))
-        keys = self._or(stored + seats, tuple(SIDE_KINDS))
+        keys = self._or(stored + seats + self._models("side", "seat"), tuple(SIDE_KINDS))
         return [*keys, "crate"] if self.spec.containers > 0 and self.household else keys
 
     def walls(self) -> list[str]:
         """What hangs on walls."""
-        return self._or(self._of("wall"), tuple(WALL_KINDS))
+        return self._or(self._of("wall") + self._models("wall"), tuple(WALL_KINDS))
 
 
 def _size(shape: Shape) -> np.ndarray:

@@ -17,6 +17,8 @@ from synthetic.furniture_seating import BEDS, SEATING
 from synthetic.furniture_storage import STORAGE
 from synthetic.furniture_tables import TABLES
 from synthetic.furniture_wall import HANG_M, WALL
+from synthetic.model_library import PREFIX as MODELS
+from synthetic.model_library import library
 from synthetic.shapes import COARSE, Solid, flipped, grid_patch, signed_volume
 from synthetic.things import Kind, Place, Thing
 
@@ -120,13 +122,17 @@ def furniture_keys(families: Iterable[str]) -> list[str]:
 def shape_keys(families: Iterable[str]) -> list[str]:
     """Return the room names of all kinds of some families of small things."""
     known = shape_families()
-    return [f"{family}_{kind}" for family in families for kind in known[family]]
+    out = [f"{family}_{kind}" for family in families if family != MODELS for kind in known[family]]
+    return [*out, *(library().keys("thing") if MODELS in families else ())]
 
 
 def kind_named(key: str) -> Kind:
     """Return the kind of this room name."""
     if key in CLOTH_KINDS:
         return CLOTH_KINDS[key]
+    model = library().kind(key)
+    if model is not None:
+        return model
     for families in (FURNITURE_FAMILIES, shape_families()):
         for family, kinds in families.items():
             kind = kinds.get(key.removeprefix(f"{family}_")) if key.startswith(f"{family}_") else None
@@ -137,6 +143,9 @@ def kind_named(key: str) -> Kind:
 
 def hang_range_m(key: str) -> tuple[float, float] | None:
     """Return between which heights a kind of a family hangs, None for others."""
+    model = library().record(key)
+    if model is not None:
+        return model.hangs_m
     return HANG_M.get(key.split("_", 1)[-1]) if key.startswith(("wall_", "storage_")) else None
 
 

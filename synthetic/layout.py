@@ -151,7 +151,10 @@ class Shape:
         points = np.concatenate([p.vertices for part in model.parts for p in part])
         corners = np.concatenate([p.vertices[p.faces] for part in model.parts for p in part])
         volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-        center = (volume[:, None] * corners.sum(1) / 4).sum(0) / volume.sum()
+        if volume.sum() > 1e-9:
+            center = (volume[:, None] * corners.sum(1) / 4).sum(0) / volume.sum()
+        else:  # a model of sheets
+            center = points.mean(0)
         silhouette = hull(points[:, :2])
         foot = hull(points[points[:, 2] < points[:, 2].min() + 1e-6, :2])
         if len(foot) < 3 or plane.area(foot) < 1e-6:  # it touches in a point or along a line

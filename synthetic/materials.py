@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 
 from synthetic import textures
+from synthetic.model_library import PREFIX as MODELS
 from synthetic.room import Room
 from synthetic.textures import Texture, octave_noise
 
 _MOST_TEXELS = 700_000  # of one texture: time and memory
+_MODELS_KEPT = 0.85  # share of the models that keep their own look
 _BASE_DENSITY, _THING_DENSITY = 340.0, 1100.0  # texels per metre
 
 
@@ -94,7 +96,7 @@ def repaint(
     walls_alike = None
     for entity in room.entities:
         names = sorted({p.texture for p in entity.patches} - {"edge"})
-        if not names:
+        if not names or (entity.name.startswith(MODELS) and rng.random() < _MODELS_KEPT):
             continue
         role = "thing"
         if entity.base:

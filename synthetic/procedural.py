@@ -18,6 +18,8 @@ from synthetic.furnishing import SIDE_KINDS, WALL_KINDS
 from synthetic.furniture import Workshop
 from synthetic.furniture_families import FURNITURE_FAMILIES, role_of, shape_families, shape_keys
 from synthetic.layout import KINDS, Item, Layout, RoomIsFull, RoomShape, kind_of
+from synthetic.model_library import PREFIX as MODELS
+from synthetic.model_library import library
 from synthetic.room import Entity, Room
 from synthetic.shapes import COARSE, Patch, Solid, box, moved, shifted
 from synthetic.textures import Texture
@@ -81,10 +83,11 @@ class RoomSpec:
         """Refuse what cannot be built."""
         for name in ("families", "furniture"):  # JSON knows lists only
             object.__setattr__(self, name, tuple(getattr(self, name)))
+        models = (MODELS,) if library().records else ()
         for name, known in (
             ("layout", LAYOUTS),
-            ("furniture", FURNITURE_FAMILIES),
-            ("families", shape_families() if self.families else ()),
+            ("furniture", {*FURNITURE_FAMILIES, *models}),
+            ("families", {*shape_families(), *models} if self.families else ()),
         ):
             value = getattr(self, name)
             unknown = sorted({value} - set(known) if name == "layout" else set(value) - set(known))

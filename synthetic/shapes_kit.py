@@ -322,7 +322,7 @@ def bow(a: Sequence[float], b: Sequence[float], way: Sequence[float], count: int
 # Solids
 
 
-def _divided(
+def divided(
     vertices: np.ndarray, faces: np.ndarray, owner: np.ndarray, step_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Halve long edges, alike in both faces of an edge, until none is left; `owner` (v,) follows vertices."""
@@ -362,7 +362,7 @@ def mesh_solids(
     faces = np.concatenate([f + s for (_, f), s in zip(raws, starts)])
     owner = np.repeat(np.arange(len(raws)), counts)
     if step_m < COARSE:
-        vertices, faces, owner = _divided(vertices, faces, owner, step_m)
+        vertices, faces, owner = divided(vertices, faces, owner, step_m)
     # From here on the vertices and the faces of a raw mesh stand together.
     order = np.argsort(owner, kind="stable")
     place = np.empty(len(order), np.int64)
