@@ -57,21 +57,24 @@ def made(library, key: str, step_m: float = COARSE):
 
 def test_only_models_whose_files_are_there_are_used(library):
     assert sorted(library.records) == ["desk", "print"]
-    assert library.keys("table") == ["models_desk"] and library.kind("chair") is None
+    assert library.keys("table") == ["models_desk"]
+    assert library.kind("chair") is None
 
 
 def test_a_desk_carries_things_on_its_whole_top(library):
     desk = made(library, "models_desk")
     np.testing.assert_allclose(desk.size, (1.2, 0.6, 0.75), atol=1e-6)
     (place,) = desk.places
-    assert place.height_m == pytest.approx(0.75) and np.isinf(place.headroom_m)
+    assert place.height_m == pytest.approx(0.75)
+    assert np.isinf(place.headroom_m)
     np.testing.assert_allclose(np.ptp(place.area, axis=0), (1.2, 0.6), atol=1e-6)
 
 
 def test_what_hangs_has_its_back_on_the_wall_and_carries_nothing(library):
     hung = made(library, "models_print")
     points = np.concatenate([p.vertices for part in hung.parts for p in part])
-    assert points[:, 1].max() == pytest.approx(0, abs=1e-9) and points[:, 2].min() == pytest.approx(0)
+    assert points[:, 1].max() == pytest.approx(0, abs=1e-9)
+    assert points[:, 2].min() == pytest.approx(0)
     assert not hung.places
 
 
@@ -85,7 +88,9 @@ def test_a_picture_found_by_its_name_lies_where_the_file_says(library):
     top = patch.normals[:, 2] > 0.9
     # On the top, u runs along x: red where x < 0.
     red = look.pixels[
-        np.clip(((1 - share[:, 1]) * 63).astype(int), 0, 63), np.clip((share[:, 0] * 63).astype(int), 0, 63), 0
+        np.clip(((1 - share[:, 1]) * 63).astype(int), 0, 63),
+        np.clip((share[:, 0] * 63).astype(int), 0, 63),
+        0,
     ]
     away = np.abs(patch.vertices[:, 0]) > 0.1
     assert (red[top & away] > 100).tolist() == (patch.vertices[top & away, 0] < 0).tolist()
