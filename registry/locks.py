@@ -54,13 +54,18 @@ def file_lock(path: Path, blocking: bool = True) -> Generator[None, None, None]:
         except BlockingIOError:
             holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
             raise LockHeld(holder or "an unknown process") from None
-        # The pid only serves the error message of other processes: ignore a full disk.
-        with contextlib.suppress(OSError):
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"pid {os.getpid()}\n".encode(), 0)
+        if not blocking:  # the pid serves the error message of others, who do not wait either
+            with contextlib.suppress(OSError):  # a full disk
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, f"pid {os.getpid()}\n".encode(), 0)
         yield
     finally:
         os.close(descriptor)
+
+
+def scene_lock(root: Path, scene_id: str, purpose: str) -> Path:
+    """Return the lock file of a scene of the registry `root` for "publish" or "hold"."""
+    return root / "locks" / f"{scene_id}.{purpose}.lock"
 
 
 def is_locked(path: Path) -> bool:

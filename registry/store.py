@@ -20,7 +20,7 @@ import random
 import re
 import secrets
 import shutil
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,10 +35,11 @@ from registry.errors import (
     UsageError,
     did_you_mean,
 )
-from registry.index_rows import is_revision, row_of, row_of_scene
-from registry.locks import LockHeld, file_lock, is_leased, is_locked
+from registry.index_rows import row_of_scene
+from registry.locks import LockHeld, file_lock, is_leased, is_locked, scene_lock
 from registry.roots import address_of, default_registry_root
 from registry.schema import check_scene_id, is_scene_id
+from registry.searching import revisions, search_folders
 
 _TEMPORARY = (".publishing-", ".removing-")
 _NUMBERED = re.compile(r"scene(\d{4,9})")
@@ -279,7 +280,7 @@ class SceneRegistry:
             file_lock(self.lock_path(scene_id, "publish")),
         ):
             self._index.delete(scene_id)
-            for revision in _revisions(folder):
+            for revision in revisions(folder):
                 _remove_folder(revision)
             self._sweep(folder)
             with contextlib.suppress(OSError):
@@ -324,7 +325,7 @@ class SceneRegistry:
     def _folder_ids(self) -> Names:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             folders = (f for f in sorted(self.scenes_folder.iterdir()) if is_scene_id(f.name))
-            return [f.name for f in folders if any(_revisions(f))]
+            return [f.name for f in folders if any(revisions(f))]
         return []
 
     def _lost_ids(self) -> Names:
@@ -370,7 +371,7 @@ class SceneRegistry:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             for folder in self.scenes_folder.iterdir():
                 number = highest_number([folder.name])
-                if number > highest and any(_revisions(folder)):
+                if number > highest and any(revisions(folder)):
                     highest = number
         return highest
 
@@ -378,7 +379,7 @@ class SceneRegistry:
 
     def lock_path(self, scene_id: str, purpose: str) -> Path:
         """Return the lock file of a scene for "publish" or "hold"."""
-        return self.root / "locks" / f"{check_scene_id(scene_id)}.{purpose}.lock"
+        return scene_lock(self.root, check_scene_id(scene_id), purpose)
 
     def _create_index(self) -> None:
         """Create the index; rebuild it from the folders if it was lost or emptied."""
@@ -410,7 +411,8 @@ class SceneRegistry:
             if row is None or row.revision != bundle.revision or placed is not None:
                 same = row is not None and row.revision == bundle.revision
                 created = row.created_utc if row is not None and same else utc_text()
-                row = _row_of(SceneBundle.open(final, check_hashes=False), scene_id, created)
+                scene = SceneBundle.open(final, check_hashes=False).scene
+                row = row_of_scene(scene, bundle.revision, scene_id, created)
                 self._index.put(row)
             return row
         except BaseException:
@@ -427,7 +429,7 @@ class SceneRegistry:
             return None
 
     def _remove_superseded(self, folder: Path, current: str) -> None:
-        for revision in _revisions(folder):
+        for revision in revisions(folder):
             if revision.name != current and not is_leased(revision):
                 _remove_folder(revision)
 
@@ -457,40 +459,8 @@ class SceneRegistry:
                     folder.rmdir()
 
     def _rows_from_folders(self, before: StoredRows) -> tuple[dict[str, SceneRow], Names]:
-        """Return a row for each scene with a valid bundle, and one line about each folder that has none."""
-        rows: dict[str, SceneRow] = {}
-        problems: Names = []
-        for scene_id in self._folder_ids():
-            with file_lock(self.lock_path(scene_id, "publish")):  # see no half of a publication
-                row, found = self._row_from_folder(scene_id, before.get(scene_id))
-            problems += found
-            if row is not None:
-                rows[scene_id] = row
-        return rows, problems
-
-    def _row_from_folder(
-        self, scene_id: str, stored: tuple[Any, ...] | None
-    ) -> tuple[SceneRow | None, Names]:
-        current = None
-        if stored is not None:
-            with contextlib.suppress(BundleError):
-                current = row_of(stored)
-        found: list[tuple[bool, float, SceneRow]] = []
-        problems: Names = []
-        for revision in _revisions(self.scenes_folder / scene_id):
-            try:
-                bundle = SceneBundle.open(revision, check_hashes=True)
-                written = (revision / "manifest.json").stat().st_mtime
-                if bundle.revision != revision.name or bundle.scene["id"] != scene_id:
-                    raise BundleError(f"bundle {revision}: it belongs to another scene or revision")
-            except BundleError as error:
-                problems.append(f"scene {scene_id}: {error}")
-                continue
-            is_current = current is not None and current.revision == revision.name
-            created = current.created_utc if current is not None and is_current else utc_text(written)
-            found.append((is_current, written, _row_of(bundle, scene_id, created)))
-        best = max(found, key=lambda item: (*item[:2], item[2].revision), default=None)
-        return None if best is None else best[2], problems
+        names = [folder.name for folder in self.scenes_folder.iterdir()]
+        return search_folders(self.root, sorted(filter(is_scene_id, names)), before)
 
 
 @contextlib.contextmanager
@@ -515,15 +485,6 @@ def highest_number(scene_ids: Names) -> int:
 def scene_name(number: int) -> str:
     """Return the id `sceneNNNN` of a number."""
     return f"scene{number:04d}"
-
-
-def _revisions(folder: Path) -> Iterator[Path]:
-    if folder.is_symlink():
-        return
-    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-        for item in sorted(folder.iterdir()):
-            if is_revision(item.name) and item.is_dir() and not item.is_symlink():
-                yield item
 
 
 def _is_intact(folder: Path) -> bool:
@@ -553,7 +514,3 @@ def _flush_tree(folder: Path) -> None:
         for name in names:
             _flush(Path(parent, name))
         _flush(Path(parent))
-
-
-def _row_of(bundle: SceneBundle, scene_id: str, created_utc: str) -> SceneRow:
-    return row_of_scene(bundle.scene, bundle.revision, scene_id, created_utc)
