@@ -259,7 +259,9 @@ def draw_film(split: str, number: int, sources: Sources | None = None) -> Film:
     mix = MaterialMix(
         **{f.name: usual[f.name] * float(np.exp(rng.normal(0, 0.6))) for f in fields(MaterialMix)}
     )
-    pictures = load_photographs(sources.photographs, 40, rng) if sources.photographs else None
+    pictures = None
+    if sources.photographs and mix.photograph > 0:
+        pictures = load_photographs(sources.photographs, 40, rng)
     room, finishes = furnish(plan), {}
     drawn = np.random.default_rng((number, 9))
     if drawn.random() >= _AS_FURNISHED or mix.photograph > 0:

@@ -459,8 +459,10 @@ class SceneRegistry:
                     folder.rmdir()
 
     def _rows_from_folders(self, before: StoredRows) -> tuple[dict[str, SceneRow], Names]:
-        names = [folder.name for folder in self.scenes_folder.iterdir()]
-        return search_folders(self.root, sorted(filter(is_scene_id, names)), before)
+        names: Names = []
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            names = sorted(folder.name for folder in self.scenes_folder.iterdir() if is_scene_id(folder.name))
+        return search_folders(self.root, names, before)
 
 
 @contextlib.contextmanager

@@ -72,3 +72,9 @@ def test_an_error_of_a_process_arrives(filled, monkeypatch):
     with pytest.raises(EnvironmentMissing, match="ended with code 9"):
         reg.rebuild()
     assert reg.revisions() == before
+
+
+def test_a_registry_without_a_folder_of_scenes_is_empty(filled):
+    reg = filled(1)
+    (reg.root / "scenes").rename(reg.root / "elsewhere")
+    assert reg.rebuild() == ([], [])
