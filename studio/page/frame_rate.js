@@ -16,6 +16,7 @@
   const STALL_MS = 20; // a frame may be delayed this much by simplifying
   // From full to cheapest: share of the resolution, and whether meshes are coarse.
   const LADDER = [[1, false], [1, true], [0.7, true], [0.5, true], [0.35, true]];
+  const FIRST_IN_SOFTWARE = 3; // where others would take seconds to be found too slow
 
   // A processor pays for each sample of a pixel. The view is drawn larger instead, once, when it has come to rest.
   const inSoftware = drawsInSoftware();
@@ -66,7 +67,7 @@
     const draw = gl.render.bind(gl);
     const moved = poseWatch(viser);
     const meshes = coarseMeshes(scene);
-    let rung = 0, moving = false, still = false, restTimer = 0, stillTimer = 0;
+    let rung = inSoftware ? FIRST_IN_SOFTWARE : 0, moving = false, still = false, restTimer = 0, stillTimer = 0;
     let last = 0, spent = 0, frames = 0, mean = SLOW_MS;
     let changed = performance.now();
 
@@ -106,6 +107,8 @@
       stillTimer = setTimeout(() => {
         still = true;
         invalidate();
+        meshes.find();
+        meshes.prepare();
       }, STILL_MS);
     }
 
@@ -176,7 +179,7 @@
   function coarseMeshes(scene) {
     const known = new Map(); // geometry -> its triangles, in full and coarse (null: not simplified yet)
     let coarse = false;
-    return { find, show };
+    return { find, prepare, show };
 
     function find() {
       const seen = new Set();
@@ -192,14 +195,19 @@
       for (const geometry of known.keys()) if (!seen.has(geometry)) known.delete(geometry);
     }
 
+    function prepare(limitMs = Infinity) {
+      const start = performance.now();
+      for (const [geometry, triangles] of known) {
+        if (performance.now() - start > limitMs) return;
+        triangles.coarse ??= simplified(geometry, triangles.full);
+      }
+    }
+
     function show(wanted) {
       if (!wanted && !coarse) return;
       coarse = wanted;
-      const start = performance.now();
+      if (wanted) prepare(STALL_MS);
       for (const [geometry, triangles] of known) {
-        if (wanted && !triangles.coarse && performance.now() - start < STALL_MS) {
-          triangles.coarse = simplified(geometry, triangles.full);
-        }
         const index = (wanted && triangles.coarse) || triangles.full;
         if (geometry.index !== index) geometry.setIndex(index);
       }

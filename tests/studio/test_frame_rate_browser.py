@@ -1,4 +1,4 @@
-"""The page where drawing is slow: fewer pixels and triangles while things move, all at rest, nothing without a change."""
+"""The page where drawing is slow: fewer pixels and triangles while things move, all at rest, none without a change."""
 
 import io
 
