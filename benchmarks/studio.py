@@ -25,7 +25,7 @@ _BLANK = 8.0  # standard deviation of pixel values below which a view counts as 
 _LIMIT_S = 120.0
 _MOVES_S = 6.0
 _RATE_HZ = 30.0  # of poses that a running simulation sends
-_ADAPTS_S = 12.0  # until a page has loaded, and viser has lowered its resolution
+_RESTS_S = 6.0  # until a page has loaded or come to rest, and draws nothing
 _PANEL_WIDTH_PX = 360  # as in the studio
 _RENDERER = """(() => {
   const canvas = [...document.querySelectorAll("canvas")].sort((a, b) => b.width - a.width)[0];
@@ -85,18 +85,19 @@ def main() -> None:
         tempfile.TemporaryDirectory() as profile,
         browser_page(find_browser(), Path(profile), webgl=True) as tab,
     ):
-        address = server.url(arguments.scene) + "?fixedDpr=1"
+        address = server.url(arguments.scene)
         for visit in ("first visit", "second visit"):
             seconds, busy = until_seen(tab, address, arguments.width, arguments.height)
             print(f"{visit}: room seen after {seconds:.1f} s, {busy:.1f} s of processor time in the browser")
-        tab.settle(2.0)
+        tab.settle(_RESTS_S)
         print(f"renderer: {tab.evaluate(_RENDERER)}")
-        tell(tab, "while looking around")
-        tab.open(server.url(arguments.scene), arguments.width, arguments.height)
-        tab.settle(_ADAPTS_S)
-        tell(tab, "... at the resolution that viser chooses")
-        tab.open(address, arguments.width, arguments.height)
-        tab.settle(_ADAPTS_S)
+        tell(tab, "while looking around, the first seconds")
+        tell(tab, "... and then")
+        tab.settle(_RESTS_S)
+        print(f"at rest: {drawn_at_rest(tab)} frames in {_MOVES_S:.0f} s ({canvas_size(tab)})")
+        tab.open(address + "?fixedDpr=1", arguments.width, arguments.height)
+        tab.settle(_RESTS_S)
+        tell(tab, "... always in full, with 4 samples a pixel (?fixedDpr=1)")
         handles = [*page.object_handles().values(), *page.room_handles()]
         for handle in handles:
             handle.visible = False
@@ -173,6 +174,13 @@ def frame_rate(tab) -> tuple[float, float, float, float]:
     return (
         frames / seconds, (_browser_seconds() - before) / frames, calls / frames, triangles / frames
     )  # fmt: skip
+
+
+def drawn_at_rest(tab) -> int:
+    """Return how many frames are drawn in a while in which nothing changes."""
+    tab.evaluate("drawn.frames = 0")
+    tab.settle(_MOVES_S)
+    return tab.evaluate("drawn.frames")
 
 
 def canvas_size(tab) -> str:

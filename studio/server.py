@@ -13,11 +13,9 @@ import threading
 from collections.abc import Sequence
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
-import viser
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -29,6 +27,7 @@ from registry import SceneRegistry
 from registry.errors import EnvironmentMissing, SimReconError
 from studio.gallery import gallery_html, message_html
 from studio.parts import Part
+from studio.player import player_html
 from studio.same_origin import is_loopback, refusal
 from studio.scene_view import StudioPage
 
@@ -38,7 +37,6 @@ DEFAULT_PORT = 8090
 _PORTS = 20  # tried in a row where none is asked for
 _COOKIE = "simrecon_studio"
 _MAX_MESSAGE_BYTES = 1 << 28
-_PLAYER = Path(viser.__file__).parent / "client" / "build" / "index.html"
 
 
 class StudioServer:
@@ -205,7 +203,7 @@ class StudioServer:
                 if not path.endswith("/"):
                     return _response(HTTPStatus.FOUND, "", {"Location": f"/s/{quote(name)}/"})
                 self._port_of(name)
-                return _response(HTTPStatus.OK, _PLAYER.read_text(encoding="utf-8"), {})
+                return _response(HTTPStatus.OK, player_html(), {})
         except SimReconError as error:
             return _page(HTTPStatus.NOT_FOUND, str(error))
         return _page(HTTPStatus.NOT_FOUND, "There is no such page.")
