@@ -10,7 +10,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from priors.rooms import SPLITS, Film, Sources, draw_film
+from priors.rooms import HELD_OUT, SPLITS, Film, Sources, draw_film
 from registry.errors import InputError, UsageError
 from synthetic.capture import write_ground_truth
 from synthetic.film import iterate_film
@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--splits",
         nargs="+",
         choices=SPLITS,
-        default=list(SPLITS[1:]),
+        default=list(HELD_OUT),
         help="which families (default: held out)",
     )
     add("--rooms", type=int, default=3, help="of each split (default: %(default)s)")
@@ -36,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     add("--frames", type=int, default=140, help="length of the film (default: %(default)s)")
     Sources.add_options(parser)
     options = parser.parse_args(arguments)
+    Sources.check_options(parser, options, options.splits)
     for split in options.splits:
         number, made = options.first, 0
         while made < options.rooms:

@@ -34,7 +34,9 @@ KEEP = ("costs", "winner", "depth", "gaussians", "surface")
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    Sources.check_options(parser, options, [options.split])
     rooms = [(options, number) for number in range(options.seed, options.seed + options.rooms)]
     folder = options.out / options.split
     missing = [job for job in rooms if not (folder / f"{job[1]:05d}" / "room.json").is_file()]

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.depth_figures import TrueView, depth_figures
 from priors.dataset import film_frames
-from priors.rooms import SPLITS, Film, Sources, draw_film
+from priors.rooms import HELD_OUT, SPLITS, Film, Sources, draw_film
 from reconstruction.core.types import PosedFrames
 from reconstruction.depth import DepthConfig, estimate_depth
 from reconstruction.depth.images import sized_camera
@@ -29,7 +29,13 @@ FIGURES = ("known", "measured", "median_rel", "off", "on_things", "on_things_eac
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m priors.evaluate", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--splits", nargs="+", choices=SPLITS, default=list(SPLITS), help="which families")
+    parser.add_argument(
+        "--splits",
+        nargs="+",
+        choices=SPLITS,
+        default=["train", *HELD_OUT],
+        help="which families (default: %(default)s)",
+    )
     parser.add_argument("--rooms", type=int, default=4, help="of each split (default: %(default)s)")
     parser.add_argument(
         "--first", type=int, default=90_000, help="number of the first room (default: %(default)s)"
@@ -46,6 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         help="write a picture of each room there: frame, depth by variant, true depth",
     )
     options = parser.parse_args(arguments)
+    Sources.check_options(parser, options, options.splits)
     variants = {
         text: _config(text, parser) for text in options.set or ["prior=none", "prior=mending", "prior=both"]
     }

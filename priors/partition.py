@@ -1,13 +1,13 @@
 """Train the network and the boosted trees of the learned cut on rooms on disk, and measure it on rooms kept out.
 
-    python -m priors.partition DATA --out RUN [--photographs DIR] [--cache DIR] [--processes 2] [--proposals-only]
+    python -m priors.partition DATA --out RUN [--photographs DIR] [--models DIR] [--cache DIR] [--proposals-only]
 
 Graphs with truth are made from `DATA/<split>/<number>` (see `priors.dataset`, `--keep depth`) and cached. Every fifth
-room of "train" is kept out, and so are all other splits. The network of superpoints is trained on all rooms, and on
-either half of them; the clusters that each half's makes of the other half are what the trees for pairs of clusters
-are fitted to, and the proposals that either half's trees make of the other half are what the trees for proposals are.
-`RUN` gets `partition.safetensors` and `figures.json`. `--photographs` has to be the folder that the rooms were
-made with.
+room of "train" and "models" is kept out, and so are all other splits. The network of superpoints is trained on all
+rooms, and on either half of them; the clusters that each half's makes of the other half are what the trees for pairs
+of clusters are fitted to, and the proposals that either half's trees make of the other half are what the trees for
+proposals are. `RUN` gets `partition.safetensors` and `figures.json`. `--photographs` and `--models` have to be the
+folders that the rooms were made with.
 """
 
 import argparse

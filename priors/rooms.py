@@ -6,6 +6,7 @@ occurs in "train": figures of those splits say what is to be expected of rooms t
 
 import argparse
 import zlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -83,6 +84,29 @@ class Sources:
     def of(cls, options: argparse.Namespace) -> "Sources":
         """Read the options."""
         return cls(options.photographs, options.models)
+
+    @classmethod
+    def check_options(
+        cls, parser: argparse.ArgumentParser, options: argparse.Namespace, splits: Sequence[str]
+    ) -> None:
+        """End the command with one line if the models of a split are not there."""
+        try:
+            for split in splits:
+                cls.of(options).use(split)
+        except InputError as error:
+            parser.error(str(error))
+
+    def use(self, split: str) -> None:
+        """Let rooms be furnished with the models of a split, or with none.
+
+        Raises:
+            InputError: The split is "models", and `models` holds no file of `priors/models.yaml`.
+        """
+        if split == MODELS_SPLIT and self.models is None:
+            raise InputError(
+                'rooms of the split "models" need --models: a folder of models, see docs/priors.md'
+            )
+        use_models(MODELS_TABLE, self.models if split == MODELS_SPLIT else None)
 
 
 @dataclass(frozen=True)
@@ -244,9 +268,7 @@ def draw_film(split: str, number: int, sources: Sources | None = None) -> Film:
         InputError: The split is "models", and `sources.models` holds no file of `priors/models.yaml`.
     """
     sources = sources or Sources()
-    if split == MODELS_SPLIT and sources.models is None:
-        raise InputError('rooms of the split "models" need --models: a folder of models, see docs/priors.md')
-    use_models(MODELS_TABLE, sources.models if split == MODELS_SPLIT else None)
+    sources.use(split)
     rng = np.random.default_rng((zlib.crc32(split.encode()), number))
     families = families_of(split)
     spec = draw_room(

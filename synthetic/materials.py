@@ -96,7 +96,7 @@ def repaint(
     walls_alike = None
     for entity in room.entities:
         names = sorted({p.texture for p in entity.patches} - {"edge"})
-        if not names or (entity.name.startswith(MODELS) and rng.random() < _MODELS_KEPT):
+        if not names or (entity.name.startswith(f"{MODELS}_") and rng.random() < _MODELS_KEPT):
             continue
         role = "thing"
         if entity.base:

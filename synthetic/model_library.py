@@ -23,7 +23,7 @@ from synthetic.things import Kind, Place, Thing
 
 PREFIX = "models"
 USES = ("thing", "table", "low_table", "seat", "couch", "side", "wall")
-"""What a model may be in a room: `thing` stands on furniture, `wall` hangs, the others stand on the floor."""
+"""Uses of a model in a room: a `thing` stands on furniture, `wall` hangs, the others stand on the floor."""
 _LARGEST_PX = 1024
 _MOST_FACES = 25_000
 _PICTURES = (".jpg", ".jpeg", ".png")
@@ -34,6 +34,7 @@ _LEVEL = 0.98  # least z of the normal of a face that others may stand on
 _FLAT_M = 0.004  # faces of one level differ by less
 _FULL = 0.8  # least share of its convex hull that a level covers
 _THING_M2, _FURNITURE_M2, _HEADROOM_M = 0.002, 0.03, 0.1
+_THING_SHARE = 0.5  # least share of a thing's footprint that a level covers
 _MOST_PLACES = 4
 
 
@@ -180,21 +181,19 @@ def _places(folder: str, record: Record) -> tuple[Place, ...]:
     corners = np.concatenate([m.vertices[m.faces] for m in meshes])
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = 0.5 * np.linalg.norm(cross, axis=1)
-    level = cross[:, 2] > _LEVEL * 2 * np.maximum(areas, 1e-12)
+    left = cross[:, 2] > _LEVEL * 2 * np.maximum(areas, 1e-12)
     heights = corners[:, :, 2].mean(1)
     footprint = plane.area(plane.convex_hull(corners[..., :2].reshape(-1, 2)))
     thing = record.use == "thing"
+    least = max(_THING_M2, _THING_SHARE * footprint) if thing else _FURNITURE_M2
     out: list[tuple[float, Place]] = []
-    left = level.copy()
     while left.any():
         order = np.flatnonzero(left)
         at = float(heights[order[np.argmax(areas[order])]])
         member = left & (np.abs(heights - at) < _FLAT_M)
         left &= ~member
         size = float(areas[member].sum())
-        if size < (_THING_M2 if thing else _FURNITURE_M2) or (thing and size < 0.5 * footprint):
-            if areas[order].max() < 1e-5:
-                break
+        if size < least:
             continue
         hull = plane.convex_hull(corners[member][..., :2].reshape(-1, 2))
         if size < _FULL * plane.area(hull):
@@ -222,11 +221,11 @@ def _read_model(folder: str, record: Record) -> tuple[_Mesh, ...]:
     """
     path = Path(folder) / record.file
     rotation = turn(*record.turn_deg) * record.scale
-    meshes = [_mesh(part.vertices @ rotation.T, part, path) for part in _geometries(path) if len(part.faces)]
-    if not meshes or sum(len(m.faces) for m in meshes) > 2 * _MOST_FACES:
-        raise InputError(
-            f"{path}: {sum(len(m.faces) for m in meshes)} triangles, expected 1 to {_MOST_FACES}"
-        )
+    geometries = [part for part in _geometries(path) if len(part.faces)]
+    count = sum(len(part.faces) for part in geometries)
+    if not 0 < count <= _MOST_FACES:
+        raise InputError(f"{path}: {count} triangles, expected 1 to {_MOST_FACES}")
+    meshes = [_mesh(part.vertices @ rotation.T, part, path) for part in geometries]
     points = np.concatenate([m.vertices for m in meshes])
     low, high = points.min(0), points.max(0)
     back = high[1] if record.use == "wall" else (low[1] + high[1]) / 2

@@ -200,8 +200,7 @@ class _Stock:
 
 
 @cache
-def _stock(families: tuple[str, ...], furniture: tuple[str, ...], household: bool) -> _Stock:
-    keys = shape_keys(families)
+def _stock(keys: tuple[str, ...], furniture: tuple[str, ...], household: bool) -> _Stock:
     by_role = {key: role_of(key) for key in keys}
 
     def mix(roles: tuple[str, ...], own: tuple[str, ...]) -> tuple[str, ...]:
@@ -223,7 +222,7 @@ def _stock(families: tuple[str, ...], furniture: tuple[str, ...], household: boo
 def _fill_from_families(spec: RoomSpec, room: Layout) -> Layout:
     """Furnish as the layout says, then place things; what finds no place where it was meant for goes elsewhere."""
     arrange(spec, room)
-    stock = _stock(spec.families, spec.furniture, spec.household)
+    stock = _stock(tuple(shape_keys(spec.families)), spec.furniture, spec.household)
     small = spec.objects - len(room.items)
     containers = min(round(spec.containers * spec.objects), small // 2)
     available = small - 2 * containers

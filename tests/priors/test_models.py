@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from priors import dataset
 from priors.rooms import MODELS_TABLE, Sources, draw_film
 from registry.errors import InputError
 from synthetic.furniture import Workshop
@@ -138,3 +139,22 @@ def test_a_room_is_furnished_with_models(tmp_path):
 def test_rooms_with_models_need_a_folder_of_models():
     with pytest.raises(InputError, match="--models"):
         draw_film("models", 0)
+
+
+def test_commands_say_at_once_that_models_are_missing(tmp_path, capsys):
+    for words in ([], ["--models", str(tmp_path)]):
+        with pytest.raises(SystemExit):
+            dataset.main([str(tmp_path / "out"), "--split", "models", *words])
+        assert "docs/priors.md" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_with_too_many_triangles_is_refused(tmp_path):
+    trimesh.creation.icosphere(6).export(tmp_path / "ball.obj")
+    (tmp_path / "table.yaml").write_text("models: {ball: {file: ball.obj, use: thing, label: ball}}")
+    library = use_models(tmp_path / "table.yaml", tmp_path)
+    try:
+        with pytest.raises(InputError, match="81920 triangles, expected 1 to 25000"):
+            made(library, "models_ball")
+    finally:
+        use_models(None, None)
