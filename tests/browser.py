@@ -125,15 +125,19 @@ class Page:
         return self.evaluate("document.body.innerText")
 
     def box_of(
-        self, text: str, selector: str = "button, a, label, input, [role=tab], summary, td, p, span, div"
+        self,
+        text: str,
+        selector: str = "button, a, label, input, [role=tab], summary, td, p, span, div",
+        timeout_s: float = 30.0,
     ) -> Any:
         """Return x, y, width, height of the smallest visible element with this text, label or placeholder.
 
+        Waits for it: a page is drawn some time after the server's state has changed.
+
         Raises:
-            LookupError: there is none.
+            LookupError: there is none within `timeout_s`.
         """
-        box = self.evaluate(
-            f"""(() => {{
+        find = f"""(() => {{
               const wanted = {json.dumps(text)};
               let best = null;
               for (const e of document.querySelectorAll({json.dumps(selector)})) {{
@@ -148,10 +152,12 @@ class Page:
               const b = best[0].getBoundingClientRect();
               return {{ x: b.x, y: b.y, width: b.width, height: b.height }};
             }})()"""
-        )
-        if box is None:
-            raise LookupError(f"nothing visible says {text!r}; the page says: {self.text()[:2000]!r}")
-        return box
+        try:
+            return self.wait_for(find, timeout_s)
+        except TimeoutError:
+            raise LookupError(
+                f"nothing visible says {text!r}; the page says: {self.text()[:2000]!r}"
+            ) from None
 
     def field(self, label: str) -> Any:
         """Return x, y, width, height of the input (text, checkbox, slider, dropdown) in the row of a label.
