@@ -43,7 +43,7 @@ from priors.samples import Room, open_rooms
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
 from reconstruction.instances.partition.graph import LABELS
-from reconstruction.instances.partition.model import Ensemble, Model, load_models
+from reconstruction.instances.partition.model import WEIGHTS, Ensemble, Model, load_models
 from registry.errors import UsageError
 
 _KEPT_OUT = 5  # one training room of so many
@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
     cache = options.cache or options.out / "cache"
-    splits = _split_rooms(options.data)
+    splits = split_rooms(options.data)
     print({name: len(rooms) for name, rooms in splits.items()}, flush=True)
     scorers = (_shipped if options.proposals_only else _trained)(splits, cache, options)
     found = scorers.proposals
@@ -253,7 +253,7 @@ def ensemble_of(networks: list[Network]) -> Ensemble:
     return Ensemble(tuple(Model({k: v.numpy() for k, v in n.state_dict().items()}) for n in networks))
 
 
-def _split_rooms(data: Path) -> dict[str, list[Room]]:
+def split_rooms(data: Path) -> dict[str, list[Room]]:
     """Return rooms by split: those trained on, those of the same families kept out, and other families."""
     rooms = [room for name in ("train", MODELS_SPLIT) for room in open_rooms(data / name, NEEDED)]
     kept_out = [room for room in rooms if int(room.folder.name) % _KEPT_OUT == _KEPT_OUT - 1]
@@ -355,7 +355,10 @@ def losses(network: Network, room: Example, targets: Targets) -> tuple[torch.Ten
 
 
 def export(superpoints: Ensemble, trees: dict[str, Boosted], least_iou: float, file: Path) -> None:
-    """Write the weights as `reconstruction.instances.partition.model.load_models` reads them, layers as float16."""
+    """Write the weights as `reconstruction.instances.partition.model.load_models` reads them, layers as float16.
+
+    The networks of crops are those that ship; `priors.crops` trains them.
+    """
     load_models.cache_clear()
     arrays = {
         f"superpoints.{k}.{name}": value if name in _SCALING else value.astype(np.float16)
@@ -365,7 +368,8 @@ def export(superpoints: Ensemble, trees: dict[str, Boosted], least_iou: float, f
     for kind, boosted in trees.items():
         arrays |= {f"{kind}.{name}": value for name, value in boosted.arrays().items()}
     arrays |= {"least_iou": np.array([least_iou], np.float32)}
-    save_file({name: torch.from_numpy(value.copy()) for name, value in arrays.items()}, file)
+    crops = {name: value for name, value in load_file(WEIGHTS).items() if name.startswith("crops.")}
+    save_file({name: torch.from_numpy(value.copy()) for name, value in arrays.items()} | crops, file)
 
 
 if __name__ == "__main__":

