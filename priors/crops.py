@@ -18,7 +18,6 @@ from pickle import UnpicklingError
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
-from scipy.special import expit
 from torch.nn import functional
 
 from priors.partition import split_rooms
@@ -27,7 +26,13 @@ from priors.partition_crops import RoomCrops, crops_of_rooms, joined
 from priors.partition_figures import best_least, proposal_figures
 from priors.rooms import Sources
 from reconstruction.instances.partition.crop_network import Head, Trunk
-from reconstruction.instances.partition.crop_scores import CropScorer, head_inputs, mean_by_proposal, mirrored
+from reconstruction.instances.partition.crop_scores import (
+    CropScorer,
+    estimated_iou,
+    head_inputs,
+    mean_by_proposal,
+    mirrored,
+)
 from reconstruction.instances.partition.model import WEIGHTS, load_models
 from registry.errors import UsageError
 
@@ -101,7 +106,7 @@ def _inputs(samples: RoomCrops, rows: np.ndarray | slice) -> tuple[torch.Tensor,
 
 @torch.inference_mode()
 def _said(heads: list[Head], crops: RoomCrops, found: RoomProposals) -> np.ndarray:
-    """Return the IoU (m,) that heads estimate of a room's proposals, 0 where none was looked at."""
+    """Return the IoU (m,) that trees and heads estimate of a room's proposals, 0 where none was looked at."""
     logit = []
     for start in range(0, len(crops.proposal), _BATCH):
         inputs = _inputs(crops, slice(start, start + _BATCH))
@@ -110,7 +115,7 @@ def _said(heads: list[Head], crops: RoomCrops, found: RoomProposals) -> np.ndarr
     out = np.zeros(len(found.rows))
     if logit:
         rows, said = mean_by_proposal(crops.proposal, np.concatenate(logit).astype(np.float64))
-        out[rows] = expit(said)
+        out[rows] = estimated_iou(load_models().proposals(found.rows[rows]), said)
     return out
 
 

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
+from scipy.special import expit
 
 from reconstruction.instances.partition.crops import MAPS, Crops, crops_of
 from reconstruction.instances.partition.features import View
@@ -15,6 +16,7 @@ from registry.errors import EnvironmentMissing
 MOST = 1000  # proposals that are looked at, those the trees score highest; the others are never objects
 ALIKE = 0.9  # IoU of two proposals from which only the likelier one is looked at
 _BATCH = 48  # crops; each batch is of one thread, so that results do not depend on the number of threads
+_CLIP_LOGIT = 7.0  # of the trees
 _TINY = 1e-9
 
 
@@ -106,6 +108,11 @@ def mean_by_proposal(proposal: np.ndarray, logit: np.ndarray) -> tuple[np.ndarra
     """Return the proposals that have crops, ascending, and the mean logit of each; `proposal` is that of each crop."""
     rows, own = np.unique(proposal, return_inverse=True)
     return rows, np.bincount(own, logit) / np.maximum(np.bincount(own), 1)
+
+
+def estimated_iou(by_trees: np.ndarray, by_crops: np.ndarray) -> np.ndarray:
+    """Return the IoU of proposals from the mean of both logits: trees know the shape better, networks the picture."""
+    return expit(0.5 * (np.clip(by_trees, -_CLIP_LOGIT, _CLIP_LOGIT) + by_crops))
 
 
 def color_input(color: np.ndarray):

@@ -2,7 +2,6 @@
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.special import expit
 
 from reconstruction.core.progress import Progress
 from reconstruction.core.types import Surface
@@ -11,6 +10,7 @@ from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.mask_cut import mark_attached
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
+from reconstruction.instances.partition.crop_scores import estimated_iou
 from reconstruction.instances.partition.features import Shapes, Together, View, edge_features, node_features
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, region_graph
 from reconstruction.instances.partition.model import Models, load_models
@@ -67,9 +67,10 @@ def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[n
     odds = models.pairs(pieces.pair_rows())
     proposals = propose(view, pieces, odds)
     rows = proposal_features(view, graph, scores, label, pieces, odds, proposals)
-    shown, logit = models.crops(view, pieces.graph.region, proposals.members, models.proposals(rows))
-    members = proposals.members[shown]
-    thing = things_of(members[best_disjoint(members, expit(logit) - models.least_iou)], pieces)
+    by_trees = models.proposals(rows)
+    shown, by_crops = models.crops(view, pieces.graph.region, proposals.members, by_trees)
+    members, iou = proposals.members[shown], estimated_iou(by_trees[shown], by_crops)
+    thing = things_of(members[best_disjoint(members, iou - models.least_iou)], pieces)
     return labels_of(thing, label[graph.region], cluster[graph.region])
 
 
