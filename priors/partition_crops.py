@@ -88,7 +88,8 @@ def _made(room: Room, found: RoomProposals, cache: Path, scorer: CropScorer) -> 
 def _drawn(found: RoomProposals, said: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the proposals that are shown, ascending: the likeliest distinct ones, and some of the others."""
     area = cluster_areas(found.example.areas, found.region, found.members)
-    likely = distinct(found.members, area, said, _LIKELY, ALIKE)
+    standing = distinct(found.members, area, said, _LIKELY, ALIKE)
+    likely = np.unique(standing[standing >= 0])
     rest = np.setdiff1d(np.arange(len(said)), likely)
     good = rng.permutation(rest[found.best_iou[rest] > _TRUE])[:_GOOD]
     return np.unique(np.concatenate([likely, good, rng.permutation(rest)[:_OTHERS]])).astype(np.int64)

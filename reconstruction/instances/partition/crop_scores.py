@@ -14,7 +14,7 @@ from reconstruction.poses.parallel import ordered_map
 from registry.errors import EnvironmentMissing
 
 MOST = 1000  # proposals that are looked at, those the trees score highest; the others are never objects
-ALIKE = 0.9  # IoU of two proposals from which only the likelier one is looked at
+ALIKE = 0.9  # IoU of two proposals above which the likelier one is looked at for both
 _BATCH = 48  # crops; each batch is of one thread, so that results do not depend on the number of threads
 _CLIP_LOGIT = 7.0  # of the trees
 _TINY = 1e-9
@@ -42,7 +42,9 @@ class CropScorer:
     def __call__(
         self, view: View, region: np.ndarray, members: csr_matrix, logit: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows (r,) of the proposals that were looked at, and their logits float64 (r,).
+        """Return the rows (r,) of the likely proposals, and their logits float64 (r,).
+
+        Of proposals that are almost the same the likeliest is looked at, and its logit is that of the others.
 
         Args:
             view: the surface and its keyframes.
@@ -51,8 +53,13 @@ class CropScorer:
             logit: float (m,) of each proposal, as the trees estimate it.
         """
         area = cluster_areas(view.mesh.areas, region, members)
-        crops = crops_of(view, region, members, distinct(members, area, logit, MOST, ALIKE))
-        return mean_by_proposal(crops.proposal, self.logits(crops))
+        standing = distinct(members, area, logit, MOST, ALIKE)
+        crops = crops_of(view, region, members, np.unique(standing[standing >= 0]))
+        said = np.full(len(logit) + 1, np.nan)  # the last is that of proposals that nothing stands for
+        shown, mean = mean_by_proposal(crops.proposal, self.logits(crops))
+        said[shown] = mean
+        rows = np.flatnonzero(np.isfinite(said[standing]))
+        return rows, said[standing[rows]]
 
     def logits(self, crops: Crops) -> np.ndarray:
         """Return the logit float64 (k,) of each crop: the mean of heads, and of the crop and its mirror image."""

@@ -137,30 +137,32 @@ def regions_of_tree(
 
 
 def distinct(members: csr_matrix, area: np.ndarray, score: np.ndarray, most: int, alike: float) -> np.ndarray:
-    """Return the best proposals without those that are almost the same as a better one: non-maximum suppression.
+    """Return the best proposal that each is almost the same as: non-maximum suppression.
 
     Args:
         members: (m, n) 1 = the cluster is in the proposal.
         area: float (n,) of each cluster.
         score: float (m,) of each proposal.
-        most: number of proposals to return at the most.
-        alike: IoU of two proposals above which the one with the lower score is left out.
+        most: number of best proposals at the most.
+        alike: IoU of two proposals above which the one with the higher score stands for both.
 
     Returns:
-        Rows, ascending.
+        int (m,) row of the proposal that stands for each, its own for the best ones, -1 for none.
     """
-    own, left, out = np.asarray(members @ area).ravel(), np.ones(len(score), bool), []
+    own, out = np.asarray(members @ area).ravel(), np.full(len(score), -1)
+    found = 0
     for row in np.argsort(-score, kind="stable").tolist():
-        if len(out) == most:
+        if found == most:
             break
-        if left[row]:
-            out.append(row)
+        if out[row] < 0:
+            found += 1
             inside = np.zeros(len(area))
             clusters = members.indices[members.indptr[row] : members.indptr[row + 1]]
             inside[clusters] = area[clusters]
             shared = members @ inside
-            left &= shared <= alike * (own + own[row] - shared)
-    return np.sort(np.array(out, np.int64))
+            out[(out < 0) & (shared > alike * (own + own[row] - shared))] = row
+            out[row] = row
+    return out
 
 
 def best_disjoint(members: csr_matrix, gain: np.ndarray) -> np.ndarray:
