@@ -31,6 +31,7 @@ from reconstruction.instances.partition.crop_scores import (
     estimated_iou,
     head_inputs,
     mean_by_proposal,
+    mean_logit,
     mirrored,
 )
 from reconstruction.instances.partition.model import WEIGHTS, load_models
@@ -48,7 +49,6 @@ _EPSILON = 1e-3  # of the trunk's batch normalization
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     options = _parser().parse_args(arguments)
-    torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
     cache = options.cache or options.out / "cache"
     trunk = trunk_weights(options.trunk) if options.trunk else shipped_trunk()
@@ -57,6 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
         found[name] = shipped_proposals(rooms, cache, Sources.of(options), options.processes)
         crops[name] = crops_of_rooms(rooms, found[name], cache, CropScorer(trunk), options.processes)
         print(f"{name}: {len(rooms)} rooms, {sum(len(c.proposal) for c in crops[name])} crops", flush=True)
+    torch.set_num_threads(options.threads)  # making crops may have left it at one
     heads = [train(crops["train"], options.epochs, options.seed + k) for k in range(options.heads)]
     said = {name: [_said(heads, *pair) for pair in zip(crops[name], found[name])] for name in found}
     chosen_on = [name for name in found if name != "train"] or ["train"]
@@ -109,9 +110,7 @@ def _said(heads: list[Head], crops: RoomCrops, found: RoomProposals) -> np.ndarr
     """Return the IoU (m,) that trees and heads estimate of a room's proposals, 0 where none was looked at."""
     logit = []
     for start in range(0, len(crops.proposal), _BATCH):
-        inputs = _inputs(crops, slice(start, start + _BATCH))
-        both = [head(*seen) for head in heads for seen in (inputs, mirrored(*inputs))]
-        logit.append(torch.stack(both).mean(0).numpy())
+        logit.append(mean_logit(heads, _inputs(crops, slice(start, start + _BATCH))))
     out = np.zeros(len(found.rows))
     if logit:
         rows, said = mean_by_proposal(crops.proposal, np.concatenate(logit).astype(np.float64))

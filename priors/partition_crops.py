@@ -55,7 +55,7 @@ def crops_of_rooms(
 def _room_crops(job: tuple[Room, RoomProposals, Path, CropScorer]) -> RoomCrops:
     room, found, cache, scorer = job
     digest = digest_of([f"reconstruction.instances.partition.{name}" for name in ("crops", "cut")])
-    file = cached(room, cache, f"crops-{digest}").with_suffix(".npz")
+    file = cached(room, cache, f"crops-{digest}-{scorer.trunk_digest()}").with_suffix(".npz")
     if not file.is_file():
         made = _made(room, found, cache, scorer)
         write_arrays(file, **{f.name: getattr(made, f.name) for f in fields(RoomCrops)})

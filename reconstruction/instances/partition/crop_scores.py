@@ -1,5 +1,6 @@
 """Estimated IoU of proposals by networks that see them in keyframes: crops of the likeliest -> logits."""
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -73,8 +74,7 @@ class CropScorer:
             with torch.inference_mode():
                 fine, coarse = trunk(color_input(crops.color[part]))
                 seen = (fine, coarse, *head_inputs(crops.maps[part], crops.scalars[part]))
-                said = [head(*inputs) for head in heads for inputs in (seen, mirrored(*seen))]
-                return torch.stack(said).mean(0).numpy()
+                return mean_logit(heads, seen)
 
         every = list(ordered_map(of, range(0, len(crops.proposal), _BATCH)))
         return np.concatenate(every).astype(np.float64) if every else np.zeros(0)
@@ -91,6 +91,13 @@ class CropScorer:
         numbers = sorted({name.split(".")[1] for name in self.weights if name.startswith("heads.")})
         heads = tuple(self._loaded(Head(), f"heads.{number}.") for number in numbers)
         return self._loaded(Trunk(), "trunk."), heads
+
+    def trunk_digest(self) -> str:
+        """Return a digest of the trunk's weights, which features of crops follow from."""
+        digest = hashlib.sha256()
+        for name in sorted(name for name in self.weights if name.startswith("trunk.")):
+            digest.update(np.asarray(self.weights[name], np.float16).tobytes())
+        return digest.hexdigest()[:12]
 
     def _loaded(self, network, prefix: str):
         import torch
@@ -135,6 +142,15 @@ def head_inputs(maps: np.ndarray, scalars: np.ndarray) -> tuple:
     import torch
 
     return torch.from_numpy(maps).float() / 127, torch.from_numpy(scalars)
+
+
+def mean_logit(heads, inputs: tuple) -> np.ndarray:
+    """Return the mean logit (b,) of heads for their inputs and for the mirror image of these."""
+    import torch
+
+    return (
+        torch.stack([head(*seen) for head in heads for seen in (inputs, mirrored(*inputs))]).mean(0).numpy()
+    )
 
 
 def mirrored(fine, coarse, maps, scalars) -> tuple:
