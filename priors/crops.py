@@ -108,9 +108,8 @@ def _inputs(samples: RoomCrops, rows: np.ndarray | slice) -> tuple[torch.Tensor,
 @torch.inference_mode()
 def _said(heads: list[Head], crops: RoomCrops, found: RoomProposals) -> np.ndarray:
     """Return the IoU (m,) that trees and heads estimate of a room's proposals, 0 where none was looked at."""
-    logit = []
-    for start in range(0, len(crops.proposal), _BATCH):
-        logit.append(mean_logit(heads, _inputs(crops, slice(start, start + _BATCH))))
+    starts = range(0, len(crops.proposal), _BATCH)
+    logit = [mean_logit(heads, _inputs(crops, slice(start, start + _BATCH))) for start in starts]
     out = np.zeros(len(found.rows))
     if logit:
         rows, said = mean_by_proposal(crops.proposal, np.concatenate(logit).astype(np.float64))
