@@ -4,6 +4,7 @@ SIFT features, matching of likely pairs, COLMAP's incremental mapper (the global
 adjustment. Held-out frames are localized against the finished model and never enter it.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +22,13 @@ from reconstruction.poses.held_out import candidates_in_time, locate_frames
 from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.moving_crop import correct_moving_crop
+from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.refine import refine_model
 from reconstruction.poses.rolling_shutter import Shutter, correct_rolling_shutter
 from reconstruction.poses.undistort import undistort
-from reconstruction.poses.zoom import without_zoom
+from reconstruction.poses.zoom import cut_to_part, search_zoom
 
+_DATABASE = "database.db"  # of the mapper, in the work folder
 _PLAUSIBLE_FOCAL = (0.35, 4.0)  # of the longer image side; metadata beyond is ignored
 _DEFAULT_FOCAL_SHARE = 1.0  # of the longer image side, where the metadata has no focal length
 
@@ -115,19 +118,19 @@ def _reconstruct(
 ) -> tuple[FrameSet, list[Features], Reconstruction]:
     """Run structure from motion; return the frames with one focal length, their features, and the refined model."""
     camera = initial_camera(frames, config)
-    database = work_dir / "database.db"
     pairs = consistent_pairs(frames, features, camera, config, progress)
     diagnose.check_motion(features, pairs, (camera.width, camera.height))
-    frames, features, pairs = without_zoom(frames, features, pairs, camera, config, work_dir, progress)
-    database.unlink(missing_ok=True)
-    mapping.write_database(database, camera, features, pairs)
+    with ThreadPoolExecutor(1) as beside:  # the mapper uses one core
+        search = beside.submit(search_zoom, frames, features, pairs, camera, config, work_dir)
+        models = _map(features, pairs, camera, config, work_dir, progress)
+    if (part := search.result()) is not None:
+        frames, features, pairs = cut_to_part(part, frames, features, pairs, progress)
+        models = _map(features, pairs, camera, config, work_dir, progress)
     chosen = len(frames.images)
-    progress.start(chosen, "mapping")
-    models = mapping.incremental_models(database, work_dir, config, chosen, progress)
     first = models[0].num_reg_images() if models else 0
     parts = label_parts(chosen, pairs)
     if first < config.second_try_below_share * int((parts == 0).sum()):
-        other = mapping.global_models(database, work_dir, config)
+        other = mapping.global_models(work_dir / _DATABASE, work_dir, config)
         second = other[0].num_reg_images() if other else 0
         progress.note(
             f"poses: the incremental mapper registered {first} of {chosen} frames, the global mapper "
@@ -140,6 +143,18 @@ def _reconstruct(
     for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
         progress.note(note)
     return frames, features, models[0]
+
+
+def _map(
+    features: list[Features], pairs: list[VerifiedPair], camera: ColmapCamera, config: PosesConfig, work_dir: Path,
+    progress: Progress,
+) -> list[Reconstruction]:  # fmt: skip
+    """Return the models of the incremental mapper, largest first; the database of the frames stays in `work_dir`."""
+    database = work_dir / _DATABASE
+    database.unlink(missing_ok=True)
+    mapping.write_database(database, camera, features, pairs)
+    progress.start(len(features), "mapping")
+    return mapping.incremental_models(database, work_dir, config, len(features), progress)
 
 
 def _locate_held_out(

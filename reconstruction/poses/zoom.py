@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruction.core.progress import Progress
+from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.core.types import FrameSet
 from reconstruction.poses import diagnose, mapping
 from reconstruction.poses.colmap_types import ColmapCamera
@@ -34,25 +34,28 @@ class Part:
     focal_px: tuple[float, float]
 
 
-def without_zoom(
+def search_zoom(
     frames: FrameSet,
     features: list[Features],
     pairs: list[VerifiedPair],
     camera: ColmapCamera,
     config: PosesConfig,
     work_dir: Path,
-    progress: Progress,
+) -> Part | None:
+    """Return the longest part with one focal length; None where the film has one, or is a set of pictures."""
+    if not frames.ordered or not _scale_changes(frames.times_s, features, pairs):
+        return None
+    return _longest_part(features, pairs, camera, config, work_dir)
+
+
+def cut_to_part(
+    part: Part, frames: FrameSet, features: list[Features], pairs: list[VerifiedPair], progress: Progress
 ) -> tuple[FrameSet, list[Features], list[VerifiedPair]]:
-    """Return frames, features and pairs of the longest part with one focal length; all of them where it is constant.
+    """Return frames, features and pairs of a part.
 
     Raises:
-        InputError: no such part has enough frames.
+        InputError: it has too few frames.
     """
-    if not frames.ordered or not _scale_changes(frames.times_s, features, pairs):
-        return frames, features, pairs
-    part = _longest_part(features, pairs, camera, config, work_dir, progress)
-    if part is None:
-        return frames, features, pairs
     low, high = part.focal_px
     start_s, end_s = frames.times_s[part.first], frames.times_s[part.last]
     found = (
@@ -91,7 +94,6 @@ def _longest_part(
     camera: ColmapCamera,
     config: PosesConfig,
     work_dir: Path,
-    progress: Progress,
 ) -> Part | None:
     """Map some frames with own focal lengths; return the longest part with one, None where all have the same."""
     stride = -(-len(features) // _MAX_MAPPED)
@@ -105,9 +107,8 @@ def _longest_part(
     folder.mkdir(parents=True, exist_ok=True)
     database = folder / "database.db"
     database.unlink(missing_ok=True)
-    progress.start(len(rows), "looking for zoom")
     mapping.write_database(database, camera, [features[r] for r in rows], chosen, own_cameras=True)
-    models = mapping.incremental_models(database, folder, config, len(rows), progress)
+    models = mapping.incremental_models(database, folder, config, len(rows), NO_PROGRESS)
     if not models or models[0].num_reg_images() < _LEAST_REGISTERED * len(rows):
         return None
     model = models[0]
