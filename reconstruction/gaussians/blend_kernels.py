@@ -26,14 +26,29 @@ from reconstruction.gaussians.kernels import (
     OPACITY,
     REACH2,
     RED,
-    TILE,
     WX,
     WY,
     XC,
     YC,
     ZC,
 )
+from reconstruction.gaussians.patches import (
+    LANES,
+    PATCH,
+    PATCHES,
+    lane_offsets,
+    mark_finished,
+    may_reach,
+    patches_of,
+    place_in_tile,
+    tile_bounds,
+)
 
+LIGHT, WEIGHT = (
+    N_FEATURES,
+    N_FEATURES + 1,
+)  # planes beside the features: transmittance, weight of the last splat
+_CHECK_EVERY = 16  # splats, after which finished patches are looked for
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
@@ -61,24 +76,14 @@ def _falloff(rho):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, inline="always", fastmath=_FAST)
-def splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx):  # pragma: no cover - compiled
+def splat_at(dx, dy, ax, ay, bx, by, wx, wy):  # pragma: no cover - compiled
     """Return W, 1 / W, u, v, whether the disk determines rho (else the screen-space filter), and rho, at a pixel."""
-    w = w_row + wx * dx
+    w = _ONE + wy * dy + wx * dx
     inverse_w = _ONE / w
-    u, v = (u_row + ax * dx) * inverse_w, (v_row + bx * dx) * inverse_w
-    rho2, rho3 = _TWO * (dx * dx + dy2), u * u + v * v
+    u, v = (ay * dy + ax * dx) * inverse_w, (by * dy + bx * dx) * inverse_w
+    rho2, rho3 = _TWO * (dx * dx + dy * dy), u * u + v * v
     on_disk = (w > dx - dx) & (rho3 <= rho2)
     return w, inverse_w, u, v, on_disk, rho3 if on_disk else rho2
-
-
-@numba.njit(cache=True, inline="always")
-def tile_pixels(tile, tiles_x, image):  # pragma: no cover - compiled
-    """Return the bounds x0, y0, x1, y1 of a tile in the image, and the coordinates (16,) of its columns and rows."""
-    x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    xs, ys = np.empty(TILE, image.dtype), np.empty(TILE, image.dtype)
-    for j in range(TILE):
-        xs[j], ys[j] = x0 + j, y0 + j
-    return x0, y0, min(x0 + TILE, image.shape[1]), min(y0 + TILE, image.shape[0]), xs, ys
 
 
 @numba.njit(cache=True, nogil=True)
@@ -102,70 +107,85 @@ def blend(
 def _blend_tile(
     tile, splats, boxes, tile_start, entries, tiles_x, scalars, weights, features, contributions
 ):  # pragma: no cover - compiled
-    """Blend one tile; the inner loop runs over a row of 16 pixels without branches, so that it is vectorized."""
+    """Blend one tile; the inner loop runs over a patch of 16 pixels without branches, so that it is vectorized.
+
+    Planes are in one array, so that the compiler knows that they do not overlap.
+    """
     alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
     zero = alpha_max - alpha_max
     with_weights = weights.shape[0] > 0
-    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, features)
-    image = np.zeros((N_FEATURES, TILE, TILE), features.dtype)
-    light = np.ones((TILE, TILE), features.dtype)
-    factors = np.zeros((TILE, TILE), features.dtype)
+    tx, ty, x_end, y_end = tile_bounds(tile, tiles_x, features)
+    xs, ys = lane_offsets(features.dtype)
+    finished = np.zeros(PATCHES * PATCHES, np.bool_)
+    image = np.zeros((N_FEATURES + 2, PATCHES * PATCHES, LANES), features.dtype)
+    factors = np.zeros((PATCHES * PATCHES, LANES), features.dtype)
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            i, j = place_in_tile(x - tx, y - ty)
+            image[LIGHT, i, j] = 1
+            if with_weights:
+                factors[i, j] = weights[y, x]
     if with_weights:
         contributions[tile_start[tile] : tile_start[tile + 1]] = 0
-        for y in range(ty, y_end):
-            for x in range(tx, x_end):
-                factors[y - ty, x - tx] = weights[y, x]
-    sums = np.zeros(TILE, features.dtype)
     for e in range(tile_start[tile], tile_start[tile + 1]):
-        if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
+        rank = e - tile_start[tile]
+        if rank % _CHECK_EVERY == _CHECK_EVERY - 1 and mark_finished(image[LIGHT], stop, finished):
             break
         s = splats[entries[e]]
         box = boxes[entries[e]]
         xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
-        ax, bx, wx, reach2, opacity = s[AX], s[BX], s[WX], s[REACH2], s[OPACITY]
+        ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
+        opacity, reach2 = s[OPACITY], s[REACH2]
         red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
         inverse_zc = _ONE / zc
+        total = zero
+        first_column, end_column, first_row, end_row = patches_of(box, tx, ty, x_end, y_end)
+        for row in range(first_row, end_row):
+            for column in range(first_column, end_column):
+                i = np.uint64(row * PATCHES + column)
+                left, top = np.float32(tx + column * PATCH) - xc, np.float32(ty + row * PATCH) - yc
+                if finished[i] or not may_reach(left, top, ax, ay, bx, by, wx, wy, reach2):
+                    continue
+                for j in range(LANES):
+                    t = image[LIGHT, i, j]
+                    dx, dy = left + xs[j], top + ys[j]
+                    w, _, _, _, on_disk, rho = splat_at(dx, dy, ax, ay, bx, by, wx, wy)
+                    w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                    w = w if on_disk else w_flat
+                    inverse_z, z = w * inverse_zc, zc / w
+                    alpha = min(opacity * _falloff(rho), alpha_max)
+                    alpha = alpha if (rho <= reach2) & (t >= stop) else zero
+                    weight = alpha * t
+                    first = inverse_z if (t == _ONE) else image[F_FIRST, i, j]
+                    m = reference * (first - inverse_z)
+                    before, m1, m2 = image[F_ALPHA, i, j], image[F_MOMENT1, i, j], image[F_MOMENT2, i, j]
+                    after = t * (_ONE - alpha)
+                    median = image[F_MEDIAN, i, j]
+                    image[0, i, j] += weight * red
+                    image[1, i, j] += weight * green
+                    image[2, i, j] += weight * blue
+                    image[F_DEPTH, i, j] += weight * z
+                    image[F_NORMAL, i, j] += weight * nx
+                    image[F_NORMAL + 1, i, j] += weight * ny
+                    image[F_NORMAL + 2, i, j] += weight * nz
+                    image[F_FIRST, i, j] = first
+                    image[F_DISTORTION, i, j] += weight * (m * m * before + m2 - _TWO * m * m1)
+                    image[F_ALPHA, i, j] = before + weight
+                    image[F_MOMENT1, i, j] = m1 + weight * m
+                    image[F_MOMENT2, i, j] = m2 + weight * m * m
+                    image[F_MEDIAN, i, j] = z if (t > _HALF) & (after <= _HALF) else median
+                    image[LIGHT, i, j] = after
+                    image[WEIGHT, i, j] = weight
+                if with_weights:
+                    for j in range(LANES):
+                        total += image[WEIGHT, i, j] * factors[i, j]
         if with_weights:
-            sums[:] = 0
-        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
-            dy = ys[i] - yc
-            u_row, v_row, w_row, dy2 = s[AY] * dy, s[BY] * dy, _ONE + s[WY] * dy, dy * dy
-            for j in range(TILE):
-                t = light[i, j]
-                dx = xs[j] - xc
-                w, _, _, _, on_disk, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
-                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
-                w = w if on_disk else w_flat
-                inverse_z, z = w * inverse_zc, zc / w
-                alpha = min(opacity * _falloff(rho), alpha_max)
-                alpha = alpha if (rho <= reach2) & (t >= stop) else zero
-                weight = alpha * t
-                first = inverse_z if (t == _ONE) else image[F_FIRST, i, j]
-                m = reference * (first - inverse_z)
-                before, m1, m2 = image[F_ALPHA, i, j], image[F_MOMENT1, i, j], image[F_MOMENT2, i, j]
-                after = t * (_ONE - alpha)
-                median = image[F_MEDIAN, i, j]
-                image[0, i, j] += weight * red
-                image[1, i, j] += weight * green
-                image[2, i, j] += weight * blue
-                image[F_DEPTH, i, j] += weight * z
-                image[F_NORMAL, i, j] += weight * nx
-                image[F_NORMAL + 1, i, j] += weight * ny
-                image[F_NORMAL + 2, i, j] += weight * nz
-                image[F_FIRST, i, j] = first
-                image[F_DISTORTION, i, j] += weight * (m * m * before + m2 - _TWO * m * m1)
-                image[F_ALPHA, i, j] = before + weight
-                image[F_MOMENT1, i, j] = m1 + weight * m
-                image[F_MOMENT2, i, j] = m2 + weight * m * m
-                image[F_MEDIAN, i, j] = z if (t > _HALF) & (after <= _HALF) else median
-                light[i, j] = after
-                sums[j] += weight * factors[i, j]
-        if with_weights:
-            contributions[e] = sums.sum()
+            contributions[e] = total
     for y in range(ty, y_end):
         for x in range(tx, x_end):
+            i, j = place_in_tile(x - tx, y - ty)
             for c in range(N_FEATURES):
-                features[y, x, c] = image[c, y - ty, x - tx]
+                features[y, x, c] = image[c, i, j]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -195,15 +215,18 @@ def _blend_tile_backward(
     """Differentiate one tile. One function despite its length: it recomputes the forward values that it needs."""
     alpha_max, stop, reference = scalars[0], scalars[1], scalars[2]
     zero = alpha_max - alpha_max
-    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, features)
-    light = np.ones((TILE, TILE), features.dtype)
+    tx, ty, x_end, y_end = tile_bounds(tile, tiles_x, features)
+    xs, ys = lane_offsets(features.dtype)
+    finished = np.zeros(PATCHES * PATCHES, np.bool_)
     # Planes: gradients 0..8, error 9, sum over splats not passed yet 10, opacity 11, moments 12 and 13, first inverse
-    # depth 14.
-    given = np.zeros((15, TILE, TILE), features.dtype)
-    lanes = np.empty((N_SPLAT_GRADIENTS, TILE), features.dtype)
+    # depth 14, transmittance 15.
+    given = np.zeros((16, PATCHES * PATCHES, LANES), features.dtype)
+    lanes = np.empty((N_SPLAT_GRADIENTS, LANES), features.dtype)
     for y in range(ty, y_end):
         for x in range(tx, x_end):
-            f, g, i, j = features[y, x], image_gradients[y, x], y - ty, x - tx
+            f, g = features[y, x], image_gradients[y, x]
+            i, j = place_in_tile(x - tx, y - ty)
+            given[15, i, j] = 1
             total = _TWO * g[8] * f[F_DISTORTION]
             for c in range(8):
                 total += g[c] * f[c]
@@ -214,8 +237,8 @@ def _blend_tile_backward(
     done = False
     for e in range(tile_start[tile], tile_start[tile + 1]):
         out = entry_gradients[e]
-        if (e - tile_start[tile]) % 32 == 31:
-            done = done or light[: y_end - ty, : x_end - tx].max() < stop
+        if (e - tile_start[tile]) % _CHECK_EVERY == _CHECK_EVERY - 1:
+            done = done or mark_finished(given[15], stop, finished)
         if done:
             out[:] = 0
             continue
@@ -227,66 +250,70 @@ def _blend_tile_backward(
         red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
         inverse_zc = _ONE / zc
         lanes[:] = 0
-        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
-            dy = ys[i] - yc
-            u_row, v_row, w_row, dy2 = ay * dy, by * dy, _ONE + wy * dy, dy * dy
-            for j in range(TILE):
-                t = light[i, j]
-                dx = xs[j] - xc
-                w, inverse_w, u, v, on_disk, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
-                w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
-                moves = on_disk | (w == w_flat)
-                w = w if on_disk else w_flat
-                inverse_w = _ONE / w
-                inverse_z, z = w * inverse_zc, zc * inverse_w
-                falloff = _falloff(rho)
-                inside = (rho <= reach2) & (t >= stop)
-                falloff = falloff if inside else zero
-                full = opacity * falloff
-                alpha = min(full, alpha_max)
-                weight = alpha * t
-                after = t * (_ONE - alpha)
-                light[i, j] = after
-                g_d, g_x = given[3, i, j], given[8, i, j]
-                g_r, g_g, g_b = given[0, i, j], given[1, i, j], given[2, i, j]
-                g_nx, g_ny, g_nz = given[4, i, j], given[5, i, j], given[6, i, j]
-                m = reference * (given[14, i, j] - inverse_z)
-                spread = m * given[11, i, j] - given[12, i, j]
-                q = (
-                    g_r * red + g_g * green + g_b * blue + g_d * z + g_nx * nx + g_ny * ny + g_nz * nz
-                    + given[7, i, j] + g_x * (m * spread + given[13, i, j] - m * given[12, i, j])
-                )  # fmt: skip
-                rest = given[10, i, j] - weight * q
-                given[10, i, j] = rest
-                d_z = weight * (g_d + _TWO * g_x * spread * reference * inverse_z * inverse_z)
-                d_alpha = t * q - rest / (_ONE - alpha)
-                d_alpha = d_alpha if inside & (full <= alpha_max) else zero
-                d_rho = -_HALF * d_alpha * alpha
-                disk_rho = d_rho if on_disk else zero
-                flat_rho = zero if on_disk else d_rho
-                d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
-                d_w = -(d_u * u + d_v * v) - d_z * z * inverse_w
-                d_w = d_w if moves else zero
-                lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
-                lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
-                lanes[ZC, j] += d_z * inverse_w
-                lanes[AX, j] += d_u * dx
-                lanes[AY, j] += d_u * dy
-                lanes[BX, j] += d_v * dx
-                lanes[BY, j] += d_v * dy
-                lanes[WX, j] += d_w * dx
-                lanes[WY, j] += d_w * dy
-                lanes[OPACITY, j] += d_alpha * falloff
-                lanes[10, j] += weight * g_r
-                lanes[11, j] += weight * g_g
-                lanes[12, j] += weight * g_b
-                lanes[13, j] += weight * g_nx
-                lanes[14, j] += weight * g_ny
-                lanes[15, j] += weight * g_nz
-                lanes[16, j] += weight
-                lanes[17, j] += weight * given[9, i, j]
+        first_column, end_column, first_row, end_row = patches_of(box, tx, ty, x_end, y_end)
+        for row in range(first_row, end_row):
+            for column in range(first_column, end_column):
+                i = np.uint64(row * PATCHES + column)
+                left, top = np.float32(tx + column * PATCH) - xc, np.float32(ty + row * PATCH) - yc
+                if finished[i] or not may_reach(left, top, ax, ay, bx, by, wx, wy, reach2):
+                    continue
+                for j in range(LANES):
+                    t = given[15, i, j]
+                    dx, dy = left + xs[j], top + ys[j]
+                    w, inverse_w, u, v, on_disk, rho = splat_at(dx, dy, ax, ay, bx, by, wx, wy)
+                    w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                    moves = on_disk | (w == w_flat)
+                    w = w if on_disk else w_flat
+                    inverse_w = _ONE / w
+                    inverse_z, z = w * inverse_zc, zc * inverse_w
+                    falloff = _falloff(rho)
+                    inside = (rho <= reach2) & (t >= stop)
+                    falloff = falloff if inside else zero
+                    full = opacity * falloff
+                    alpha = min(full, alpha_max)
+                    weight = alpha * t
+                    after = t * (_ONE - alpha)
+                    given[15, i, j] = after
+                    g_d, g_x = given[3, i, j], given[8, i, j]
+                    g_r, g_g, g_b = given[0, i, j], given[1, i, j], given[2, i, j]
+                    g_nx, g_ny, g_nz = given[4, i, j], given[5, i, j], given[6, i, j]
+                    m = reference * (given[14, i, j] - inverse_z)
+                    spread = m * given[11, i, j] - given[12, i, j]
+                    q = (
+                        g_r * red + g_g * green + g_b * blue + g_d * z + g_nx * nx + g_ny * ny + g_nz * nz
+                        + given[7, i, j] + g_x * (m * spread + given[13, i, j] - m * given[12, i, j])
+                    )  # fmt: skip
+                    rest = given[10, i, j] - weight * q
+                    given[10, i, j] = rest
+                    d_z = weight * (g_d + _TWO * g_x * spread * reference * inverse_z * inverse_z)
+                    d_alpha = t * q - rest / (_ONE - alpha)
+                    d_alpha = d_alpha if inside & (full <= alpha_max) else zero
+                    d_rho = -_HALF * d_alpha * alpha
+                    disk_rho = d_rho if on_disk else zero
+                    flat_rho = zero if on_disk else d_rho
+                    d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
+                    d_w = -(d_u * u + d_v * v) - d_z * z * inverse_w
+                    d_w = d_w if moves else zero
+                    lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
+                    lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
+                    lanes[ZC, j] += d_z * inverse_w
+                    lanes[AX, j] += d_u * dx
+                    lanes[AY, j] += d_u * dy
+                    lanes[BX, j] += d_v * dx
+                    lanes[BY, j] += d_v * dy
+                    lanes[WX, j] += d_w * dx
+                    lanes[WY, j] += d_w * dy
+                    lanes[OPACITY, j] += d_alpha * falloff
+                    lanes[10, j] += weight * g_r
+                    lanes[11, j] += weight * g_g
+                    lanes[12, j] += weight * g_b
+                    lanes[13, j] += weight * g_nx
+                    lanes[14, j] += weight * g_ny
+                    lanes[15, j] += weight * g_nz
+                    lanes[16, j] += weight
+                    lanes[17, j] += weight * given[9, i, j]
         for c in range(N_SPLAT_GRADIENTS):
             total = zero
-            for j in range(TILE):
+            for j in range(LANES):
                 total += lanes[c, j]
             out[c] = total

@@ -22,7 +22,6 @@ from reconstruction.gaussians.blend_kernels import (
     _TWO,
     _falloff,
     splat_at,
-    tile_pixels,
 )
 from reconstruction.gaussians.kernels import (
     AX,
@@ -31,17 +30,29 @@ from reconstruction.gaussians.kernels import (
     BY,
     OPACITY,
     REACH2,
-    TILE,
     WX,
     WY,
     XC,
     YC,
     ZC,
 )
+from reconstruction.gaussians.patches import (
+    LANES,
+    PATCH,
+    PATCHES,
+    lane_offsets,
+    mark_finished,
+    may_reach,
+    patches_of,
+    place_in_tile,
+    tile_bounds,
+)
 
 # Planes of the blended image: sums over the target's splats of alpha T, of alpha T worth, and of alpha T depth.
 SEEN, WORTH, DEPTH = 0, 1, 2
 N_PLANES = 3
+_LIGHT, _WEIGHT = N_PLANES, N_PLANES + 1  # planes beside them: transmittance, weight of the last splat
+_CHECK_EVERY = 16  # splats, after which finished patches are looked for
 N_GRADIENTS = 9  # derivatives of a splat: by XC .. WY
 
 
@@ -109,43 +120,56 @@ def _blend_tile(
     """Blend one tile; the inner loop has no branches, so that it is vectorized."""
     alpha_max, stop = scalars[0], scalars[1]
     zero = alpha_max - alpha_max
-    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, image)
-    sums = np.zeros((N_PLANES, TILE, TILE), image.dtype)
-    light = np.ones((TILE, TILE), image.dtype)
-    row_sums = np.zeros(TILE, image.dtype)
+    tx, ty, x_end, y_end = tile_bounds(tile, tiles_x, image)
+    xs, ys = lane_offsets(image.dtype)
+    finished = np.zeros(PATCHES * PATCHES, np.bool_)
+    sums = np.zeros((N_PLANES + 2, PATCHES * PATCHES, LANES), image.dtype)
+    for y in range(ty, y_end):
+        for x in range(tx, x_end):
+            i, j = place_in_tile(x - tx, y - ty)
+            sums[_LIGHT, i, j] = 1
     contributions[tile_start[tile] : tile_start[tile + 1]] = 0
     for e in range(tile_start[tile], tile_end[tile]):
-        if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
+        rank = e - tile_start[tile]
+        if rank % _CHECK_EVERY == _CHECK_EVERY - 1 and mark_finished(sums[_LIGHT], stop, finished):
             break
         s = splats[entries[e]]
         box = boxes[entries[e]]
         mine, value = own[entries[e]], worth[entries[e]]
-        row_sums[:] = 0
+        total = zero
         xc, yc, zc = s[XC] - _HALF, s[YC] - _HALF, s[ZC]
-        ax, bx, wx, reach2 = s[AX], s[BX], s[WX], s[REACH2]
+        ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
+        reach2 = s[REACH2]
         edge = _falloff(reach2)
         opacity = s[OPACITY] / (_ONE - edge)
-        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
-            dy = ys[i] - yc
-            u_row, v_row, w_row, dy2 = s[AY] * dy, s[BY] * dy, _ONE + s[WY] * dy, dy * dy
-            for j in range(TILE):
-                t = light[i, j]
-                dx = xs[j] - xc
-                w, _, _, _, _, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
-                w = min(max(w, _FLAT_LOW), _FLAT_HIGH)
-                alpha = min(opacity * (_falloff(rho) - edge), alpha_max)
-                alpha = alpha if (rho <= reach2) & (t >= stop) else zero
-                weight = alpha * t
-                sums[SEEN, i, j] += weight * mine
-                sums[WORTH, i, j] += weight * value
-                sums[DEPTH, i, j] += weight * mine * (zc / w)
-                light[i, j] = t - weight
-                row_sums[j] += weight
-        contributions[e, 0] = row_sums.sum()
+        first_column, end_column, first_row, end_row = patches_of(box, tx, ty, x_end, y_end)
+        for row in range(first_row, end_row):
+            for column in range(first_column, end_column):
+                i = np.uint64(row * PATCHES + column)
+                left, top = np.float32(tx + column * PATCH) - xc, np.float32(ty + row * PATCH) - yc
+                if finished[i] or not may_reach(left, top, ax, ay, bx, by, wx, wy, reach2):
+                    continue
+                for j in range(LANES):
+                    t = sums[_LIGHT, i, j]
+                    dx, dy = left + xs[j], top + ys[j]
+                    w, _, _, _, _, rho = splat_at(dx, dy, ax, ay, bx, by, wx, wy)
+                    w = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                    alpha = min(opacity * (_falloff(rho) - edge), alpha_max)
+                    alpha = alpha if (rho <= reach2) & (t >= stop) else zero
+                    weight = alpha * t
+                    sums[SEEN, i, j] += weight * mine
+                    sums[WORTH, i, j] += weight * value
+                    sums[DEPTH, i, j] += weight * mine * (zc / w)
+                    sums[_LIGHT, i, j] = t - weight
+                    sums[_WEIGHT, i, j] = weight
+                for j in range(LANES):
+                    total += sums[_WEIGHT, i, j]
+        contributions[e, 0] = total
     for y in range(ty, y_end):
         for x in range(tx, x_end):
+            i, j = place_in_tile(x - tx, y - ty)
             for c in range(N_PLANES):
-                image[y, x, c] = sums[c, y - ty, x - tx]
+                image[y, x, c] = sums[c, i, j]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -173,19 +197,23 @@ def _blend_tile_backward(
     """Differentiate one tile. One function despite its length: it recomputes the forward values that it needs."""
     alpha_max, stop = scalars[0], scalars[1]
     zero = alpha_max - alpha_max
-    tx, ty, x_end, y_end, xs, ys = tile_pixels(tile, tiles_x, image)
-    light = np.ones((TILE, TILE), image.dtype)
-    # Planes: image gradients, then the sum over splats not passed yet.
-    given = np.zeros((N_PLANES + 1, TILE, TILE), image.dtype)
-    lanes = np.empty((N_GRADIENTS, TILE), image.dtype)
+    tx, ty, x_end, y_end = tile_bounds(tile, tiles_x, image)
+    xs, ys = lane_offsets(image.dtype)
+    finished = np.zeros(PATCHES * PATCHES, np.bool_)
+    # Planes: image gradients, then the sum over splats not passed yet, then transmittance.
+    given = np.zeros((N_PLANES + 2, PATCHES * PATCHES, LANES), image.dtype)
+    lanes = np.empty((N_GRADIENTS, LANES), image.dtype)
     for y in range(ty, y_end):
         for x in range(tx, x_end):
+            i, j = place_in_tile(x - tx, y - ty)
+            given[N_PLANES + 1, i, j] = 1
             for c in range(N_PLANES):
-                given[c, y - ty, x - tx] = image_gradients[y, x, c]
-                given[N_PLANES, y - ty, x - tx] += image_gradients[y, x, c] * image[y, x, c]
+                given[c, i, j] = image_gradients[y, x, c]
+                given[N_PLANES, i, j] += image_gradients[y, x, c] * image[y, x, c]
     entry_gradients[tile_start[tile] : tile_start[tile + 1]] = 0
     for e in range(tile_start[tile], tile_end[tile]):
-        if (e - tile_start[tile]) % 32 == 31 and light[: y_end - ty, : x_end - tx].max() < stop:
+        rank = e - tile_start[tile]
+        if rank % _CHECK_EVERY == _CHECK_EVERY - 1 and mark_finished(given[N_PLANES + 1], stop, finished):
             break
         if contributions[e, 0] == zero:
             continue
@@ -198,48 +226,52 @@ def _blend_tile_backward(
         edge = _falloff(reach2)
         opacity = s[OPACITY] / (_ONE - edge)
         lanes[:] = 0
-        for i in range(max(box[1], ty) - ty, min(box[3], y_end) - ty):
-            dy = ys[i] - yc
-            u_row, v_row, w_row, dy2 = ay * dy, by * dy, _ONE + wy * dy, dy * dy
-            for j in range(TILE):
-                t = light[i, j]
-                dx = xs[j] - xc
-                w, inverse_w, u, v, on_disk, rho = splat_at(dx, dy2, u_row, v_row, w_row, ax, bx, wx)
-                w_near = min(max(w, _FLAT_LOW), _FLAT_HIGH)
-                inverse_near = _ONE / w_near
-                z = zc * inverse_near
-                inside = (rho <= reach2) & (t >= stop)
-                slope = opacity * _falloff(rho)
-                full = slope - opacity * edge
-                full = full if inside else zero
-                alpha = min(full, alpha_max)
-                weight = alpha * t
-                light[i, j] = t - weight
-                g_z = given[DEPTH, i, j] * mine
-                q = given[SEEN, i, j] * mine + given[WORTH, i, j] * value + g_z * z
-                rest = given[N_PLANES, i, j] - weight * q
-                given[N_PLANES, i, j] = rest
-                d_z = weight * g_z
-                d_alpha = t * q - rest / (_ONE - alpha)
-                d_alpha = d_alpha if inside & (full <= alpha_max) else zero
-                d_rho = -_HALF * d_alpha * slope
-                disk_rho = d_rho if on_disk else zero
-                flat_rho = zero if on_disk else d_rho
-                d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
-                d_w = -d_z * z * inverse_near
-                d_w = d_w if w == w_near else zero
-                d_w -= d_u * u + d_v * v
-                lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
-                lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
-                lanes[ZC, j] += d_z * inverse_near
-                lanes[AX, j] += d_u * dx
-                lanes[AY, j] += d_u * dy
-                lanes[BX, j] += d_v * dx
-                lanes[BY, j] += d_v * dy
-                lanes[WX, j] += d_w * dx
-                lanes[WY, j] += d_w * dy
+        first_column, end_column, first_row, end_row = patches_of(box, tx, ty, x_end, y_end)
+        for row in range(first_row, end_row):
+            for column in range(first_column, end_column):
+                i = np.uint64(row * PATCHES + column)
+                left, top = np.float32(tx + column * PATCH) - xc, np.float32(ty + row * PATCH) - yc
+                if finished[i] or not may_reach(left, top, ax, ay, bx, by, wx, wy, reach2):
+                    continue
+                for j in range(LANES):
+                    t = given[N_PLANES + 1, i, j]
+                    dx, dy = left + xs[j], top + ys[j]
+                    w, inverse_w, u, v, on_disk, rho = splat_at(dx, dy, ax, ay, bx, by, wx, wy)
+                    w_near = min(max(w, _FLAT_LOW), _FLAT_HIGH)
+                    inverse_near = _ONE / w_near
+                    z = zc * inverse_near
+                    inside = (rho <= reach2) & (t >= stop)
+                    slope = opacity * _falloff(rho)
+                    full = slope - opacity * edge
+                    full = full if inside else zero
+                    alpha = min(full, alpha_max)
+                    weight = alpha * t
+                    given[N_PLANES + 1, i, j] = t - weight
+                    g_z = given[DEPTH, i, j] * mine
+                    q = given[SEEN, i, j] * mine + given[WORTH, i, j] * value + g_z * z
+                    rest = given[N_PLANES, i, j] - weight * q
+                    given[N_PLANES, i, j] = rest
+                    d_z = weight * g_z
+                    d_alpha = t * q - rest / (_ONE - alpha)
+                    d_alpha = d_alpha if inside & (full <= alpha_max) else zero
+                    d_rho = -_HALF * d_alpha * slope
+                    disk_rho = d_rho if on_disk else zero
+                    flat_rho = zero if on_disk else d_rho
+                    d_u, d_v = _TWO * u * disk_rho * inverse_w, _TWO * v * disk_rho * inverse_w
+                    d_w = -d_z * z * inverse_near
+                    d_w = d_w if w == w_near else zero
+                    d_w -= d_u * u + d_v * v
+                    lanes[XC, j] -= d_u * ax + d_v * bx + d_w * wx + _TWO * _TWO * flat_rho * dx
+                    lanes[YC, j] -= d_u * ay + d_v * by + d_w * wy + _TWO * _TWO * flat_rho * dy
+                    lanes[ZC, j] += d_z * inverse_near
+                    lanes[AX, j] += d_u * dx
+                    lanes[AY, j] += d_u * dy
+                    lanes[BX, j] += d_v * dx
+                    lanes[BY, j] += d_v * dy
+                    lanes[WX, j] += d_w * dx
+                    lanes[WY, j] += d_w * dy
         for c in range(N_GRADIENTS):
             total = zero
-            for j in range(TILE):
+            for j in range(LANES):
                 total += lanes[c, j]
             entry_gradients[e, c] = total
