@@ -23,13 +23,21 @@ _DROP_MAPS, _DROP = 0.1, 0.2
 class _Convolution(nn.Conv2d):
     """A convolution padded as TensorFlow does: outputs cover the image evenly, odd padding comes last."""
 
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
+        # Without a stride the padding is even, and the convolution's own is faster.
+        super().__init__(
+            inputs, outputs, kernel, stride, padding=kernel // 2 if stride == 1 else 0, groups=groups
+        )
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         kernel, stride = self.kernel_size[0], self.stride[0]
-        padding = [0, 0, 0, 0]
-        for axis, size in enumerate((x.shape[-1], x.shape[-2])):
-            total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
-            padding[2 * axis : 2 * axis + 2] = total // 2, total - total // 2
-        return super().forward(functional.pad(x, padding))
+        if stride > 1:
+            padding = [0, 0, 0, 0]
+            for axis, size in enumerate((x.shape[-1], x.shape[-2])):
+                total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
+                padding[2 * axis : 2 * axis + 2] = total // 2, total - total // 2
+            x = functional.pad(x, padding)
+        return super().forward(x)
 
 
 class _Block(nn.Module):
@@ -39,13 +47,13 @@ class _Block(nn.Module):
         super().__init__()
         inner = inputs * expansion
         self.expand = _Convolution(inputs, inner, 1) if expansion > 1 else None
-        self.depthwise = _Convolution(inner, inner, kernel, stride, groups=inner)
+        self.depthwise = _Convolution(inner, inner, kernel, stride, inner)
         self.project = _Convolution(inner, outputs, 1)
         self.residual = stride == 1 and inputs == outputs
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = x if self.expand is None else functional.relu6(self.expand(x))
-        y = self.project(functional.relu6(self.depthwise(y)))
+        y = x if self.expand is None else functional.relu6(self.expand(x), inplace=True)
+        y = self.project(functional.relu6(self.depthwise(y), inplace=True))
         return x + y if self.residual else y
 
 
@@ -65,7 +73,7 @@ class Trunk(nn.Module):
 
     def forward(self, color: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Map color (b, 3, h, w), -1 to 1, to features (b, FINE, h / 8, w / 8) and (b, COARSE, h / 16, w / 16)."""
-        x, fine = functional.relu6(self.stem(color)), color
+        x, fine = functional.relu6(self.stem(color), inplace=True), color
         for block in self.blocks:
             x = block(x)
             if x.shape[1] == FINE:

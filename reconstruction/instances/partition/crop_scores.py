@@ -16,7 +16,7 @@ from registry.errors import EnvironmentMissing
 
 MOST = 1000  # proposals that are looked at, those the trees score highest; the others are never objects
 ALIKE = 0.9  # IoU of two proposals above which the likelier one is looked at for both
-_BATCH = 48  # crops; each batch is of one thread, so that results do not depend on the number of threads
+_BATCH = 16  # crops; each batch is of one thread, so that results do not depend on the number of threads
 _CLIP_LOGIT = 7.0  # of the trees
 _TINY = 1e-9
 
