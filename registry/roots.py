@@ -29,7 +29,7 @@ def default_registry_root() -> Path:
         EnvironmentMissing: The folder of an address cannot be made.
     """
     named = os.environ.get("SIMRECON_REGISTRY")
-    return registry_folder(named) if named else _home() / _FOLDER
+    return registry_folder(named) if named else home_folder() / _FOLDER
 
 
 def registry_folder(address: Path | str | None) -> Path:
@@ -53,7 +53,7 @@ def registry_folder(address: Path | str | None) -> Path:
         )
     address = address.rstrip("/")
     words = re.sub(r"[^a-z0-9]+", "-", address.split("://")[1].lower()).strip("-")[:40]
-    folder = _home() / _COPIES / f"{words}-{hashlib.sha256(address.encode()).hexdigest()[:8]}"
+    folder = home_folder() / _COPIES / f"{words}-{hashlib.sha256(address.encode()).hexdigest()[:8]}"
     if address_of(folder / _FOLDER) != address:
         try:
             write_whole(folder / _ADDRESS, address.encode())
@@ -68,7 +68,7 @@ def registry_folder(address: Path | str | None) -> Path:
 def address_of(root: Path) -> str | None:
     """Return the address that a folder is the copy of; None for a registry of its own."""
     root = root.absolute()
-    if root.name != _FOLDER or root.parent.parent != (_home() / _COPIES).absolute():
+    if root.name != _FOLDER or root.parent.parent != (home_folder() / _COPIES).absolute():
         return None
     try:
         return (root.parent / _ADDRESS).read_text(encoding="utf-8")
@@ -76,6 +76,7 @@ def address_of(root: Path) -> str | None:
         return None
 
 
-def _home() -> Path:
+def home_folder() -> Path:
+    """Return the folder of registries and caches: `$SIMRECON_HOME`, or `~/.simrecon`."""
     home = os.environ.get("SIMRECON_HOME")
     return Path(home).expanduser() if home else Path.home() / ".simrecon"

@@ -1,6 +1,7 @@
 """Rank the objects that a robot can pick up; types of targets and robot placements. NumPy and SciPy only."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from registry import SceneBundle, UsageError
 from registry.bundle import BundleObject
 from registry.geometry import transform_points
 from simrecon_envs.grasps import Grasp, find_grasps
+from simrecon_envs.kept_grasps import KeptGrasps
 from simrecon_envs.occupancy import ConvexSolid
 from simrecon_envs.robots import RobotTraits
 
@@ -111,6 +113,7 @@ def candidate_targets(
     """Return the movable objects with their grasps, best first; those with a problem come last."""
     scored: list[tuple[int, float, int, Target]] = []
     entries = {entry["id"]: entry for entry in bundle.scene["objects"]}
+    kept = KeptGrasps(bundle.revision, traits.hand)
     for item in bundle.objects:
         if item.id not in movable:
             continue
@@ -121,7 +124,10 @@ def candidate_targets(
             problems.append(f"weighs {item.mass_kg:.1f} kg")
         elif not problems:
             center_of_mass = transform_points(item.world_from_object, item.center_of_mass[None])[0]
-            grasps = find_grasps(solids, item.id, target.center, item.mass_kg, center_of_mass, traits.hand)
+            search = partial(
+                find_grasps, solids, item.id, target.center, item.mass_kg, center_of_mass, traits.hand
+            )
+            grasps = kept.of(item.id, search)
             if not grasps:
                 problems.append(_why_no_grasp(target, traits))
         if target.top_m - target.bottom_m < config.min_height_m:
@@ -133,6 +139,7 @@ def candidate_targets(
         score += 1.0 - float(entries[item.id]["provenance"].get("observed_fraction", 1.0))
         described = replace(target, problem="; ".join(problems), grasps=tuple(grasps))
         scored.append((len(problems), score, item.id, described))
+    kept.save()
     return [entry[-1] for entry in sorted(scored, key=lambda entry: entry[:3])]
 
 

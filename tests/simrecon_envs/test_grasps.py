@@ -1,11 +1,14 @@
 """Grasps across an object, at its neck and at its wall; none without clearance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
 from simrecon_envs.grasps import Grasp, find_grasps
 from simrecon_envs.hovering import most_room
+from simrecon_envs.kept_grasps import KeptGrasps
 from simrecon_envs.occupancy import ConvexSolid, convex_solid
 from simrecon_envs.robots import TRAITS
 
@@ -81,3 +84,39 @@ def test_a_closed_hand_turns_to_where_there_is_room_or_says_how_much_is_missing(
     assert hover.room_m == pytest.approx(0.05 - HAND.tip_below_m, abs=1e-6)
     shut = [*gate, *(_box(3, (0.4, 0.02, 0.3), (0, y, 0)) for y in (-0.06, 0.06))]
     assert most_room(shut, tip, HAND).room_m == pytest.approx(0.10 + HAND.palm_above_m - 0.3, abs=1e-6)
+
+
+def test_grasps_are_searched_once_a_machine(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("SIMRECON_HOME", str(tmp_path))
+    found = _grasps([_box(1, (0.16, 0.05, 0.10), (0.02, 0.01, 0))])
+    first = KeptGrasps("a" * 16, HAND)
+    first.of(1, lambda: found)
+    first.of(2, list)
+    first.save()
+
+    again = KeptGrasps("a" * 16, HAND)
+
+    kept = again.of(1, lambda: pytest.fail("searched again"))
+    assert [(*g.offset, g.yaw_rad, g.width_m, g.opening_m, g.cost) for g in kept] == [
+        (*g.offset, g.yaw_rad, g.width_m, g.opening_m, g.cost) for g in found
+    ]
+    assert again.of(2, lambda: pytest.fail("searched again")) == []
+    assert KeptGrasps("b" * 16, HAND).of(1, list) == []  # another scene
+    assert KeptGrasps("a" * 16, replace(HAND, opening_m=0.05)).of(1, list) == []  # another hand
+
+
+@pytest.mark.parametrize("content", ["", "[1]", '{"1": [[0, 0]]}', '{"1": 3}', "\x00"])
+def test_damaged_files_of_grasps_are_searched_anew(tmp_path, monkeypatch, content) -> None:
+    monkeypatch.setenv("SIMRECON_HOME", str(tmp_path))
+    first = KeptGrasps("a" * 16, HAND)
+    first.of(1, list)
+    first.save()
+    (file,) = (tmp_path / "cache" / "grasps").iterdir()
+    file.write_text(content)
+    found = _grasps([_box(1, (0.16, 0.05, 0.10), (0.02, 0.01, 0))])
+
+    kept = KeptGrasps("a" * 16, HAND)
+    kept.of(1, lambda: found)
+    kept.save()
+
+    assert len(KeptGrasps("a" * 16, HAND).of(1, list)) == len(found) > 0
