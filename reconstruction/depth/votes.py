@@ -16,7 +16,9 @@ SAME = 0.012
 """Relative difference up to which two inverse depths are one surface."""
 
 
-def voters(rho: np.ndarray, score: np.ndarray, doubt: np.ndarray, doubted_say: float, color: np.ndarray, reach: int):
+def voters(
+    rho: np.ndarray, score: np.ndarray, doubt: np.ndarray, doubted_say: float, color: np.ndarray, reach: int
+):
     """Return inverse depth, say and color of every pixel as voter, float32 (5, h + 2 reach, w + 2 reach).
 
     Args:
@@ -39,7 +41,7 @@ def make_votes(reach: int, stride: int, tone: float, most_tone: float, px: float
     """
     grid_x, grid_y = offsets(reach, stride)
     samples = len(grid_x)
-    by_tone = np.where(_LEVELS > most_tone, 0, np.exp(-0.5 * (_LEVELS / tone) ** 2)).astype(np.float32)
+    by_tone = np.where(most_tone < _LEVELS, 0, np.exp(-0.5 * (_LEVELS / tone) ** 2)).astype(np.float32)
     by_place = np.exp(-0.5 * (grid_x**2 + grid_y**2) / px**2).astype(np.float32)
 
     @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
