@@ -98,7 +98,8 @@ def candidate_shares(
         logits = logits[0, :, :h, :w]
         logits[:-1].masked_fill_(torch.from_numpy(~there), -1e4)
         logits[0] += math.log(_OWN_ODDS)
-        return logits.softmax(0)[:-1].numpy(), affinity[0, :, :h, :w].sigmoid().numpy()
+        share = logits.permute(1, 2, 0).softmax(2).permute(2, 0, 1)  # as they lie in memory
+        return share[:-1].numpy(), affinity[0, :, :h, :w].contiguous().sigmoid().numpy()
 
 
 def pack_affinities(affinity: np.ndarray) -> np.ndarray:

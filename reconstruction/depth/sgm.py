@@ -74,3 +74,31 @@ def winner(total, rhos, out):  # pragma: no cover - compiled
                 if bend > 0:
                     shift = min(0.5, max(-0.5, 0.5 * (a - c) / bend))
             out[y, x] = rhos[at] + shift * step
+
+
+@numba.njit(cache=True, nogil=True)
+def least_in_bins(cost, first, out):  # pragma: no cover - compiled
+    """Write the least of costs (h, w, planes) from plane first[b] to before first[b + 1] to out (h, w, bins)."""
+    h, w, bins = out.shape
+    for y in range(h):
+        for x in range(w):
+            for b in range(bins):
+                least = cost[y, x, first[b]]
+                for d in range(first[b] + 1, first[b + 1]):
+                    least = min(least, cost[y, x, d])
+                out[y, x, b] = least
+
+
+@numba.njit(cache=True, nogil=True)
+def score_bins(total, hopeless, out):  # pragma: no cover - compiled
+    """Write 255 for the cheapest bin of `total` uint16 (h, w, bins), less for others, 0 from `hopeless` behind it."""
+    h, w, bins = out.shape
+    one = np.float32(1.0)
+    for y in range(h):
+        for x in range(w):
+            least = total[y, x, 0]
+            for b in range(bins):
+                least = min(least, total[y, x, b])
+            for b in range(bins):
+                behind = np.float32(np.uint16(total[y, x, b] - least)) / hopeless
+                out[y, x, b] = np.uint8(np.int32(np.float32(255.0) * (one - min(behind, one))))
