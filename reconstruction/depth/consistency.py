@@ -226,12 +226,12 @@ def count_witnesses(
 def remove_speckles(depth: np.ndarray, min_px: int, jump: float) -> np.ndarray:
     """Return a mask (h, w) of pixels in connected pieces of at least `min_px`, cut where depth jumps by `jump`."""
     label = np.zeros(depth.shape, np.int32)
-    sizes = _label_pieces(depth, jump, label)
+    sizes = label_pieces(depth, jump, label)
     return (depth > 0) & (sizes[label] >= min_px)
 
 
 @numba.njit(cache=True, nogil=True)
-def _label_pieces(depth, jump, label):  # pragma: no cover - compiled
+def label_pieces(depth, jump, label):  # pragma: no cover - compiled
     """Flood-fill pieces of continuous depth; return the size of each label (label 0 = no depth)."""
     h, w = depth.shape
     stack = np.empty(h * w, np.int64)
