@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from reconstruction.depth.vector_memory import load_only_read, store_apart
-from reconstruction.depth.windows import FAST, offsets
+from reconstruction.depth.windows import FAST, fill_vectors, offsets
 
 _LEVELS = np.arange(256)
 _LEAST_SAY = np.float32(0.15)  # of pixels whose window correlates with nothing
@@ -30,8 +30,10 @@ def voters(
         reach: Pixels of the margin.
     """
     say = np.maximum(_LEAST_SAY, score) * np.where(doubt, np.float32(doubted_say), np.float32(1)) * (rho > 0)
-    margin = ((0, 0), (reach, reach), (reach, reach))
-    return np.pad(np.stack([rho, say, *np.moveaxis(color, 2, 0)]).astype(np.float32), margin)
+    out = np.zeros((5, rho.shape[0] + 2 * reach, rho.shape[1] + 2 * reach), np.float32)
+    inside = out[:, reach:-reach, reach:-reach]
+    inside[0], inside[1], inside[2:] = rho, say, np.moveaxis(color, 2, 0)
+    return out
 
 
 def make_votes(reach: int, stride: int, tone: float, most_tone: float, px: float):
@@ -40,9 +42,10 @@ def make_votes(reach: int, stride: int, tone: float, most_tone: float, px: float
     A vote counts less the more its color differs (`tone` levels; none from `most_tone` on) and with distance (`px`).
     """
     grid_x, grid_y = offsets(reach, stride)
-    samples = len(grid_x)
     by_tone = np.where(most_tone < _LEVELS, 0, np.exp(-0.5 * (_LEVELS / tone) ** 2)).astype(np.float32)
     by_place = np.exp(-0.5 * (grid_x**2 + grid_y**2) / px**2).astype(np.float32)
+    grid_x, grid_y, by_place = (fill_vectors(values) for values in (grid_x, grid_y, by_place))
+    samples = len(by_place)
 
     @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
     def votes(maps, width, y, x, candidates, count, out):  # pragma: no cover - compiled
