@@ -74,7 +74,11 @@ class Mending(nn.Module):
         Args:
             features: (b, FEATURES, h, w) of `mending.mending_features`; height and width are even.
         """
-        out = functional.pixel_shuffle(self.leave(self.unet(functional.pixel_unshuffle(features, 2))), 2)
+        return self.scores(self.unet(functional.pixel_unshuffle(features, 2)))
+
+    def scores(self, found: torch.Tensor):
+        """Return what `forward` does, from the features (b, widths[0], h / 2, w / 2) of the last convolution."""
+        out = functional.pixel_shuffle(self.leave(found), 2)
         return out[:, : self.candidates + 1], out[:, self.candidates + 1 :]
 
 
