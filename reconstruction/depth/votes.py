@@ -68,7 +68,7 @@ def make_votes(reach: int, stride: int, tone: float, most_tone: float, px: float
         total = np.float32(1e-6)
         for n in range(samples):
             at = np.uint32(here + np.int32(dy[n]) * np.int32(width) + np.int32(dx[n]))
-            d = max(abs(load_only_read(red, at) - r), abs(load_only_read(green, at) - g))
+            d = max(abs(load_only_read(red, at) - r), abs(load_only_read(green, at) - g))  # pyright: ignore[reportCallIssue]
             d = max(d, abs(load_only_read(blue, at) - b))
             q = load_only_read(tones, np.uint32(np.int32(d))) * place[n] * load_only_read(say, at)
             total += q
