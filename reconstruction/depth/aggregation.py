@@ -89,7 +89,7 @@ def aggregate_costs(
     picture = color.astype(np.float32) / 255
     spare = ((0, h % 2), (0, w % 2), (0, 0))
     tensors = [
-        torch.from_numpy(np.pad(array, spare, mode="edge")).permute(2, 0, 1)[None]
+        torch.from_numpy(np.pad(array, spare, mode="edge")[None]).permute(0, 3, 1, 2)
         for array in (correlation, smoothed, picture)
     ]
     with torch.inference_mode():
