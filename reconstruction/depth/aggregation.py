@@ -15,8 +15,11 @@ _HOPELESS = 508.0  # bins whose aggregated cost exceeds the winner's by this muc
 
 def bin_costs(cost: np.ndarray) -> np.ndarray:
     """Return the least cost inside each bin, uint8 (h, w, BINS), of costs (h, w, planes) of at least as many planes."""
-    first = np.arange(BINS) * cost.shape[2] // BINS
-    return np.minimum.reduceat(cost, first, axis=2)
+    from reconstruction.depth.sgm import least_in_bins
+
+    out = np.empty((*cost.shape[:2], BINS), np.uint8)
+    least_in_bins(cost, np.arange(BINS + 1) * cost.shape[2] // BINS, out)
+    return out
 
 
 def smoothed_scores(binned: np.ndarray, gray: np.ndarray, small: float, large: float) -> np.ndarray:
@@ -28,13 +31,14 @@ def smoothed_scores(binned: np.ndarray, gray: np.ndarray, small: float, large: f
         small: penalty of a change by one bin, in units of correlation.
         large: penalty of a jump, in units of correlation.
     """
-    from reconstruction.depth.sgm import aggregate
+    from reconstruction.depth.sgm import aggregate, score_bins
 
     p1, p2 = np.int32(max(1, round(127 * small))), np.int32(round(127 * large))
     total = np.zeros(binned.shape, np.uint16)
     aggregate(np.ascontiguousarray(binned), gray, p1, p2, p1 + np.int32(1), 8.0, total)
-    behind = (total - total.min(axis=2, keepdims=True)).astype(np.float32)
-    return (255 * (1 - np.minimum(behind / _HOPELESS, 1))).astype(np.uint8)
+    out = np.empty(binned.shape, np.uint8)
+    score_bins(total, np.float32(_HOPELESS), out)
+    return out
 
 
 def line_of_places(far: float, near: float, planes: int) -> tuple[float, float]:
@@ -85,12 +89,13 @@ def aggregate_costs(
     picture = color.astype(np.float32) / 255
     spare = ((0, h % 2), (0, w % 2), (0, 0))
     tensors = [
-        torch.from_numpy(np.pad(array, spare, mode="edge")).permute(2, 0, 1)[None]
+        torch.from_numpy(np.pad(array, spare, mode="edge")[None]).permute(0, 3, 1, 2)
         for array in (correlation, smoothed, picture)
     ]
     with torch.inference_mode():
         logits, offset, _ = load_network("aggregation", weights)(*tensors)
-        place, surety = place_of(logits.softmax(1), offset)
+        share = logits.permute(0, 2, 3, 1).softmax(3).permute(0, 3, 1, 2)  # as they lie in memory
+        place, surety = place_of(share, offset)
     start, step = line_of_places(1.0 / rhos[0], 1.0 / rhos[-1], len(rhos))
     rho = start + step * place[0, :h, :w].numpy()
     return np.maximum(rho, 0.25 * rhos[0]).astype(np.float32), surety[0, :h, :w].numpy()

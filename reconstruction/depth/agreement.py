@@ -28,8 +28,8 @@ def keep_confirmed(scene: DepthScene, depth: np.ndarray, correlation: np.ndarray
     def work(i: int) -> None:
         rows, relative = scene.neighbors(i)
         check_view(
-            i, rows, depth, weight, relative, scene.camera.intrinsics, config.agree_depth, config.agree_px, count[i],
-            fused[i],
+            i, rows, depth, weight, depth[i] > 0, relative, scene.camera.intrinsics, config.agree_depth,
+            config.agree_px, count[i], fused[i],
         )  # fmt: skip
         # A window without contrast correlates with anything a little: such depth needs more witnesses.
         good = (count[i] >= config.min_agreeing) & (correlation[i] >= config.min_correlation)
@@ -77,8 +77,8 @@ def fill_predicted(
     def believe(i: int) -> None:
         rows, relative = scene.neighbors(i)
         count, fused = np.zeros(scene.shape, np.uint8), np.zeros(scene.shape, np.float32)
-        check_view(i, rows, said, weight, relative, k, reach, reach_px, count, fused)
         asked = (depth[i] == 0) & (said[i] > 0)
+        check_view(i, rows, said, weight, asked, relative, k, reach, reach_px, count, fused)
         agree, through = np.zeros_like(count), np.zeros_like(count)
         count_witnesses(i, rows, said, asked, relative, k, 1.0 + 2 * reach, 0.5 * reach, agree, through)
         taken[i] = np.where(asked & (count >= config.min_agreeing) & (count > through), fused, 0)

@@ -3,6 +3,8 @@
 import numba
 import numpy as np
 
+from reconstruction.depth.windows import FAST
+
 _RINGS_PX = (2, 4, 7, 11, 18)
 OFFSETS = np.array(
     [(0, 0)]
@@ -28,52 +30,60 @@ MOST_BENT = np.float32(0.3)
 """Relative change of inverse depth up to which a plane is extended."""
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
+def _add_slopes(rho, gx, gy, here, own_x, own_y, dx, dy, sx, sy, n):  # pragma: no cover - compiled
+    """Add to the sums of a row of pixels the slopes of their neighbors (dx, dy) away that lie on their planes."""
+    one, nil, dx, dy = np.float32(1.0), np.float32(0.0), np.float32(dx), np.float32(dy)
+    for x in range(len(here)):
+        off = abs(rho[x] - here[x] - own_x[x] * dx - own_y[x] * dy)
+        m = one if (rho[x] > nil) & (off < JUMP * here[x]) else nil
+        sx[x] += m * gx[x]
+        sy[x] += m * gy[x]
+        n[x] += m
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mean_slopes(rho, gx, gy, out_x, out_y):  # pragma: no cover - compiled
-    """Average slopes over the neighbors that lie on a pixel's plane."""
+    """Average slopes over the neighbors that lie on a pixel's plane; 0 where there is no depth."""
     h, w = rho.shape
+    n = np.empty(w, np.float32)
     for y in range(h):
+        sx, sy = out_x[y], out_y[y]
+        sx[:], sy[:], n[:] = 0.0, 0.0, 0.0
+        for j in range(y - SLOPE_REACH, y + SLOPE_REACH + 1, SLOPE_STRIDE):
+            for dx in range(-SLOPE_REACH, SLOPE_REACH + 1, SLOPE_STRIDE):
+                low, high = max(0, -dx), w - max(0, dx)
+                if 0 <= j < h and low < high:
+                    there, here = slice(low + dx, high + dx), slice(low, high)
+                    _add_slopes(
+                        rho[j, there], gx[j, there], gy[j, there], rho[y, here], gx[y, here], gy[y, here], dx, j - y,
+                        sx[here], sy[here], n[here],
+                    )  # fmt: skip
         for x in range(w):
-            r = rho[y, x]
-            if r <= 0.0:
-                out_x[y, x] = 0.0
-                out_y[y, x] = 0.0
-                continue
-            sx, sy, n = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for dy in range(-SLOPE_REACH, SLOPE_REACH + 1, SLOPE_STRIDE):
-                j = y + dy
-                if j < 0 or j >= h:
-                    continue
-                for dx in range(-SLOPE_REACH, SLOPE_REACH + 1, SLOPE_STRIDE):
-                    i = x + dx
-                    if i < 0 or i >= w or rho[j, i] <= 0.0:
-                        continue
-                    if abs(rho[j, i] - r - gx[y, x] * dx - gy[y, x] * dy) < JUMP * r:
-                        sx += gx[j, i]
-                        sy += gy[j, i]
-                        n += np.float32(1.0)
-            out_x[y, x] = sx / n if n > 0 else gx[y, x]
-            out_y[y, x] = sy / n if n > 0 else gy[y, x]
+            if rho[y, x] > 0.0:
+                sx[x] = sx[x] / n[x] if n[x] > 0 else gx[y, x]
+                sy[x] = sy[x] / n[x] if n[x] > 0 else gy[y, x]
 
 
 @numba.njit(cache=True, nogil=True)
 def _extend(rho, gx, gy, offsets, out):  # pragma: no cover - compiled
     h, w = rho.shape
+    out[:] = 0.0
     for k in range(len(offsets)):
         dy, dx = offsets[k]
-        for y in range(h):
-            j = y + dy
-            for x in range(w):
-                i = x + dx
-                out[k, y, x] = 0.0
-                if j < 0 or j >= h or i < 0 or i >= w:
-                    continue
-                r = rho[j, i]
-                if r <= 0.0:
-                    continue
-                there = r - gx[j, i] * dx - gy[j, i] * dy
-                if abs(there - r) < MOST_BENT * r:
-                    out[k, y, x] = there
+        across, down = np.float32(dx), np.float32(dy)
+        low, high = max(0, -dx), max(0, -dx, w - max(0, dx))
+        for y in range(max(0, -dy), h - max(0, dy)):
+            there = slice(low + dx, high + dx)
+            r, x_slope, y_slope, at = (
+                rho[y + dy, there],
+                gx[y + dy, there],
+                gy[y + dy, there],
+                out[k, y, low:high],
+            )
+            for x in range(len(r)):
+                q = r[x] - x_slope[x] * across - y_slope[x] * down
+                at[x] = q if abs(q - r[x]) < MOST_BENT * r[x] else np.float32(0.0)
 
 
 def candidate_depths(rho: np.ndarray) -> np.ndarray:
@@ -94,19 +104,17 @@ def candidate_depths(rho: np.ndarray) -> np.ndarray:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
-def _support(candidates, share, at, y, x, spread):  # pragma: no cover - compiled
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST, forceinline=True)
+def _support(candidates, share, at):  # pragma: no cover - compiled
     """Return the probability of a depth's neighborhood: all candidates, weighed by how near they are."""
-    total = np.float32(0.0)
+    total, one, inverse = np.float32(0.0), np.float32(1.0), np.float32(1.0) / (SPREAD * at)
     for j in range(len(candidates)):
-        c = candidates[j, y, x]
-        if c > 0.0:
-            off = (c - at) / (spread * at)
-            total += share[j, y, x] / (np.float32(1.0) + off * off)
+        off = (candidates[j] - at) * inverse
+        total += share[j] / (one + off * off)
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def choose_candidates(candidates, share, least, out, trust):  # pragma: no cover - compiled
     """Write the mode of a pixel's candidates as a mixture, and the probability around it.
 
@@ -120,23 +128,26 @@ def choose_candidates(candidates, share, least, out, trust):  # pragma: no cover
         trust: float32 (h, w) probability, written.
     """
     k, h, w = candidates.shape
+    depths, shares = np.empty(k, np.float32), np.empty(k, np.float32)
     for y in range(h):
         for x in range(w):
-            value = candidates[0, y, x]
-            own = _support(candidates, share, value, y, x, SPREAD) if value > 0.0 else np.float32(0.0)
-            best, whole = own, np.float32(0.0)
+            whole = np.float32(0.0)
             for i in range(k):
-                whole += share[i, y, x]
+                depths[i] = candidates[i, y, x]
+                shares[i] = share[i, y, x] if depths[i] > 0.0 else np.float32(0.0)
+                whole += shares[i]
+            value = depths[0]
+            own = _support(depths, shares, value) if value > 0.0 else np.float32(0.0)
+            best = own
             # No mode has more than the whole: most pixels are done here.
             others = k if own < _KEPT * whole else 1
             for i in range(1, others):
-                at = candidates[i, y, x]
-                if at <= 0.0 or share[i, y, x] < _NO_MODE:
+                if shares[i] < _NO_MODE:
                     continue
-                total = _support(candidates, share, at, y, x, SPREAD)
+                total = _support(depths, shares, depths[i])
                 if total > best:
-                    best, value = total, at
+                    best, value = total, depths[i]
             if own >= _KEPT * best and own > 0.0:
-                best, value = own, candidates[0, y, x]
+                best, value = own, depths[0]
             trust[y, x] = best
             out[y, x] = value if best >= least else np.float32(0.0)

@@ -22,17 +22,14 @@ _OBJECTING_VIEWS = 8  # neighbors that are asked whether they look through a pla
 
 def _anchored(label: np.ndarray, measured: np.ndarray, min_px: int) -> np.ndarray:
     """Return which labelled pixels belong to a piece of one label with enough measured pixels in it."""
-    import cv2
+    from reconstruction.depth.consistency import label_pieces
 
-    keep = np.zeros(label.shape, bool)
-    for value in np.unique(label[label >= 0]):
-        count, pieces = cv2.connectedComponents((label == value).astype(np.uint8), connectivity=4)
-        size = np.bincount(pieces.ravel(), minlength=count)
-        anchor = np.bincount(pieces.ravel(), measured.ravel(), minlength=count)
-        good = (anchor >= min_px) & (anchor >= 0.04 * size)
-        good[0] = False
-        keep |= good[pieces]
-    return keep
+    pieces = np.zeros(label.shape, np.int32)
+    size = label_pieces((label + 1).astype(np.float32), 0.0, pieces)
+    anchor = np.bincount(pieces.ravel(), measured.ravel(), minlength=len(size))
+    good = (anchor >= min_px) & (anchor >= 0.04 * size)
+    good[0] = False
+    return good[pieces]
 
 
 def _fill_regions(label: np.ndarray, cost: np.ndarray, measured: np.ndarray, color: np.ndarray) -> None:

@@ -69,7 +69,7 @@ def _reassigned(
     scene: DepthScene, i: int, gray: np.ndarray, rho: np.ndarray, sure: np.ndarray, doubts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return inverse depth and surety (h, w) after pixels beside jumps chose their surface; `doubts` marks them."""
-    from reconstruction.depth.outlines import mark_doubt, resolve_edges
+    from reconstruction.depth.outlines import edge_voters, mark_doubt, resolve_edges
     from reconstruction.depth.refine import fit_slopes
 
     parts = list(scene.plan.parts_with_sources(i, *scene.shape))
@@ -82,11 +82,12 @@ def _reassigned(
         fit_slopes(rho, _SURFACE_STEP, fitted, gx, gy)
         doubt = np.empty(scene.shape, bool)
         mark_doubt(rho, gx, gy, _JUMP, band, doubt)
+        voting = edge_voters(rho, sure, doubt, color)
         out, out_sure = rho.copy(), sure.copy()
         for (bounds, _), (seen, h_inf, shift) in zip(parts, warps):
             resolve_edges(
-                gray[i], color, seen, h_inf, shift, rho, gx, gy, sure, doubt, scene.config.noise_gray, bounds, out,
-                out_sure,
+                gray[i], color, seen, h_inf, shift, rho, gx, gy, sure, doubt, voting, scene.config.noise_gray, bounds,
+                out, out_sure,
             )  # fmt: skip
         rho, sure = out, out_sure
         doubts |= doubt

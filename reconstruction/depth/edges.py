@@ -3,13 +3,12 @@
 import numba
 import numpy as np
 
+from reconstruction.depth.votes import SAME, make_votes, voters
+
 _REACH = 9
-_STRIDE = 3
 _MAX_CANDIDATES = 5
-# Weights by difference of color (whole levels) and by place.
-_LEVELS = np.arange(256)
-_BY_TONE = np.where(_LEVELS > 30, 0, np.exp(-0.5 * (_LEVELS / 9.0) ** 2)).astype(np.float32)
-_BY_STEP = np.exp(-0.5 * np.arange(_REACH + 1) ** 2 / 50.0).astype(np.float32)
+_DOUBTED_SAY = 0.25
+_votes = make_votes(_REACH, stride=3, tone=9.0, most_tone=30.0, px=50.0**0.5)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -25,7 +24,60 @@ def _near_jump(rho, y, x, jump):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compiled
+def _mark_doubt(rho, doubt):  # pragma: no cover - compiled
+    """Mark in doubt (h, w) the pixels beside a jump."""
+    for y in range(rho.shape[0]):
+        for x in range(rho.shape[1]):
+            doubt[y, x] = rho[y, x] > 0.0 and _near_jump(rho, y, x, 0.025)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _candidates(rho, gx, gy, y, x, out):  # pragma: no cover - compiled
+    """Write the surfaces around a pixel, extended to it, to out (m, 3): its own first; return how many."""
+    h, w = rho.shape
+    out[0, 0], out[0, 1], out[0, 2] = rho[y, x], gx[y, x], gy[y, x]
+    count = 1
+    for reach in ((_REACH + 2) // 2, _REACH + 2):
+        for dy in (-reach, 0, reach):
+            for dx in (-reach, 0, reach):
+                j, i = y + dy, x + dx
+                if j < 0 or i < 0 or j >= h or i >= w or count == _MAX_CANDIDATES:
+                    continue
+                q = rho[j, i] - gx[j, i] * np.float32(dx) - gy[j, i] * np.float32(dy)
+                fresh = q > 0.0
+                for c in range(count):
+                    if abs(q - out[c, 0]) < np.float32(SAME) * out[c, 0]:
+                        fresh = False
+                if fresh:
+                    out[count, 0], out[count, 1], out[count, 2] = q, gx[j, i], gy[j, i]
+                    count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _choose(rho, gx, gy, doubt, maps, width, out):  # pragma: no cover - compiled
+    """Write to out (h, w) the inverse depth that most voters of `maps` around a pixel in doubt lie on."""
+    candidates = np.empty((_MAX_CANDIDATES, 3), np.float32)
+    votes = np.empty(_MAX_CANDIDATES, np.float32)
+    for y in range(rho.shape[0]):
+        for x in range(rho.shape[1]):
+            out[y, x] = rho[y, x]
+            if not doubt[y, x]:
+                continue
+            count = _candidates(rho, gx, gy, y, x, candidates)
+            if count == 1:
+                continue
+            _votes(maps, width, y, x, candidates, count, votes)
+            best = 0
+            for c in range(1, count):
+                if votes[c] > np.float32(1.1) * votes[0] and votes[c] > votes[best]:
+                    best = c
+            out[y, x] = candidates[best, 0]
+
+
+def sharpen_edges(
+    rho: np.ndarray, gx: np.ndarray, gy: np.ndarray, score: np.ndarray, color: np.ndarray, out: np.ndarray
+) -> None:
     """Reassign pixels beside depth jumps to the surface that most nearby pixels of their color lie on.
 
     Args:
@@ -36,63 +88,7 @@ def sharpen_edges(rho, gx, gy, score, color, out):  # pragma: no cover - compile
         color: float32 (h, w, 3).
         out: (h, w), written.
     """
-    h, w = rho.shape
-    far = _REACH + 2
-    # Pixels beside a jump are in doubt; their votes count a quarter.
-    doubt = np.empty((h, w), np.bool_)
-    for y in range(h):
-        for x in range(w):
-            doubt[y, x] = rho[y, x] > 0.0 and _near_jump(rho, y, x, 0.025)
-    candidates = np.empty((_MAX_CANDIDATES, 3))
-    votes = np.empty(_MAX_CANDIDATES)
-    for y in range(h):
-        for x in range(w):
-            r = rho[y, x]
-            out[y, x] = r
-            if not doubt[y, x]:
-                continue
-            candidates[0, 0], candidates[0, 1], candidates[0, 2] = r, gx[y, x], gy[y, x]
-            count = 1
-            for reach in (far // 2, far):
-                for dy in (-reach, 0, reach):
-                    for dx in (-reach, 0, reach):
-                        j, i = y + dy, x + dx
-                        if j < 0 or i < 0 or j >= h or i >= w or count == _MAX_CANDIDATES:
-                            continue
-                        q = rho[j, i] - gx[j, i] * dx - gy[j, i] * dy
-                        fresh = q > 0.0
-                        for c in range(count):
-                            if abs(q - candidates[c, 0]) < 0.012 * candidates[c, 0]:
-                                fresh = False
-                        if fresh:
-                            candidates[count, 0], candidates[count, 1] = q, gx[j, i]
-                            candidates[count, 2] = gy[j, i]
-                            count += 1
-            if count == 1:
-                continue
-            votes[:] = 0.0
-            for dy in range(-_REACH, _REACH + 1, _STRIDE):
-                j = y + dy
-                if j < 0 or j >= h:
-                    continue
-                for dx in range(-_REACH, _REACH + 1, _STRIDE):
-                    i = x + dx
-                    if i < 0 or i >= w:
-                        continue
-                    d = abs(color[j, i, 0] - color[y, x, 0])
-                    d = max(d, abs(color[j, i, 1] - color[y, x, 1]))
-                    q = _BY_TONE[int(max(d, abs(color[j, i, 2] - color[y, x, 2])))]
-                    if q == 0.0:
-                        continue
-                    q *= _BY_STEP[abs(dx)] * _BY_STEP[abs(dy)] * max(np.float32(0.15), score[j, i])
-                    if doubt[j, i]:
-                        q *= np.float32(0.25)
-                    for c in range(count):
-                        expected = candidates[c, 0] + candidates[c, 1] * dx + candidates[c, 2] * dy
-                        if abs(rho[j, i] - expected) < 0.012 * expected:
-                            votes[c] += q
-            best = 0
-            for c in range(1, count):
-                if votes[c] > 1.1 * votes[0] and votes[c] > votes[best]:
-                    best = c
-            out[y, x] = candidates[best, 0]
+    doubt = np.empty(rho.shape, bool)
+    _mark_doubt(rho, doubt)
+    maps = voters(rho, score, doubt, _DOUBTED_SAY, color, _REACH)
+    _choose(rho, gx, gy, doubt, maps.reshape(len(maps), -1), maps.shape[2], out)

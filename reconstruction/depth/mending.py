@@ -25,6 +25,7 @@ AROUND_PX = 49
 MANY_VIEWS = 10.0
 """Counts of views are told as shares of it."""
 _OWN_ODDS = 8.0  # odds of a pixel's own depth over those in the rooms of the training (docs/priors.md)
+_STRIP_PX = 32  # rows whose candidates are scored at a time
 _LOOK_THROUGH = 2  # views that see something beyond a point, from which it may be dropped
 
 
@@ -87,18 +88,28 @@ def candidate_shares(
         weights: Of the network.
     """
     import torch
+    from torch.nn.functional import pixel_unshuffle
 
     from reconstruction.depth.weights import load_network
 
     torch.set_num_threads(1)
     h, w = features.shape[1:]
     padded = np.pad(features, ((0, 0), (0, h % 2), (0, w % 2)), mode="edge")
+    share = np.empty((h, w, len(there) + 1), np.float32)
+    together = np.empty((AFFINITIES, h, w), np.float32)
+    network = load_network("mending", weights)
     with torch.inference_mode():
-        logits, affinity = load_network("mending", weights)(torch.from_numpy(padded)[None])
-        logits = logits[0, :, :h, :w]
-        logits[:-1].masked_fill_(torch.from_numpy(~there), -1e4)
-        logits[0] += math.log(_OWN_ODDS)
-        return logits.softmax(0)[:-1].numpy(), affinity[0, :, :h, :w].sigmoid().numpy()
+        found = network.unet(pixel_unshuffle(torch.from_numpy(padded)[None], 2))
+        for top in range(0, h, _STRIP_PX):  # what a strip needs stays in the processor's cache
+            rows = slice(top, min(h, top + _STRIP_PX))
+            logits, affinity = network.scores(found[:, :, top // 2 : (top + _STRIP_PX) // 2])
+            size = rows.stop - top
+            logits = logits[0, :, :size, :w].permute(1, 2, 0)  # as they lie in memory
+            logits[..., :-1].masked_fill_(torch.from_numpy(~there[:, rows]).permute(1, 2, 0), -1e4)
+            logits[..., 0] += math.log(_OWN_ODDS)
+            share[rows] = logits.softmax(2).numpy()
+            together[:, rows] = affinity[0, :, :size, :w].contiguous().sigmoid().numpy()
+    return np.moveaxis(share, 2, 0)[:-1], together
 
 
 def pack_affinities(affinity: np.ndarray) -> np.ndarray:

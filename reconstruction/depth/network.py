@@ -39,7 +39,7 @@ class UNet(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map (b, inputs, h, w) to (b, widths[0], h, w)."""
-        kept = [self.enter(x)]
+        kept = [self.enter(x.contiguous(memory_format=torch.channels_last))]  # convolutions are faster so
         for layer in self.down:
             kept.append(layer(functional.max_pool2d(kept[-1], 2, ceil_mode=True)))
         x = kept.pop()
@@ -74,7 +74,11 @@ class Mending(nn.Module):
         Args:
             features: (b, FEATURES, h, w) of `mending.mending_features`; height and width are even.
         """
-        out = functional.pixel_shuffle(self.leave(self.unet(functional.pixel_unshuffle(features, 2))), 2)
+        return self.scores(self.unet(functional.pixel_unshuffle(features, 2)))
+
+    def scores(self, found: torch.Tensor):
+        """Return what `forward` does, from the features (b, widths[0], h / 2, w / 2) of the last convolution."""
+        out = functional.pixel_shuffle(self.leave(found), 2)
         return out[:, : self.candidates + 1], out[:, self.candidates + 1 :]
 
 
@@ -123,7 +127,7 @@ def place_of(share: torch.Tensor, offset: torch.Tensor, reach: int = 2):
         offset: (b, h, w), in bins.
         reach: Bins to each side of the best one.
     """
-    best = share.argmax(1, keepdim=True)
+    best = share.max(1, keepdim=True).indices
     near = torch.arange(-reach, reach + 1, device=share.device).view(1, -1, 1, 1) + best
     inside = (near >= 0) & (near < share.shape[1])
     near = near.clamp(0, share.shape[1] - 1)

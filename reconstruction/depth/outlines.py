@@ -8,27 +8,22 @@ by color (adaptive support weights, Yoon and Kweon, PAMI 2006) and by the surfac
 import numba
 import numpy as np
 
+from reconstruction.depth.votes import SAME, make_votes, voters
 from reconstruction.depth.windows import make_correlate, offsets, project, source_maps
 
 _REACH = 15  # pixels of the same color vote within this distance
-_VOTE_STRIDE = 3
 _MAX_CANDIDATES = 4
 _RADIUS = 4  # 9x9 windows, every second pixel of them
 _STRIDE = 2
 _DX, _DY = offsets(_RADIUS, _STRIDE)
 _SAMPLES = len(_DX)
 _correlate = make_correlate(_SAMPLES)
-_SAME = 0.012  # relative difference up to which two inverse depths are one surface
-_WINDOW_TONE, _VOTE_TONE, _VOTE_PX = 10.0, 9.0, 11.0
+_votes = make_votes(_REACH, stride=3, tone=9.0, most_tone=31.5, px=11.0)
+_WINDOW_TONE = 10.0
 _DOUBTED_SAY = 0.1
 _STAY = 0.05
-# Weights by difference of color (whole levels) and by place; 0 where a vote or a sample would hardly count.
-_LEVELS = np.arange(256)
-_VOTE_BY_TONE = np.where(_LEVELS > 3.5 * _VOTE_TONE, 0, np.exp(-0.5 * (_LEVELS / _VOTE_TONE) ** 2)).astype(
-    np.float32
-)
-_VOTE_BY_STEP = np.exp(-0.5 * (np.arange(_REACH + 1) / _VOTE_PX) ** 2).astype(np.float32)
-_SAMPLE_BY_TONE = np.exp(-_LEVELS / _WINDOW_TONE).astype(np.float32)
+# Weights of samples by difference of color (whole levels) and by place.
+_SAMPLE_BY_TONE = np.exp(-np.arange(256) / _WINDOW_TONE).astype(np.float32)
 _SAMPLE_BY_PLACE = np.exp(-(_DX**2 + _DY**2) / (2.0 * _RADIUS * _RADIUS)).astype(np.float32)
 
 
@@ -69,6 +64,11 @@ def mark_doubt(rho, gx, gy, jump, band, doubt):  # pragma: no cover - compiled
             doubt[y, x] |= last - y <= band
 
 
+def edge_voters(rho: np.ndarray, score: np.ndarray, doubt: np.ndarray, color: np.ndarray) -> np.ndarray:
+    """Return what `resolve_edges` needs to let pixels vote, of its arguments of the same names."""
+    return voters(rho, score, doubt, _DOUBTED_SAY, color, _REACH)
+
+
 @numba.njit(cache=True, nogil=True)
 def _candidates(rho, gx, gy, doubt, y, x, out):  # pragma: no cover - compiled
     """Write the surfaces around a pixel, extended to it, to out (m, 3): its own first, then those far from jumps."""
@@ -91,7 +91,7 @@ def _candidates(rho, gx, gy, doubt, y, x, out):  # pragma: no cover - compiled
                     q = rho[j, i] - gx[j, i] * dx - gy[j, i] * dy
                     fresh = q > 0.0
                     for c in range(count):
-                        if abs(q - out[c, 0]) < _SAME * out[c, 0]:
+                        if abs(q - out[c, 0]) < SAME * out[c, 0]:
                             fresh = False
                             break
                     if fresh:
@@ -106,36 +106,6 @@ def _differ(color, j, i, y, x):  # pragma: no cover - compiled
     d = abs(color[j, i, 0] - color[y, x, 0])
     d = max(d, abs(color[j, i, 1] - color[y, x, 1]))
     return int(max(d, abs(color[j, i, 2] - color[y, x, 2])))
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _vote(rho, score, color, doubt, y, x, candidates, count, votes):  # pragma: no cover - compiled
-    """Sum the weights of nearby pixels of the same color by candidate surface to `votes`; return the total."""
-    h, w = rho.shape
-    votes[:] = 0.0
-    total = np.float32(1e-6)
-    for dy in range(-_REACH, _REACH + 1, _VOTE_STRIDE):
-        j = y + dy
-        if j < 0 or j >= h:
-            continue
-        for dx in range(-_REACH, _REACH + 1, _VOTE_STRIDE):
-            i = x + dx
-            if i < 0 or i >= w or rho[j, i] <= 0.0:
-                continue
-            q = _VOTE_BY_TONE[_differ(color, j, i, y, x)]
-            if q == 0.0:
-                continue
-            q *= _VOTE_BY_STEP[abs(dx)] * _VOTE_BY_STEP[abs(dy)]
-            q *= max(np.float32(0.15), score[j, i])
-            if doubt[j, i]:
-                q *= np.float32(_DOUBTED_SAY)
-            total += q
-            r, fx, fy = rho[j, i], np.float32(dx), np.float32(dy)
-            for c in range(count):
-                e = candidates[c, 0] + candidates[c, 1] * fx + candidates[c, 2] * fy
-                if abs(r - e) < np.float32(_SAME) * e:
-                    votes[c] += q
-    return total
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -180,7 +150,7 @@ def _seen(
 
 @numba.njit(cache=True, nogil=True)
 def resolve_edges(
-    reference, color, sources, h_inf, shift, rho, gx, gy, score, doubt, noise, part, out, out_score
+    reference, color, sources, h_inf, shift, rho, gx, gy, score, doubt, voting, noise, part, out, out_score
 ):  # pragma: no cover - compiled
     """Reassign pixels in doubt to one of the surfaces around them; unknown pixels need stronger evidence.
 
@@ -195,6 +165,7 @@ def resolve_edges(
         gy: (h, w) its slope along y.
         score: (h, w) how sure each pixel is, 0 to 1.
         doubt: bool (h, w).
+        voting: Of `edge_voters`.
         noise: Image noise in gray levels.
         part: Top, bottom, left and right of the part of the frame that is written: the sources are those of the part.
         out: (h, w), written.
@@ -206,6 +177,7 @@ def resolve_edges(
     maps = source_maps(h_inf, shift)
     dx, dy = _DX.copy(), _DY.copy()
     weight, centered = np.empty(_SAMPLES, np.float32), np.empty(_SAMPLES, np.float32)
+    maps_voting, width = voting.reshape(len(voting), -1), voting.shape[2]
     candidates = np.empty((_MAX_CANDIDATES, 3), np.float32)
     votes = np.empty(_MAX_CANDIDATES, np.float32)
     for y in range(part[0], part[1]):
@@ -217,7 +189,7 @@ def resolve_edges(
             count = _candidates(rho, gx, gy, doubt, y, x, candidates)
             if count == 0 or (count == 1 and known):
                 continue
-            total = _vote(rho, score, color, doubt, y, x, candidates, count, votes)
+            total = _votes(maps_voting, width, y, x, candidates, count, votes)
             if known and votes[0] > 0.8 * total:
                 continue
             project(h_inf, y, x, maps)

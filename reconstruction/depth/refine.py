@@ -104,20 +104,48 @@ def _disparity_rate(maps, r):  # pragma: no cover - compiled
     return np.sqrt(rate)
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _mean_of_seen(e, g):  # pragma: no cover - compiled
+    """Return the mean of two correlations, or that of the one source that sees its pixel; -1 where none does."""
+    none, half = np.float32(-2.0), np.float32(0.5)
+    if e > none and g > none:
+        return half * (e + g)
+    return half * max(e, g) if e > none or g > none else np.float32(-1.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _peak(line):  # pragma: no cover - compiled
+    """Return the place of the best of five tries, from -2 to 2 and between them by a parabola, and its worth."""
+    half = np.float32(0.5)
+    top, at = np.float32(-9.0), 2
+    for c in range(5):
+        # Where the windows say nothing, the aggregated depth stands.
+        value = line[c] - np.float32(0.004 * abs(c - 2))
+        if value > top:
+            top, at = value, c
+    moved = np.float32(0.0)
+    if 0 < at < 4:
+        bend = line[at - 1] + line[at + 1] - np.float32(2.0) * line[at]
+        if bend < np.float32(-1e-4):
+            moved = min(half, max(-half, half * (line[at - 1] - line[at + 1]) / bend))
+    return np.float32(at - 2) + moved, line[at]
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def refine(
     reference, sources, h_inf, shift, rho, gx, gy, px_step, noise, part, out_rho, out_score
 ):  # pragma: no cover
     """Try inverse depths around `rho` (h, w) in steps of `px_step` pixels of disparity; keep the best, by parabola.
 
-    Only `part` (top, bottom, left, right) of the frame is written: the sources are those of the part. A try's worth
-    is the mean correlation with the two sources that see the unmoved window best: the others may not see it at all.
+    One step is tried to each side, a second one beyond the better of the two if that is better than the middle. Only
+    `part` (top, bottom, left, right) of the frame is written: the sources are those of the part. A try's worth is the
+    mean correlation with the two sources that see the unmoved window best: the others may not see it at all.
     """
     s, sh, sw = sources.shape
     flat = sources.reshape(s, sh * sw)
-    zero, half, none = np.float32(noise * noise), np.float32(0.5), np.float32(-2.0)
+    zero, none = np.float32(noise * noise), np.float32(-2.0)
     px_step = np.float32(px_step)
-    line = np.empty(5, np.float32)
+    line, seen = np.empty(5, np.float32), np.empty(2, np.float32)
     maps = source_maps(h_inf, shift)
     weight = np.full(_SAMPLES, 1.0 / _SAMPLES).astype(np.float32)
     centered = np.empty(_SAMPLES, np.float32)
@@ -126,7 +154,6 @@ def refine(
         for x in range(part[2], part[3]):
             r, a, b = rho[y, x], gx[y, x], gy[y, x]
             project(h_inf, y, x, maps)
-            step = px_step / _disparity_rate(maps, r)
             variance = _window(reference, y, x, centered, zero)
             first, second, best, other = none, none, -1, -1
             for k in range(s):
@@ -136,32 +163,20 @@ def refine(
                     first, best = e, k
                 elif e > second:
                     second, other = e, k
+            step = px_step / _disparity_rate(maps, r)
             line[:] = -1.0
-            line[2] = half * (first + second) if other >= 0 else (half * first if best >= 0 else line[2])
-            for c in (0, 1, 3, 4):
-                q = r + np.float32(c - 2) * step
-                if q <= np.float32(0.0) or best < 0:
+            line[2] = _mean_of_seen(first, second)
+            for turn in range(3 if best >= 0 else 0):
+                at = 1 + 2 * turn if turn < 2 else (0 if line[1] > line[3] else 4)
+                q = r + np.float32(at - 2) * step
+                if q <= np.float32(0.0) or (turn == 2 and max(line[1], line[3]) <= line[2]):
                     continue
-                e = _correlate(
-                    weight, centered, variance, flat[best], sh, sw, maps[best], q, a, b, zero, dx, dy
-                )
-                g = none
-                if other >= 0:
-                    g = _correlate(
-                        weight, centered, variance, flat[other], sh, sw, maps[other], q, a, b, zero, dx, dy
+                seen[1] = none
+                for n in range(2 if other >= 0 else 1):
+                    k = other if n else best
+                    seen[n] = _correlate(
+                        weight, centered, variance, flat[k], sh, sw, maps[k], q, a, b, zero, dx, dy
                     )
-                if e > none or g > none:
-                    line[c] = half * (e + g) if e > none and g > none else half * max(e, g)
-            top, at = np.float32(-9.0), 2
-            for c in range(5):
-                # Where the windows say nothing, the aggregated depth stands.
-                value = line[c] - np.float32(0.004 * abs(c - 2))
-                if value > top:
-                    top, at = value, c
-            moved = np.float32(0.0)
-            if 0 < at < 4:
-                bend = line[at - 1] + line[at + 1] - np.float32(2.0) * line[at]
-                if bend < np.float32(-1e-4):
-                    moved = min(half, max(-half, half * (line[at - 1] - line[at + 1]) / bend))
-            out_rho[y, x] = r + (np.float32(at - 2) + moved) * step
-            out_score[y, x] = line[at]
+                line[at] = _mean_of_seen(seen[0], seen[1])
+            place, out_score[y, x] = _peak(line)
+            out_rho[y, x] = r + place * step

@@ -19,6 +19,11 @@ def offsets(radius: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(x.ravel()), np.ascontiguousarray(y.ravel())
 
 
+def fill_vectors(values: np.ndarray) -> np.ndarray:
+    """Return values of samples (n,) with zeros after them, so that vector units of 16 numbers work on all at once."""
+    return np.pad(values, (0, -len(values) % 16))
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def source_maps(h_inf, shift):  # pragma: no cover - compiled
     """Return (s, 12) float32: room for where a pixel is at infinity, then its change by x, y and inverse depth."""

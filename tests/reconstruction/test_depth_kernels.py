@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from reconstruction.core.types import Camera
+from reconstruction.depth.consistency import check_view, count_witnesses
 from reconstruction.depth.measure import sweep_frame
 from reconstruction.depth.refine import fit_slopes, refine
 from reconstruction.depth.scene import plane_warps
@@ -141,3 +142,49 @@ def test_slopes_of_a_plane_are_found_and_stop_at_a_jump() -> None:
     assert np.abs(gx - 0.004).max() < 1e-5
     assert np.abs(gy + 0.003).max() < 1e-5
     assert np.abs(fitted - rho).max() < 1e-5
+
+
+def test_views_are_compared_as_written_out() -> None:
+    """A room's wall, seen by three views with noise and holes: each pixel there and back, and what is beyond."""
+    rng = np.random.default_rng(2)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1:, :3, 3] = (0.2, 0.02, 0.05), (-0.1, 0.0, -0.04)
+    depth = rng.uniform(1.9, 2.1, (3, H, W)).astype(np.float32)
+    depth[:, :, W // 2 :] = 2.0
+    depth[rng.uniform(size=depth.shape) < 0.1] = 0
+    weight = rng.uniform(0, 1, depth.shape).astype(np.float32)
+    relative = np.linalg.inv(poses[1:]) @ poses[0]
+    mask = rng.uniform(size=(H, W)) < 0.8
+    agree, through, count = (np.zeros((H, W), np.uint8) for _ in range(3))
+    fused = np.zeros((H, W), np.float32)
+    k, rows = (40.0, 40.0, W / 2, H / 2), np.array([1, 2, -1])
+    count_witnesses(0, rows, depth, mask, relative, k, 1.02, 0.01, agree, through)
+    check_view(0, rows, depth, weight, mask, relative, k, 0.03, 1.0, count, fused)
+    for y, x in np.argwhere(mask & (depth[0] > 0)):
+        z, seen = float(depth[0, y, x]), []
+        for j, m in zip(rows, relative):
+            there = K @ (m[:3, :3] @ np.linalg.inv(K) @ [z * (x + 0.5), z * (y + 0.5), z] + m[:3, 3])
+            u, v = there[:2] / there[2]
+            if 1 <= u < W - 1 and 1 <= v < H - 1:
+                seen.append((j, m, u, v, there[2]))
+        if len(seen) < 2:
+            continue
+        direct = [float(depth[j, int(v), int(u)]) / far for j, _, u, v, far in seen]
+        assert agree[y, x] == sum(abs(d - 1) < 0.01 for d in direct)
+        assert through[y, x] == sum(d > 1.02 for d in direct)
+        own, sums = weight[0, y, x] + 1e-3, []
+        for j, m, u, v, far in seen:
+            i, t = int(u - 0.5), int(v - 0.5)
+            four = depth[j, t : t + 2, i : i + 2]
+            near = four.min() > 0 and four.max() - four.min() < 0.03 * four.min()
+            d = bilinear(depth[j], np.array(u), np.array(v)) if near else depth[j, int(v), int(u)]
+            back = K @ (m[:3, :3].T @ (np.linalg.inv(K) @ [u * d, v * d, d] - m[:3, 3]))
+            off = np.hypot(*(back[:2] / back[2] - [x + 0.5, y + 0.5])) if d > 0 else np.inf
+            if d > 0 and abs(d - far) <= 0.03 * far and off <= 1.0:
+                sums.append((weight[j, int(v), int(u)] + 1e-3, back[2]))
+        assert count[y, x] == len(sums)
+        total = own / z + sum(q / far for q, far in sums)
+        assert fused[y, x] == pytest.approx((own + sum(q for q, _ in sums)) / total, rel=1e-5)
+    assert (count[mask] == 2).mean() > 0.2
+    assert (through[mask] > 0).any()
+    assert not count[~mask].any()
