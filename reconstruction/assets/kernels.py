@@ -86,12 +86,12 @@ def _beside_own(ids, f, target, iu, iv, w, h):  # pragma: no cover - compiled
     return iv < h - 1 and ids[f, iv + 1, iu] == target
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def fuse_object(
     depth, confidence, ids, cosine, inner, frames, camera_from_grid, fx, fy, cx, cy, target, shape, origin, voxel,
     trunc, tau, shell, shade,
 ):  # pragma: no cover - compiled  # fmt: skip
-    """Accumulate the evidence of all frames in every voxel of one object's grid.
+    """Accumulate the evidence of all frames in every voxel of one object's grid, a slab of voxels at a time.
 
     Returns (nx, ny, nz) each:
         numerator, denominator: of the mean signed distance to the seen surface, weighted towards large ones (soft
@@ -109,23 +109,25 @@ def fuse_object(
     behind = np.zeros((nx, ny, nz), np.uint16)
     within = np.zeros((nx, ny, nz), np.uint16)
     shaded = np.zeros((nx, ny, nz), np.uint16)
+    num, den = np.zeros((ny, nz)), np.zeros((ny, nz))
     h, w = depth.shape[1:]
-    for i in prange(nx):
+    for i in range(nx):
         gx = origin[0] + (i + 0.5) * voxel
-        for j in range(ny):
-            gy = origin[1] + (j + 0.5) * voxel
-            for k in range(nz):
-                gz = origin[2] + (k + 0.5) * voxel
-                num, den, n_free, n_near, n_outside, n_behind = 0.0, 0.0, 0, 0, 0, 0
-                n_within, n_shaded = 0, 0
-                for q in range(len(frames)):
-                    f = frames[q]
-                    m = camera_from_grid[q]
-                    z = m[2, 0] * gx + m[2, 1] * gy + m[2, 2] * gz + m[2, 3]
+        num[:] = 0.0
+        den[:] = 0.0
+        # Neighbours of a slab project to neighbouring pixels of a frame, which are in the processor's cache.
+        for q in range(len(frames)):
+            f = frames[q]
+            m = camera_from_grid[q]
+            for j in range(ny):
+                gy = origin[1] + (j + 0.5) * voxel
+                mx, my, mz = m[0, 0] * gx + m[0, 1] * gy, m[1, 0] * gx + m[1, 1] * gy, m[2, 0] * gx + m[2, 1] * gy
+                for k in range(nz):
+                    gz = origin[2] + (k + 0.5) * voxel
+                    z = mz + m[2, 2] * gz + m[2, 3]
                     if z < 0.05:
                         continue
-                    xn = (m[0, 0] * gx + m[0, 1] * gy + m[0, 2] * gz + m[0, 3]) / z
-                    yn = (m[1, 0] * gx + m[1, 1] * gy + m[1, 2] * gz + m[1, 3]) / z
+                    xn, yn = (mx + m[0, 2] * gz + m[0, 3]) / z, (my + m[1, 2] * gz + m[1, 3]) / z
                     u, v = fx * xn + cx, fy * yn + cy
                     if u < 0 or v < 0 or u >= w or v >= h:
                         continue
@@ -133,44 +135,36 @@ def fuse_object(
                     d = depth[f, iv, iu]
                     if d <= 0:
                         continue
-                    cos = cosine[f, iv, iu]
-                    ray = math.sqrt(xn * xn + yn * yn + 1.0)
                     if ids[f, iv, iu] == target:
+                        cos = cosine[f, iv, iu]
                         d = _own_depth(depth, ids, f, target, u, v, w, h)
-                        along = (d - z) * ray
+                        along = (d - z) * math.sqrt(xn * xn + yn * yn + 1.0)
                         s = along * max(cos, 0.25)
                         if along < -trunc and s < -0.5 * trunc:
                             if along > -shade:
-                                n_shaded += 1
+                                shaded[i, j, k] += 1
                             continue
-                        weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
                         if s >= trunc:
                             if cos > 0:
-                                n_free += 1
+                                freed[i, j, k] += 1
                             continue
                         if cos > 0:
-                            n_near += 1
+                            support[i, j, k] += 1
                             if inner[f, iv, iu]:
-                                n_within += 1
+                                within[i, j, k] += 1
                             if s < 0 and s > -shell:
-                                n_behind += 1
+                                behind[i, j, k] += 1
+                        weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
                         soft = weight * math.exp(max(s, -trunc) / tau)
-                        num += soft * max(s, -trunc)
-                        den += soft
-                    elif cos > 0:
-                        s = (d - z) * ray * max(cos, 0.1)
-                        if s > 0.0 and not _beside_own(ids, f, target, iu, iv, w, h):
-                            n_outside += 1
-                            if s > 0.6 * trunc:
-                                n_free += 1
-                numerator[i, j, k] = num
-                denominator[i, j, k] = den
-                freed[i, j, k] = n_free
-                support[i, j, k] = n_near
-                outside[i, j, k] = n_outside
-                behind[i, j, k] = n_behind
-                within[i, j, k] = n_within
-                shaded[i, j, k] = n_shaded
+                        num[j, k] += soft * max(s, -trunc)
+                        den[j, k] += soft
+                    elif d > z and cosine[f, iv, iu] > 0 and not _beside_own(ids, f, target, iu, iv, w, h):
+                        outside[i, j, k] += 1
+                        ray = math.sqrt(xn * xn + yn * yn + 1.0)
+                        if (d - z) * ray * max(cosine[f, iv, iu], 0.1) > 0.6 * trunc:
+                            freed[i, j, k] += 1
+        numerator[i] = num
+        denominator[i] = den
     return numerator, denominator, freed, support, outside, behind, within, shaded
 
 
