@@ -111,6 +111,7 @@ def fuse_object(
     shaded = np.zeros((nx, ny, nz), np.uint16)
     num, den = np.zeros((ny, nz)), np.zeros((ny, nz))
     h, w = depth.shape[1:]
+    hidden = -max(shade, 2.0 * trunc)  # voxels that far behind the surface learn nothing from it
     for i in range(nx):
         gx = origin[0] + (i + 0.5) * voxel
         num[:] = 0.0
@@ -136,6 +137,8 @@ def fuse_object(
                     if d <= 0:
                         continue
                     if ids[f, iv, iu] == target:
+                        if d * (1.0 + _EDGE) - z < hidden:
+                            continue
                         cos = cosine[f, iv, iu]
                         d = _own_depth(depth, ids, f, target, u, v, w, h)
                         along = (d - z) * math.sqrt(xn * xn + yn * yn + 1.0)
