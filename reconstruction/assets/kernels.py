@@ -1,6 +1,7 @@
 """Compiled kernels of the assets stage: viewing angles, volumetric fusion, texture sampling.
 
-They are long because all work on a voxel or texel happens in one iteration of a parallel loop.
+They are long because all work on a voxel or texel happens in one iteration of a loop. Objects are made beside each other:
+a kernel releases the interpreter lock and runs on one thread.
 """
 
 import math
@@ -172,42 +173,53 @@ def fuse_object(
 
 
 @njit(cache=True, inline="always")
-def _sample_pixel(
-    point, normal, m, center, image, depth, border, fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, out
-):  # pragma: no cover - compiled
-    """Write a point's color in one frame to `out` (3,); return its weight, 0 where the frame does not see it."""
-    px, py, pz = point[0], point[1], point[2]
-    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+def _weight(
+    t, k, points, normals, camera_from_world, centers, images, depths, borders, fx, fy, cx, cy, dfx, dfy, dcx, dcy,
+    tolerance,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Return the weight of frame `k` for point `t`, 0 where it does not see the point, and the point's column and row.
+
+    It takes whole arrays, as slices of arrays are counted references.
+    """
+    px, py, pz = points[t, 0], points[t, 1], points[t, 2]
+    m = camera_from_world
+    z = m[k, 2, 0] * px + m[k, 2, 1] * py + m[k, 2, 2] * pz + m[k, 2, 3]
     if z < 0.05:
-        return 0.0
-    xn = (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]) / z
-    yn = (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]) / z
+        return 0.0, 0.0, 0.0
+    xn = (m[k, 0, 0] * px + m[k, 0, 1] * py + m[k, 0, 2] * pz + m[k, 0, 3]) / z
+    yn = (m[k, 1, 0] * px + m[k, 1, 1] * py + m[k, 1, 2] * pz + m[k, 1, 3]) / z
     u, v = fx * xn + cx, fy * yn + cy
-    h, w = image.shape[0], image.shape[1]
-    if u < 0.5 or v < 0.5 or u >= w - 0.5 or v >= h - 0.5:
-        return 0.0
-    vx, vy, vz = center[0] - px, center[1] - py, center[2] - pz
+    if u < 0.5 or v < 0.5 or u >= images.shape[2] - 0.5 or v >= images.shape[1] - 0.5:
+        return 0.0, 0.0, 0.0
+    iu = min(max(int(dfx * xn + dcx), 0), depths.shape[2] - 1)
+    iv = min(max(int(dfy * yn + dcy), 0), depths.shape[1] - 1)
+    here, border = depths[k, iv, iu], borders[k, iv, iu]
+    if here <= 0 or border <= 0:
+        return 0.0, 0.0, 0.0
+    vx, vy, vz = centers[k, 0] - px, centers[k, 1] - py, centers[k, 2] - pz
     length = math.sqrt(vx * vx + vy * vy + vz * vz)
-    cos = (vx * normal[0] + vy * normal[1] + vz * normal[2]) / max(length, 1e-9)
+    cos = (vx * normals[t, 0] + vy * normals[t, 1] + vz * normals[t, 2]) / max(length, 1e-9)
     if cos < 0.08:
-        return 0.0
-    iu = min(max(int(dfx * xn + dcx), 0), depth.shape[1] - 1)
-    iv = min(max(int(dfy * yn + dcy), 0), depth.shape[0] - 1)
-    here = depth[iv, iu]
+        return 0.0, 0.0, 0.0
     slope = 1.5 * z / dfx / max(cos, 0.1)  # change of depth over a pixel
-    if here <= 0 or abs(here - z) > tolerance + slope or border[iv, iu] <= 0:
-        return 0.0
+    if abs(here - z) > tolerance + slope:
+        return 0.0, 0.0, 0.0
+    return cos * cos / max(length, 0.1) ** 2 * border, u, v
+
+
+@njit(cache=True, inline="always")
+def _sample_pixel(images, k, u, v, out):  # pragma: no cover - compiled
+    """Write the interpolated color of frame `k` at column `u` and row `v` to `out` (3,)."""
     x0, y0 = int(u - 0.5), int(v - 0.5)
-    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    x1, y1 = min(x0 + 1, images.shape[2] - 1), min(y0 + 1, images.shape[1] - 1)
     tx, ty = u - 0.5 - x0, v - 0.5 - y0
     for c in range(3):
-        top = image[y0, x0, c] * (1 - tx) + image[y0, x1, c] * tx
-        low = image[y1, x0, c] * (1 - tx) + image[y1, x1, c] * tx
+        top = images[k, y0, x0, c] * (1 - tx) + images[k, y0, x1, c] * tx
+        low = images[k, y1, x0, c] * (1 - tx) + images[k, y1, x1, c] * tx
         out[c] = top * (1 - ty) + low * ty
-    return cos * cos / max(length, 0.1) ** 2 * border[iv, iu]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def sample_frames(
     points, normals, camera_from_world, centers, images, depths, borders, intrinsics, depth_intrinsics, tolerance
 ):  # pragma: no cover - compiled  # fmt: skip
@@ -217,16 +229,19 @@ def sample_frames(
     weights = np.zeros((frames, count), np.float32)
     fx, fy, cx, cy = intrinsics
     dfx, dfy, dcx, dcy = depth_intrinsics
-    for t in prange(count):
-        for k in range(frames):
-            weights[k, t] = _sample_pixel(
-                points[t], normals[t], camera_from_world[k], centers[k], images[k], depths[k], borders[k],
-                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, colors[k, t],
+    for k in range(frames):
+        for t in range(count):
+            w, u, v = _weight(
+                t, k, points, normals, camera_from_world, centers, images, depths, borders,
+                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance,
             )  # fmt: skip
+            if w > 0:
+                weights[k, t] = w
+                _sample_pixel(images, k, u, v, colors[k, t])
     return colors, weights
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def blend_frames(
     points, normals, camera_from_world, centers, images, depths, borders, gains, intrinsics, depth_intrinsics, tolerance
 ):  # pragma: no cover - compiled  # fmt: skip
@@ -236,27 +251,30 @@ def blend_frames(
     seen = np.zeros(count, np.bool_)
     fx, fy, cx, cy = intrinsics
     dfx, dfy, dcx, dcy = depth_intrinsics
-    for t in prange(count):
-        best = np.zeros((3, 3), np.float32)
-        weight = np.zeros(3)
-        color = np.zeros(3, np.float32)
+    weight, place, frame = np.zeros(3), np.zeros((3, 2)), np.zeros(3, np.int64)  # of the best frames, best first
+    best = np.zeros((3, 3), np.float32)
+    for t in range(count):
+        weight[:] = 0.0
         for k in range(frames):
-            w = _sample_pixel(
-                points[t], normals[t], camera_from_world[k], centers[k], images[k], depths[k], borders[k],
-                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, color,
+            w, u, v = _weight(
+                t, k, points, normals, camera_from_world, centers, images, depths, borders,
+                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance,
             )  # fmt: skip
-            for slot in range(3):
-                if w > weight[slot]:
-                    for lower in range(2, slot, -1):
-                        weight[lower] = weight[lower - 1]
-                        best[lower] = best[lower - 1]
-                    weight[slot] = w
-                    for c in range(3):
-                        best[slot, c] = color[c] * gains[k]
-                    break
+            if w <= weight[2]:
+                continue
+            slot = 2
+            while slot > 0 and w > weight[slot - 1]:
+                weight[slot], frame[slot], place[slot] = weight[slot - 1], frame[slot - 1], place[slot - 1]
+                slot -= 1
+            weight[slot], frame[slot], place[slot, 0], place[slot, 1] = w, k, u, v
         if weight[0] <= 0:
             continue
         seen[t] = True
+        for slot in range(3):
+            if weight[slot] > 0:
+                _sample_pixel(images, frame[slot], place[slot, 0], place[slot, 1], best[slot])
+                for c in range(3):
+                    best[slot, c] *= gains[frame[slot]]
         total = 0.0
         for slot in range(3):
             if weight[slot] <= 0:
