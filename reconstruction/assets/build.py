@@ -3,6 +3,7 @@
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +41,12 @@ from reconstruction.core.types import (
     Surface,
     TexturedMesh,
 )
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.views import SceneViews
 from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
+
+_MOST_AT_ONCE = 4  # objects that take shape at once: each needs some 200 MB
 
 # Least size of a shape along each axis, relative to:
 _COVERED_SHARE = 0.75  # its seen points
@@ -115,13 +119,13 @@ def build_assets(
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
     scene = replace(gather_evidence(posed, depth, surface, instances, config, progress, views), keep=keep)
     objects, pending = [], deque[tuple[Draft, Future[Collided]]]()
-    # CoACD, a process of its own, works on one object while the next ones take shape.
+    # Objects take shape beside each other; meanwhile CoACD, a process of its own, decomposes those that have one.
     worker, collider = ThreadPoolExecutor(1), Collider(scene, len(instances.objects))
     try:
         drafts = []
-        for item in instances.objects:
-            drafts.append(draft_object(item, scene))
-            pending.append((drafts[-1], worker.submit(collider, drafts[-1])))
+        for draft in ordered_map(partial(draft_object, scene=scene), instances.objects, _MOST_AT_ONCE):
+            drafts.append(draft)
+            pending.append((draft, worker.submit(collider, draft)))
             while pending and pending[0][1].done():
                 objects.append(_finished(*pending.popleft(), scene, progress))
         room = build_room(
