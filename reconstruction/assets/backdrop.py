@@ -82,10 +82,9 @@ def _bake(
     height, width = config.texture_max_px, 2 * config.texture_max_px
     frames = np.flatnonzero(opened.any(axis=(1, 2)))
     depths = rasterize_frames(vertices, faces, camera, posed.world_from_camera[frames], lambda r: r.depth)
-    masks = [_mask(opened[f], np.asarray(id_maps[f])) for f in frames]
-    views = texture_views(
-        posed, camera, frames, [np.where(m > 0, d, 0) for m, d in zip(masks, depths)], masks
-    )
+    masks = np.array([_mask(opened[f], np.asarray(id_maps[f])) for f in frames]).reshape(depths.shape)
+    depths[masks <= 0] = 0
+    views = texture_views(posed, camera, frames, depths, masks)
     rows, columns = _looked_at(shell, views.depths, posed.world_from_camera[frames], camera, height, width)
     points = shell.at((columns + 0.5) / width, 1 - (rows + 0.5) / height)
     away = shell.center - points

@@ -26,7 +26,7 @@ from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.room import build_room
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
-from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
+from reconstruction.assets.views import MOST_AT_ONCE, ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, frame_object, fuse_volume
 from reconstruction.core.progress import NO_PROGRESS, NoProgress, Progress
 from reconstruction.core.types import (
@@ -45,8 +45,6 @@ from reconstruction.poses.parallel import ordered_map
 from reconstruction.views import SceneViews
 from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
-
-_MOST_AT_ONCE = 4  # objects that take shape at once: each needs some 200 MB
 
 # Least size of a shape along each axis, relative to:
 _COVERED_SHARE = 0.75  # its seen points
@@ -123,7 +121,7 @@ def build_assets(
     worker, collider = ThreadPoolExecutor(1), Collider(scene, len(instances.objects))
     try:
         drafts = []
-        for draft in ordered_map(partial(draft_object, scene=scene), instances.objects, _MOST_AT_ONCE):
+        for draft in ordered_map(partial(draft_object, scene=scene), instances.objects, MOST_AT_ONCE):
             drafts.append(draft)
             pending.append((draft, worker.submit(collider, draft)))
             while pending and pending[0][1].done():

@@ -1,7 +1,7 @@
 """Compiled kernels of the assets stage: viewing angles, volumetric fusion, texture sampling.
 
-They are long because all work on a voxel or texel happens in one iteration of a loop. Objects are made beside each other:
-a kernel releases the interpreter lock and runs on one thread.
+They are long because all work on a voxel or texel happens in one iteration of a loop. Objects are made beside each
+other: a kernel releases the interpreter lock and runs on one thread.
 """
 
 import math
@@ -123,7 +123,11 @@ def fuse_object(
             m = camera_from_grid[q]
             for j in range(ny):
                 gy = origin[1] + (j + 0.5) * voxel
-                mx, my, mz = m[0, 0] * gx + m[0, 1] * gy, m[1, 0] * gx + m[1, 1] * gy, m[2, 0] * gx + m[2, 1] * gy
+                mx, my, mz = (
+                    m[0, 0] * gx + m[0, 1] * gy,
+                    m[1, 0] * gx + m[1, 1] * gy,
+                    m[2, 0] * gx + m[2, 1] * gy,
+                )
                 for k in range(nz):
                     gz = origin[2] + (k + 0.5) * voxel
                     z = mz + m[2, 2] * gz + m[2, 3]
@@ -251,7 +255,11 @@ def blend_frames(
     seen = np.zeros(count, np.bool_)
     fx, fy, cx, cy = intrinsics
     dfx, dfy, dcx, dcy = depth_intrinsics
-    weight, place, frame = np.zeros(3), np.zeros((3, 2)), np.zeros(3, np.int64)  # of the best frames, best first
+    weight, place, frame = (
+        np.zeros(3),
+        np.zeros((3, 2)),
+        np.zeros(3, np.int64),
+    )  # of the best frames, best first
     best = np.zeros((3, 3), np.float32)
     for t in range(count):
         weight[:] = 0.0
