@@ -332,7 +332,9 @@ def push_pull(picture: np.ndarray, filled: np.ndarray) -> np.ndarray:
     current = c / np.maximum(w, 1e-12)[..., None]
     for c, w in reversed(levels[:-1]):
         up = cv2.resize(current, (c.shape[1], c.shape[0]), interpolation=cv2.INTER_LINEAR)
-        current = c + up.reshape(c.shape) * (1 - w)[..., None]
+        current = np.asarray(up).reshape(c.shape)
+        current *= (1 - w)[..., None]
+        current += c
     return current
 
 
