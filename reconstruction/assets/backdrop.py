@@ -78,28 +78,34 @@ def _bake(
     shell: Shell, opened: np.ndarray, id_maps: np.ndarray, posed: PosedFrames, camera: Camera, config: AssetsConfig
 ) -> Backdrop:  # fmt: skip
     """Color a shell from the open pixels of all keyframes; texels that none shows are interpolated."""
-    vertices, faces, uvs = shell.mesh()
     height, width = config.texture_max_px, 2 * config.texture_max_px
-    frames = np.flatnonzero(opened.any(axis=(1, 2)))
-    depths = rasterize_frames(vertices, faces, camera, posed.world_from_camera[frames], lambda r: r.depth)
-    masks = [_mask(opened[f], np.asarray(id_maps[f])) for f in frames]
-    views = texture_views(
-        posed, camera, frames, [np.where(m > 0, d, 0) for m, d in zip(masks, depths)], masks
-    )
-    rows, columns = _looked_at(shell, views.depths, posed.world_from_camera[frames], camera, height, width)
-    points = shell.at((columns + 0.5) / width, 1 - (rows + 0.5) / height)
-    away = shell.center - points
-    normals = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    color, seen, _ = collect_colors(Texels(rows, columns, points, normals), views, _TOLERANCE_M)
+    rows, columns, color = _shown(shell, opened, id_maps, posed, camera, height, width)
     picture, drawn = np.zeros((height, width, 3), np.float32), np.zeros((height, width), bool)
-    picture[rows[seen], columns[seen]] = color[seen]
-    drawn[rows[seen], columns[seen]] = True
+    picture[rows, columns], drawn[rows, columns] = color, True
     if drawn.any():
         wide = push_pull(np.tile(picture, (1, 3, 1)), np.tile(drawn, (1, 3)))[:, width : 2 * width]
     else:
         wide = picture + 180.0
     texture = np.clip(np.round(wide), 0, 255).astype(np.uint8)
-    return Backdrop(textured(vertices, faces, uvs, texture), float(drawn.mean()))
+    return Backdrop(textured(*shell.mesh(), texture), float(drawn.mean()))
+
+
+def _shown(
+    shell: Shell, opened: np.ndarray, id_maps: np.ndarray, posed: PosedFrames, camera: Camera, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return rows and columns int32 (t,) of the texels that open pixels show, and their colors (t, 3)."""
+    vertices, faces, _ = shell.mesh()
+    frames = np.flatnonzero(opened.any(axis=(1, 2)))
+    depths = rasterize_frames(vertices, faces, camera, posed.world_from_camera[frames], lambda r: r.depth)
+    masks = np.array([_mask(opened[f], np.asarray(id_maps[f])) for f in frames]).reshape(depths.shape)
+    depths[masks <= 0] = 0
+    views = texture_views(posed, camera, frames, depths, masks)
+    rows, columns = _looked_at(shell, views.depths, posed.world_from_camera[frames], camera, height, width)
+    points = shell.at((columns + 0.5) / width, 1 - (rows + 0.5) / height)
+    away = shell.center - points
+    normals = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    color, seen, _ = collect_colors(Texels(rows, columns, points, normals), views, _TOLERANCE_M)
+    return rows[seen], columns[seen], color[seen]
 
 
 def _mask(opened: np.ndarray, ids: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.room import build_room
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
-from reconstruction.assets.views import ScenePixels, object_noise, prepare_pixels
+from reconstruction.assets.views import MOST_AT_ONCE, ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, frame_object, fuse_volume
 from reconstruction.core.progress import NO_PROGRESS, NoProgress, Progress
 from reconstruction.core.types import (
@@ -40,6 +41,7 @@ from reconstruction.core.types import (
     Surface,
     TexturedMesh,
 )
+from reconstruction.poses.parallel import ordered_map
 from reconstruction.views import SceneViews
 from registry.errors import EnvironmentMissing
 from registry.geometry import rigid, transform_points
@@ -115,13 +117,13 @@ def build_assets(
     progress.start(len(instances.objects) + len(instances.base) + 1, "assets")
     scene = replace(gather_evidence(posed, depth, surface, instances, config, progress, views), keep=keep)
     objects, pending = [], deque[tuple[Draft, Future[Collided]]]()
-    # CoACD, a process of its own, works on one object while the next ones take shape.
+    # Objects take shape beside each other; meanwhile CoACD, a process of its own, decomposes those that have one.
     worker, collider = ThreadPoolExecutor(1), Collider(scene, len(instances.objects))
     try:
         drafts = []
-        for item in instances.objects:
-            drafts.append(draft_object(item, scene))
-            pending.append((drafts[-1], worker.submit(collider, drafts[-1])))
+        for draft in ordered_map(partial(draft_object, scene=scene), instances.objects, MOST_AT_ONCE):
+            drafts.append(draft)
+            pending.append((draft, worker.submit(collider, draft)))
             while pending and pending[0][1].done():
                 objects.append(_finished(*pending.popleft(), scene, progress))
         room = build_room(

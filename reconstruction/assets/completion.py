@@ -128,12 +128,18 @@ def hull_region(volume: ObjectVolume, points: np.ndarray, *, to_support: bool) -
     up = np.array([0, 0, 1.0])
     tilted = [around * np.cos(t) + up * np.sin(t) for t in (np.radians(30), np.radians(60))]
     directions = np.concatenate([around, *tilted, up[None], -up[None]])
-    limit = np.percentile(points @ directions.T, 99.8, axis=0) + 0.3 * volume.voxel_m
-    x, y, z = (volume.centers(a).astype(np.float32) for a in range(3))
-    inside = np.ones(volume.distance.shape, bool)
-    for n, bound in zip(directions.astype(np.float32), limit.astype(np.float32)):
-        inside &= (n[0] * x[:, None, None] + n[1] * y[None, :, None] + n[2] * z[None, None, :]) < bound
-    return inside
+    limits = np.percentile(directions @ points.T, 99.8, axis=1) + 0.3 * volume.voxel_m
+    x, y, z = (volume.centers(a) for a in range(3))
+    # Per column: whether it is inside sideways, and between which heights.
+    within = np.ones((len(x), len(y)), bool)
+    lowest, highest = -limits[-1], np.full(within.shape, np.inf)
+    for n, limit in zip(directions[:-1], limits):
+        left = limit - n[0] * x[:, None] - n[1] * y
+        if n[2] > 0:
+            highest = np.minimum(highest, left / n[2])
+        else:
+            within &= left > 0
+    return within[:, :, None] & (z > lowest) & (z < highest[:, :, None])
 
 
 def enclosed(volume: ObjectVolume, hull: np.ndarray, needed: int) -> np.ndarray:

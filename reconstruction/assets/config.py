@@ -54,7 +54,7 @@ class AssetsConfig:
     """So do solids with dents shallower than this share of their middle extent (noise) …"""
     dent_limit_m: float = 0.012
     """… and than this, metres."""
-    collision_faces: int = 600
+    collision_faces: int = 400
     """Faces of the decimated mesh that is decomposed."""
     coacd_threshold: float = 0.1
     """Concavity at which CoACD stops cutting; 0.6 of it for hollow objects."""

@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from reconstruction.assets.views import ScenePixels
+from reconstruction.assets.views import MOST_AT_ONCE, ScenePixels
 from reconstruction.assets.volume import ObjectFrame
-from reconstruction.core.types import Camera, InstanceSet, PosedFrames, Surface
+from reconstruction.core.types import Camera, Instance, InstanceSet, PosedFrames, Surface
+from reconstruction.poses.parallel import ordered_map
 from registry.geometry import invert_rigid, transform_points
 
 _CELL_M, _MAX_CELLS = 0.006, 6_000_000  # spacing of samples, and voxels of the distance field
@@ -50,19 +51,23 @@ def without_strays(
     pixels: ScenePixels, posed: PosedFrames, camera: Camera, surface: Surface, found: InstanceSet
 ) -> ScenePixels:
     """Set the depth of pixels that lie off the fused surface of their object to unknown."""
-    depth = pixels.depth.copy()
-    for item in found.objects:
+
+    def strays(item: Instance) -> tuple[np.ndarray, ...] | None:
         samples = sample_surface(item.id, surface, found)
-        rows, v, u = np.nonzero((pixels.ids == item.id) & (pixels.depth > 0))
+        rows, v, u = pixels.places(item.id)
         if len(samples) < _MIN_SAMPLES or len(rows) == 0:
-            continue
+            return None
         z = pixels.depth[rows, v, u].astype(np.float64)
         local = camera.unproject(u + 0.5, v + 0.5, z)
         pose = posed.world_from_camera[rows]
         points = np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3]
         stray = _distance(points, samples) > _REACH_M + _REACH_SIGMAS * pixels.noise_relative * z
-        if stray.mean() <= 1.0 - _MIN_BELIEVED:
-            depth[rows[stray], v[stray], u[stray]] = 0.0
+        return (rows[stray], v[stray], u[stray]) if stray.mean() <= 1.0 - _MIN_BELIEVED else None
+
+    depth = pixels.depth.copy()
+    for places in ordered_map(strays, found.objects, MOST_AT_ONCE):
+        if places is not None:
+            depth[places] = 0.0
     return replace(pixels, depth=depth)
 
 

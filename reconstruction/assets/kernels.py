@@ -1,6 +1,7 @@
 """Compiled kernels of the assets stage: viewing angles, volumetric fusion, texture sampling.
 
-They are long because all work on a voxel or texel happens in one iteration of a parallel loop.
+They are long because all work on a voxel or texel happens in one iteration of a loop. Objects are made beside each
+other: a kernel releases the interpreter lock and runs on one thread.
 """
 
 import math
@@ -86,12 +87,12 @@ def _beside_own(ids, f, target, iu, iv, w, h):  # pragma: no cover - compiled
     return iv < h - 1 and ids[f, iv + 1, iu] == target
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def fuse_object(
     depth, confidence, ids, cosine, inner, frames, camera_from_grid, fx, fy, cx, cy, target, shape, origin, voxel,
     trunc, tau, shell, shade,
 ):  # pragma: no cover - compiled  # fmt: skip
-    """Accumulate the evidence of all frames in every voxel of one object's grid.
+    """Accumulate the evidence of all frames in every voxel of one object's grid, a slab of voxels at a time.
 
     Returns (nx, ny, nz) each:
         numerator, denominator: of the mean signed distance to the seen surface, weighted towards large ones (soft
@@ -109,23 +110,30 @@ def fuse_object(
     behind = np.zeros((nx, ny, nz), np.uint16)
     within = np.zeros((nx, ny, nz), np.uint16)
     shaded = np.zeros((nx, ny, nz), np.uint16)
+    num, den = np.zeros((ny, nz)), np.zeros((ny, nz))
     h, w = depth.shape[1:]
-    for i in prange(nx):
+    hidden = -max(shade, 2.0 * trunc)  # voxels that far behind the surface learn nothing from it
+    for i in range(nx):
         gx = origin[0] + (i + 0.5) * voxel
-        for j in range(ny):
-            gy = origin[1] + (j + 0.5) * voxel
-            for k in range(nz):
-                gz = origin[2] + (k + 0.5) * voxel
-                num, den, n_free, n_near, n_outside, n_behind = 0.0, 0.0, 0, 0, 0, 0
-                n_within, n_shaded = 0, 0
-                for q in range(len(frames)):
-                    f = frames[q]
-                    m = camera_from_grid[q]
-                    z = m[2, 0] * gx + m[2, 1] * gy + m[2, 2] * gz + m[2, 3]
+        num[:] = 0.0
+        den[:] = 0.0
+        # Neighbours of a slab project to neighbouring pixels of a frame, which are in the processor's cache.
+        for q in range(len(frames)):
+            f = frames[q]
+            m = camera_from_grid[q]
+            for j in range(ny):
+                gy = origin[1] + (j + 0.5) * voxel
+                mx, my, mz = (
+                    m[0, 0] * gx + m[0, 1] * gy,
+                    m[1, 0] * gx + m[1, 1] * gy,
+                    m[2, 0] * gx + m[2, 1] * gy,
+                )
+                for k in range(nz):
+                    gz = origin[2] + (k + 0.5) * voxel
+                    z = mz + m[2, 2] * gz + m[2, 3]
                     if z < 0.05:
                         continue
-                    xn = (m[0, 0] * gx + m[0, 1] * gy + m[0, 2] * gz + m[0, 3]) / z
-                    yn = (m[1, 0] * gx + m[1, 1] * gy + m[1, 2] * gz + m[1, 3]) / z
+                    xn, yn = (mx + m[0, 2] * gz + m[0, 3]) / z, (my + m[1, 2] * gz + m[1, 3]) / z
                     u, v = fx * xn + cx, fy * yn + cy
                     if u < 0 or v < 0 or u >= w or v >= h:
                         continue
@@ -133,84 +141,89 @@ def fuse_object(
                     d = depth[f, iv, iu]
                     if d <= 0:
                         continue
-                    cos = cosine[f, iv, iu]
-                    ray = math.sqrt(xn * xn + yn * yn + 1.0)
                     if ids[f, iv, iu] == target:
+                        if d * (1.0 + _EDGE) - z < hidden:
+                            continue
+                        cos = cosine[f, iv, iu]
                         d = _own_depth(depth, ids, f, target, u, v, w, h)
-                        along = (d - z) * ray
+                        along = (d - z) * math.sqrt(xn * xn + yn * yn + 1.0)
                         s = along * max(cos, 0.25)
                         if along < -trunc and s < -0.5 * trunc:
                             if along > -shade:
-                                n_shaded += 1
+                                shaded[i, j, k] += 1
                             continue
-                        weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
                         if s >= trunc:
                             if cos > 0:
-                                n_free += 1
+                                freed[i, j, k] += 1
                             continue
                         if cos > 0:
-                            n_near += 1
+                            support[i, j, k] += 1
                             if inner[f, iv, iu]:
-                                n_within += 1
+                                within[i, j, k] += 1
                             if s < 0 and s > -shell:
-                                n_behind += 1
+                                behind[i, j, k] += 1
+                        weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
                         soft = weight * math.exp(max(s, -trunc) / tau)
-                        num += soft * max(s, -trunc)
-                        den += soft
-                    elif cos > 0:
-                        s = (d - z) * ray * max(cos, 0.1)
-                        if s > 0.0 and not _beside_own(ids, f, target, iu, iv, w, h):
-                            n_outside += 1
-                            if s > 0.6 * trunc:
-                                n_free += 1
-                numerator[i, j, k] = num
-                denominator[i, j, k] = den
-                freed[i, j, k] = n_free
-                support[i, j, k] = n_near
-                outside[i, j, k] = n_outside
-                behind[i, j, k] = n_behind
-                within[i, j, k] = n_within
-                shaded[i, j, k] = n_shaded
+                        num[j, k] += soft * max(s, -trunc)
+                        den[j, k] += soft
+                    elif d > z and cosine[f, iv, iu] > 0 and not _beside_own(ids, f, target, iu, iv, w, h):
+                        outside[i, j, k] += 1
+                        ray = math.sqrt(xn * xn + yn * yn + 1.0)
+                        if (d - z) * ray * max(cosine[f, iv, iu], 0.1) > 0.6 * trunc:
+                            freed[i, j, k] += 1
+        numerator[i] = num
+        denominator[i] = den
     return numerator, denominator, freed, support, outside, behind, within, shaded
 
 
 @njit(cache=True, inline="always")
-def _sample_pixel(
-    point, normal, m, center, image, depth, border, fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, out
-):  # pragma: no cover - compiled
-    """Write a point's color in one frame to `out` (3,); return its weight, 0 where the frame does not see it."""
-    px, py, pz = point[0], point[1], point[2]
-    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+def _weight(
+    t, k, points, normals, camera_from_world, centers, images, depths, borders, fx, fy, cx, cy, dfx, dfy, dcx, dcy,
+    tolerance,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Return the weight of frame `k` for point `t`, 0 where it does not see the point, and the point's column and row.
+
+    It takes whole arrays, as slices of arrays are counted references.
+    """
+    px, py, pz = points[t, 0], points[t, 1], points[t, 2]
+    m = camera_from_world
+    z = m[k, 2, 0] * px + m[k, 2, 1] * py + m[k, 2, 2] * pz + m[k, 2, 3]
     if z < 0.05:
-        return 0.0
-    xn = (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]) / z
-    yn = (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]) / z
+        return 0.0, 0.0, 0.0
+    xn = (m[k, 0, 0] * px + m[k, 0, 1] * py + m[k, 0, 2] * pz + m[k, 0, 3]) / z
+    yn = (m[k, 1, 0] * px + m[k, 1, 1] * py + m[k, 1, 2] * pz + m[k, 1, 3]) / z
     u, v = fx * xn + cx, fy * yn + cy
-    h, w = image.shape[0], image.shape[1]
-    if u < 0.5 or v < 0.5 or u >= w - 0.5 or v >= h - 0.5:
-        return 0.0
-    vx, vy, vz = center[0] - px, center[1] - py, center[2] - pz
+    if u < 0.5 or v < 0.5 or u >= images.shape[2] - 0.5 or v >= images.shape[1] - 0.5:
+        return 0.0, 0.0, 0.0
+    iu = min(max(int(dfx * xn + dcx), 0), depths.shape[2] - 1)
+    iv = min(max(int(dfy * yn + dcy), 0), depths.shape[1] - 1)
+    here, border = depths[k, iv, iu], borders[k, iv, iu]
+    if here <= 0 or border <= 0:
+        return 0.0, 0.0, 0.0
+    vx, vy, vz = centers[k, 0] - px, centers[k, 1] - py, centers[k, 2] - pz
     length = math.sqrt(vx * vx + vy * vy + vz * vz)
-    cos = (vx * normal[0] + vy * normal[1] + vz * normal[2]) / max(length, 1e-9)
+    cos = (vx * normals[t, 0] + vy * normals[t, 1] + vz * normals[t, 2]) / max(length, 1e-9)
     if cos < 0.08:
-        return 0.0
-    iu = min(max(int(dfx * xn + dcx), 0), depth.shape[1] - 1)
-    iv = min(max(int(dfy * yn + dcy), 0), depth.shape[0] - 1)
-    here = depth[iv, iu]
+        return 0.0, 0.0, 0.0
     slope = 1.5 * z / dfx / max(cos, 0.1)  # change of depth over a pixel
-    if here <= 0 or abs(here - z) > tolerance + slope or border[iv, iu] <= 0:
-        return 0.0
+    if abs(here - z) > tolerance + slope:
+        return 0.0, 0.0, 0.0
+    return cos * cos / max(length, 0.1) ** 2 * border, u, v
+
+
+@njit(cache=True, inline="always")
+def _sample_pixel(images, k, u, v, out):  # pragma: no cover - compiled
+    """Write the interpolated color of frame `k` at column `u` and row `v` to `out` (3,)."""
     x0, y0 = int(u - 0.5), int(v - 0.5)
-    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    x1, y1 = min(x0 + 1, images.shape[2] - 1), min(y0 + 1, images.shape[1] - 1)
     tx, ty = u - 0.5 - x0, v - 0.5 - y0
     for c in range(3):
-        top = image[y0, x0, c] * (1 - tx) + image[y0, x1, c] * tx
-        low = image[y1, x0, c] * (1 - tx) + image[y1, x1, c] * tx
+        top = images[k, y0, x0, c] * (1 - tx) + images[k, y0, x1, c] * tx
+        low = images[k, y1, x0, c] * (1 - tx) + images[k, y1, x1, c] * tx
         out[c] = top * (1 - ty) + low * ty
-    return cos * cos / max(length, 0.1) ** 2 * border[iv, iu]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def sample_frames(
     points, normals, camera_from_world, centers, images, depths, borders, intrinsics, depth_intrinsics, tolerance
 ):  # pragma: no cover - compiled  # fmt: skip
@@ -220,16 +233,19 @@ def sample_frames(
     weights = np.zeros((frames, count), np.float32)
     fx, fy, cx, cy = intrinsics
     dfx, dfy, dcx, dcy = depth_intrinsics
-    for t in prange(count):
-        for k in range(frames):
-            weights[k, t] = _sample_pixel(
-                points[t], normals[t], camera_from_world[k], centers[k], images[k], depths[k], borders[k],
-                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, colors[k, t],
+    for k in range(frames):
+        for t in range(count):
+            w, u, v = _weight(
+                t, k, points, normals, camera_from_world, centers, images, depths, borders,
+                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance,
             )  # fmt: skip
+            if w > 0:
+                weights[k, t] = w
+                _sample_pixel(images, k, u, v, colors[k, t])
     return colors, weights
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def blend_frames(
     points, normals, camera_from_world, centers, images, depths, borders, gains, intrinsics, depth_intrinsics, tolerance
 ):  # pragma: no cover - compiled  # fmt: skip
@@ -239,27 +255,34 @@ def blend_frames(
     seen = np.zeros(count, np.bool_)
     fx, fy, cx, cy = intrinsics
     dfx, dfy, dcx, dcy = depth_intrinsics
-    for t in prange(count):
-        best = np.zeros((3, 3), np.float32)
-        weight = np.zeros(3)
-        color = np.zeros(3, np.float32)
+    weight, place, frame = (
+        np.zeros(3),
+        np.zeros((3, 2)),
+        np.zeros(3, np.int64),
+    )  # of the best frames, best first
+    best = np.zeros((3, 3), np.float32)
+    for t in range(count):
+        weight[:] = 0.0
         for k in range(frames):
-            w = _sample_pixel(
-                points[t], normals[t], camera_from_world[k], centers[k], images[k], depths[k], borders[k],
-                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, color,
+            w, u, v = _weight(
+                t, k, points, normals, camera_from_world, centers, images, depths, borders,
+                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance,
             )  # fmt: skip
-            for slot in range(3):
-                if w > weight[slot]:
-                    for lower in range(2, slot, -1):
-                        weight[lower] = weight[lower - 1]
-                        best[lower] = best[lower - 1]
-                    weight[slot] = w
-                    for c in range(3):
-                        best[slot, c] = color[c] * gains[k]
-                    break
+            if w <= weight[2]:
+                continue
+            slot = 2
+            while slot > 0 and w > weight[slot - 1]:
+                weight[slot], frame[slot], place[slot] = weight[slot - 1], frame[slot - 1], place[slot - 1]
+                slot -= 1
+            weight[slot], frame[slot], place[slot, 0], place[slot, 1] = w, k, u, v
         if weight[0] <= 0:
             continue
         seen[t] = True
+        for slot in range(3):
+            if weight[slot] > 0:
+                _sample_pixel(images, frame[slot], place[slot, 0], place[slot, 1], best[slot])
+                for c in range(3):
+                    best[slot, c] *= gains[frame[slot]]
         total = 0.0
         for slot in range(3):
             if weight[slot] <= 0:

@@ -50,8 +50,9 @@ def build_room(
         for o in objects
         if not o.attached_hint and np.ptp(o.visual.vertices, axis=0).max() < config.furniture_m
     ]
-    fixed = ~np.isin(pixels.ids, [*moves, *(r.entity.id for r in rectangles)])
-    base = bake_base(rectangles, hits, fixed, posed, depth, pixels, config)
+    fixed = np.ones(int(pixels.ids.max()) + 1, bool)  # by id
+    fixed[[i for i in (*moves, *(r.entity.id for r in rectangles)) if i < len(fixed)]] = False
+    base = bake_base(rectangles, hits, fixed[pixels.ids], posed, depth, pixels, config)
     return base, build_backdrop(
         posed, depth, pixels.ids, np.concatenate([m[1] for m in meshes]), hits == 0, config
     )

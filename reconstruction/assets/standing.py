@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reconstruction.assets.support import support_height
-from reconstruction.assets.views import ScenePixels, SeenPoints, lift_object, within_outlines
+from reconstruction.assets.views import MOST_AT_ONCE, ScenePixels, SeenPoints, lift_object, within_outlines
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, without_outliers
 from reconstruction.core.types import DepthMaps, Instance, InstanceSet, PosedFrames
+from reconstruction.poses.parallel import ordered_map
 from registry.geometry import invert_rigid, transform_points
 
 _SAME_LEVEL_M = 0.015  # levels of one parent's children that differ by less are the same level
@@ -61,10 +62,11 @@ def find_stands(posed: PosedFrames, depth: DepthMaps, pixels: ScenePixels, found
     """Measure where each object with 30 seen points or more touches the carrier that its `support_hint` names."""
     from scipy.spatial import ConvexHull, QhullError
 
-    seen = {
-        o.id: within_outlines(lift_object(posed, depth, pixels, o.id), posed, depth, pixels, o.id)
-        for o in found.objects
-    }
+    def seen_points(item: Instance) -> SeenPoints:
+        return within_outlines(lift_object(posed, depth, pixels, item.id), posed, depth, pixels, item.id)
+
+    every = ordered_map(seen_points, found.objects, MOST_AT_ONCE)
+    seen = {item.id: points for item, points in zip(found.objects, every)}
     # An unlabeled carrier may be the lower part of the object itself: it gets no covered top.
     shaped = {o.id for o in found.objects if o.label != "unknown"}
     by_child: dict[int, Standing] = {}

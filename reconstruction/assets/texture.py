@@ -4,6 +4,7 @@ A texel takes the blend of the best few frames that show it: where the object's 
 instance map has the object's id. Exposures are equalized first. Unseen texels take colors of the nearest seen surface.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -116,7 +117,8 @@ class TextureViews:
 
 
 def texture_views(
-    posed: PosedFrames, depth_camera: Camera, frames: np.ndarray, depths: list[np.ndarray], borders: list[np.ndarray]
+    posed: PosedFrames, depth_camera: Camera, frames: np.ndarray, depths: Sequence[np.ndarray] | np.ndarray,
+    borders: Sequence[np.ndarray] | np.ndarray,
 ) -> TextureViews:  # fmt: skip
     """Gather the views of the keyframes at rows `frames`; `depths` and `borders` are theirs."""
     shape = (len(frames), depth_camera.height, depth_camera.width)
@@ -126,8 +128,8 @@ def texture_views(
         np.ascontiguousarray(invert_rigid(poses)),
         np.ascontiguousarray(poses[:, :3, 3]),
         np.ascontiguousarray(posed.images[frames]),
-        np.array(depths, np.float32).reshape(shape),
-        np.array(borders, np.float32).reshape(shape),
+        np.asarray(depths, np.float32).reshape(shape),
+        np.asarray(borders, np.float32).reshape(shape),
         tuple(posed.camera.intrinsics.tolist()),
         tuple(depth_camera.intrinsics.tolist()),
     )
@@ -330,7 +332,9 @@ def push_pull(picture: np.ndarray, filled: np.ndarray) -> np.ndarray:
     current = c / np.maximum(w, 1e-12)[..., None]
     for c, w in reversed(levels[:-1]):
         up = cv2.resize(current, (c.shape[1], c.shape[0]), interpolation=cv2.INTER_LINEAR)
-        current = c + up.reshape(c.shape) * (1 - w)[..., None]
+        current = np.asarray(up).reshape(c.shape)
+        current *= (1 - w)[..., None]
+        current += c
     return current
 
 

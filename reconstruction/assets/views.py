@@ -14,6 +14,7 @@ from registry.geometry import invert_rigid, transform_points
 
 _OUTLINE_PX = 3  # depth and ids are unreliable this close to an instance's outline
 _NEAR_M = 0.05  # nearer points do not project
+MOST_AT_ONCE = 4  # objects worked on at once: each needs some 200 MB
 FEW_PIXELS = 8  # frames that show no more of an object are ignored
 
 
@@ -31,6 +32,11 @@ class ScenePixels:
     def counts(self, target: int) -> np.ndarray:
         """Return how many pixels of each frame show instance `target` (n,)."""
         return (self.ids == target).reshape(len(self.ids), -1).sum(axis=1)
+
+    def places(self, target: int) -> tuple[np.ndarray, ...]:
+        """Return frames, rows and columns int64 (k,), each, of the pixels with depth that show instance `target`."""
+        shown = np.flatnonzero((self.ids == target) & (self.depth > 0))
+        return np.unravel_index(shown, self.ids.shape)
 
 
 def prepare_pixels(posed: PosedFrames, depth: DepthMaps, id_maps: np.ndarray) -> ScenePixels:
@@ -155,7 +161,7 @@ def lift_object(
 ) -> SeenPoints:
     """Unproject the depth pixels of instance `target`, evenly thinned to `limit` points at most, with normals."""
     camera = depth.camera
-    rows, v, u = np.nonzero((pixels.ids == target) & (pixels.depth > 0))
+    rows, v, u = pixels.places(target)
     if len(rows) > limit:
         keep = np.linspace(0, len(rows) - 1, limit).astype(np.int64)
         rows, v, u = rows[keep], v[keep], u[keep]

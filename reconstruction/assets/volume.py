@@ -121,7 +121,8 @@ def without_outliers(seen: SeenPoints) -> tuple[np.ndarray, np.ndarray]:
         return points, seen.normals
     flat = np.ravel_multi_index((keys + 1).T, dims)
     count = np.bincount(flat, minlength=int(dims.prod())).reshape(dims).astype(np.float32)
-    pairs = np.unique(np.stack([flat, seen.frames.astype(np.int64)]), axis=1)[0]
+    frame_count = int(seen.frames.max()) + 1
+    pairs = np.unique(flat * frame_count + seen.frames) // frame_count
     frames = np.bincount(pairs, minlength=int(dims.prod())).reshape(dims).astype(np.float32)
     density = uniform_filter(count, 3, mode="constant").ravel()[flat] * 27
     reports = uniform_filter(frames, 3, mode="constant").ravel()[flat] * 27

@@ -20,12 +20,15 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def ordered_map(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield function(item) for each item, in order; the first exception is raised and cancels the rest."""
+def ordered_map(function: Callable[[T], R], items: Iterable[T], most_threads: int = 256) -> Iterator[R]:
+    """Yield function(item) for each item, in order; the first exception is raised and cancels the rest.
+
+    `most_threads` bounds the memory of large items on machines with many cores.
+    """
     from threadpoolctl import threadpool_limits
 
     cv2_threads = cv2.getNumThreads()
-    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(usable_cores()) as pool:
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(min(usable_cores(), most_threads)) as pool:
         cv2.setNumThreads(1)
         try:
             yield from pool.map(function, items)
