@@ -31,8 +31,8 @@ class UsageMeter:
     """Context manager that measures this process and its descendants while the body runs.
 
     Memory is the resident set of this process plus the unique set of each descendant, so that pages shared after a fork
-    count once. It is sampled five times a second. Where the kernel keeps a high-water mark, peaks of this process between two
-    samples count, too. CPU time includes descendants that have ended.
+    count once. It is sampled five times a second. Where the kernel keeps a high-water mark, peaks of this process
+    between two samples count, too. CPU time includes descendants that have ended.
     """
 
     def __enter__(self) -> "UsageMeter":
