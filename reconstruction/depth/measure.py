@@ -127,10 +127,10 @@ def _refine(scene: DepthScene, i: int, rho: np.ndarray, gray: np.ndarray, out: M
     fitted, gx, gy = (np.empty(scene.shape, np.float32) for _ in range(3))
     score = np.full(scene.shape, -1.0, np.float32)
     noise = scene.config.noise_gray
-    for step_px in _STEPS_PX[: scene.config.refine_rounds]:
+    for turn, step_px in enumerate(_STEPS_PX[: scene.config.refine_rounds]):
         fit_slopes(rho, _SURFACE_STEP, fitted, gx, gy)
         for (bounds, _), (seen, h_inf, shift) in zip(parts, warps):
-            refine(gray[i], seen, h_inf, shift, fitted, gx, gy, step_px, noise, bounds, rho, score)
+            refine(gray[i], seen, h_inf, shift, fitted, gx, gy, step_px, turn == 0, noise, bounds, rho, score)
     out.correlation[i] = score
     fit_slopes(rho, _SURFACE_STEP, fitted, gx, gy)
     sharpen_edges(rho, gx, gy, score, small_color(scene.posed.images[i], scene.camera), out.rho[i])

@@ -133,13 +133,13 @@ def _peak(line):  # pragma: no cover - compiled
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def refine(
-    reference, sources, h_inf, shift, rho, gx, gy, px_step, noise, part, out_rho, out_score
+    reference, sources, h_inf, shift, rho, gx, gy, px_step, thorough, noise, part, out_rho, out_score
 ):  # pragma: no cover
     """Try inverse depths around `rho` (h, w) in steps of `px_step` pixels of disparity; keep the best, by parabola.
 
-    One step is tried to each side, a second one beyond the better of the two if that is better than the middle. Only
-    `part` (top, bottom, left, right) of the frame is written: the sources are those of the part. A try's worth is the
-    mean correlation with the two sources that see the unmoved window best: the others may not see it at all.
+    Two steps are tried to each side; if not `thorough`, the second one only where the first one is the best so far.
+    Only `part` (top, bottom, left, right) of the frame is written: the sources are those of the part. A try's worth is
+    the mean correlation with the two sources that see the unmoved window best: the others may not see it at all.
     """
     s, sh, sw = sources.shape
     flat = sources.reshape(s, sh * sw)
@@ -166,10 +166,12 @@ def refine(
             step = px_step / _disparity_rate(maps, r)
             line[:] = -1.0
             line[2] = _mean_of_seen(first, second)
-            for turn in range(3 if best >= 0 else 0):
-                at = 1 + 2 * turn if turn < 2 else (0 if line[1] > line[3] else 4)
+            for at in (1, 3, 0, 4):
                 q = r + np.float32(at - 2) * step
-                if q <= np.float32(0.0) or (turn == 2 and max(line[1], line[3]) <= line[2]):
+                if best < 0 or q <= np.float32(0.0):
+                    continue
+                nearer = line[1] if at < 2 else line[3]
+                if (at == 0 or at == 4) and not thorough and nearer < max(line[1], line[2], line[3]):
                     continue
                 seen[1] = none
                 for n in range(2 if other >= 0 else 1):

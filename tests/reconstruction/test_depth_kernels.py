@@ -88,7 +88,7 @@ def test_parts_with_the_same_sources_are_the_whole(images) -> None:
         rho, score = np.full((H, W), -1, np.float32), np.full((H, W), -9, np.float32)
         for part in parts:
             refine(
-                images[0], images[1:], h_inf, shift, fitted, slope, slope, 0.7, NOISE, part, rho, score
+                images[0], images[1:], h_inf, shift, fitted, slope, slope, 0.7, True, NOISE, part, rho, score
             )  # fmt: skip
         refined.append((rho, score))
     assert np.array_equal(refined[0], refined[1])
