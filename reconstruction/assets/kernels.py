@@ -56,6 +56,88 @@ def incidence_cosines(depth, fx, fy, cx, cy):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
+def _fuse_slab(
+    depth, confidence, ids, cosine, inner, f, m, fx, fy, cx, cy, target, gx, origin, voxel, trunc, tau, shell, shade,
+    num, den, freed, support, outside, behind, within, shaded,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Add the evidence of frame `f` to the sums (ny, nz) of the voxels at `gx`; see `fuse_object`."""
+    ny, nz = num.shape
+    h, w = depth.shape[1:]
+    hidden = -max(shade, 2.0 * trunc)  # voxels that far behind the surface learn nothing from it
+    for j in range(ny):
+        gy = origin[1] + (j + 0.5) * voxel
+        mx, my, mz = (
+            m[0, 0] * gx + m[0, 1] * gy,
+            m[1, 0] * gx + m[1, 1] * gy,
+            m[2, 0] * gx + m[2, 1] * gy,
+        )
+        for k in range(nz):
+            gz = origin[2] + (k + 0.5) * voxel
+            z = mz + m[2, 2] * gz + m[2, 3]
+            if z < 0.05:
+                continue
+            xn, yn = (mx + m[0, 2] * gz + m[0, 3]) / z, (my + m[1, 2] * gz + m[1, 3]) / z
+            u, v = fx * xn + cx, fy * yn + cy
+            if u < 0 or v < 0 or u >= w or v >= h:
+                continue
+            iu, iv = int(u), int(v)
+            d = depth[f, iv, iu]
+            if d <= 0:
+                continue
+            if ids[f, iv, iu] == target:
+                if d * (1.0 + _EDGE) - z < hidden:
+                    continue
+                cos = cosine[f, iv, iu]
+                # Bilinear where the four pixels around show the object and are one surface.
+                x0, y0 = int(math.floor(u - 0.5)), int(math.floor(v - 0.5))
+                if (
+                    x0 >= 0 and y0 >= 0 and x0 + 1 < w and y0 + 1 < h
+                    and ids[f, y0, x0] == target and ids[f, y0, x0 + 1] == target
+                    and ids[f, y0 + 1, x0] == target and ids[f, y0 + 1, x0 + 1] == target
+                ):  # fmt: skip
+                    d00, d01 = depth[f, y0, x0], depth[f, y0, x0 + 1]
+                    d10, d11 = depth[f, y0 + 1, x0], depth[f, y0 + 1, x0 + 1]
+                    low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
+                    if low > 0 and high - low <= _EDGE * d:
+                        tx, ty = u - 0.5 - x0, v - 0.5 - y0
+                        top, bottom = d00 * (1 - tx) + d01 * tx, d10 * (1 - tx) + d11 * tx
+                        d = top * (1 - ty) + bottom * ty
+                along = (d - z) * math.sqrt(xn * xn + yn * yn + 1.0)
+                s = along * max(cos, 0.25)
+                if along < -trunc and s < -0.5 * trunc:
+                    if along > -shade:
+                        shaded[j, k] += 1
+                    continue
+                if s >= trunc:
+                    if cos > 0:
+                        freed[j, k] += 1
+                    continue
+                if cos > 0:
+                    support[j, k] += 1
+                    if inner[f, iv, iu]:
+                        within[j, k] += 1
+                    if s < 0 and s > -shell:
+                        behind[j, k] += 1
+                weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
+                soft = weight * math.exp(max(s, -trunc) / tau)
+                num[j, k] += soft * max(s, -trunc)
+                den[j, k] += soft
+            elif d > z and cosine[f, iv, iu] > 0:
+                # Outlines are known to a pixel only.
+                if (
+                    (iu > 0 and ids[f, iv, iu - 1] == target)
+                    or (iu < w - 1 and ids[f, iv, iu + 1] == target)
+                    or (iv > 0 and ids[f, iv - 1, iu] == target)
+                    or (iv < h - 1 and ids[f, iv + 1, iu] == target)
+                ):
+                    continue
+                outside[j, k] += 1
+                ray = math.sqrt(xn * xn + yn * yn + 1.0)
+                if (d - z) * ray * max(cosine[f, iv, iu], 0.1) > 0.6 * trunc:
+                    freed[j, k] += 1
+
+
+@njit(cache=True, nogil=True)
 def fuse_object(
     depth, confidence, ids, cosine, inner, frames, camera_from_grid, fx, fy, cx, cy, target, shape, origin, voxel,
     trunc, tau, shell, shade,
@@ -79,87 +161,17 @@ def fuse_object(
     within = np.zeros((nx, ny, nz), np.uint16)
     shaded = np.zeros((nx, ny, nz), np.uint16)
     num, den = np.zeros((ny, nz)), np.zeros((ny, nz))
-    h, w = depth.shape[1:]
-    hidden = -max(shade, 2.0 * trunc)  # voxels that far behind the surface learn nothing from it
     for i in range(nx):
         gx = origin[0] + (i + 0.5) * voxel
         num[:] = 0.0
         den[:] = 0.0
         # Neighbours of a slab project to neighbouring pixels of a frame, which are in the processor's cache.
         for q in range(len(frames)):
-            f = frames[q]
-            m = camera_from_grid[q]
-            for j in range(ny):
-                gy = origin[1] + (j + 0.5) * voxel
-                mx, my, mz = (
-                    m[0, 0] * gx + m[0, 1] * gy,
-                    m[1, 0] * gx + m[1, 1] * gy,
-                    m[2, 0] * gx + m[2, 1] * gy,
-                )
-                for k in range(nz):
-                    gz = origin[2] + (k + 0.5) * voxel
-                    z = mz + m[2, 2] * gz + m[2, 3]
-                    if z < 0.05:
-                        continue
-                    xn, yn = (mx + m[0, 2] * gz + m[0, 3]) / z, (my + m[1, 2] * gz + m[1, 3]) / z
-                    u, v = fx * xn + cx, fy * yn + cy
-                    if u < 0 or v < 0 or u >= w or v >= h:
-                        continue
-                    iu, iv = int(u), int(v)
-                    d = depth[f, iv, iu]
-                    if d <= 0:
-                        continue
-                    if ids[f, iv, iu] == target:
-                        if d * (1.0 + _EDGE) - z < hidden:
-                            continue
-                        cos = cosine[f, iv, iu]
-                        # Bilinear where the four pixels around show the object and are one surface.
-                        x0, y0 = int(math.floor(u - 0.5)), int(math.floor(v - 0.5))
-                        if (
-                            x0 >= 0 and y0 >= 0 and x0 + 1 < w and y0 + 1 < h
-                            and ids[f, y0, x0] == target and ids[f, y0, x0 + 1] == target
-                            and ids[f, y0 + 1, x0] == target and ids[f, y0 + 1, x0 + 1] == target
-                        ):  # fmt: skip
-                            d00, d01 = depth[f, y0, x0], depth[f, y0, x0 + 1]
-                            d10, d11 = depth[f, y0 + 1, x0], depth[f, y0 + 1, x0 + 1]
-                            low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
-                            if low > 0 and high - low <= _EDGE * d:
-                                tx, ty = u - 0.5 - x0, v - 0.5 - y0
-                                top, bottom = d00 * (1 - tx) + d01 * tx, d10 * (1 - tx) + d11 * tx
-                                d = top * (1 - ty) + bottom * ty
-                        along = (d - z) * math.sqrt(xn * xn + yn * yn + 1.0)
-                        s = along * max(cos, 0.25)
-                        if along < -trunc and s < -0.5 * trunc:
-                            if along > -shade:
-                                shaded[i, j, k] += 1
-                            continue
-                        if s >= trunc:
-                            if cos > 0:
-                                freed[i, j, k] += 1
-                            continue
-                        if cos > 0:
-                            support[i, j, k] += 1
-                            if inner[f, iv, iu]:
-                                within[i, j, k] += 1
-                            if s < 0 and s > -shell:
-                                behind[i, j, k] += 1
-                        weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
-                        soft = weight * math.exp(max(s, -trunc) / tau)
-                        num[j, k] += soft * max(s, -trunc)
-                        den[j, k] += soft
-                    elif d > z and cosine[f, iv, iu] > 0:
-                        # Outlines are known to a pixel only.
-                        if (
-                            (iu > 0 and ids[f, iv, iu - 1] == target)
-                            or (iu < w - 1 and ids[f, iv, iu + 1] == target)
-                            or (iv > 0 and ids[f, iv - 1, iu] == target)
-                            or (iv < h - 1 and ids[f, iv + 1, iu] == target)
-                        ):
-                            continue
-                        outside[i, j, k] += 1
-                        ray = math.sqrt(xn * xn + yn * yn + 1.0)
-                        if (d - z) * ray * max(cosine[f, iv, iu], 0.1) > 0.6 * trunc:
-                            freed[i, j, k] += 1
+            _fuse_slab(
+                depth, confidence, ids, cosine, inner, frames[q], camera_from_grid[q], fx, fy, cx, cy, target, gx,
+                origin, voxel, trunc, tau, shell, shade, num, den,
+                freed[i], support[i], outside[i], behind[i], within[i], shaded[i],
+            )  # fmt: skip
         numerator[i] = num
         denominator[i] = den
     return numerator, denominator, freed, support, outside, behind, within, shaded
