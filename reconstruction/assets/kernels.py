@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+_BLOCK = 256  # points that are weighed at once
 _EDGE = 0.025  # relative depth difference to a neighbor that is a discontinuity
 
 
@@ -54,37 +55,86 @@ def incidence_cosines(depth, fx, fy, cx, cy):  # pragma: no cover - compiled
     return out
 
 
-@njit(cache=True, inline="always")
-def _own_depth(depth, ids, f, target, u, v, w, h):  # pragma: no cover - compiled
-    """Bilinear depth where the four pixels around show the object and are one surface, else the nearest pixel's."""
-    iu, iv = int(u), int(v)
-    here = depth[f, iv, iu]
-    x0, y0 = int(math.floor(u - 0.5)), int(math.floor(v - 0.5))
-    if x0 < 0 or y0 < 0 or x0 + 1 >= w or y0 + 1 >= h:
-        return here
-    a, b = depth[f, y0, x0], depth[f, y0, x0 + 1]
-    c, d = depth[f, y0 + 1, x0], depth[f, y0 + 1, x0 + 1]
-    if ids[f, y0, x0] != target or ids[f, y0, x0 + 1] != target:
-        return here
-    if ids[f, y0 + 1, x0] != target or ids[f, y0 + 1, x0 + 1] != target:
-        return here
-    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-    if low <= 0 or high - low > _EDGE * here:
-        return here
-    tx, ty = u - 0.5 - x0, v - 0.5 - y0
-    return (a * (1 - tx) + b * tx) * (1 - ty) + (c * (1 - tx) + d * tx) * ty
-
-
-@njit(cache=True, inline="always")
-def _beside_own(ids, f, target, iu, iv, w, h):  # pragma: no cover - compiled
-    """Whether a pixel borders one of the object: outlines are known to a pixel only."""
-    if iu > 0 and ids[f, iv, iu - 1] == target:
-        return True
-    if iu < w - 1 and ids[f, iv, iu + 1] == target:
-        return True
-    if iv > 0 and ids[f, iv - 1, iu] == target:
-        return True
-    return iv < h - 1 and ids[f, iv + 1, iu] == target
+@njit(cache=True, nogil=True)
+def _fuse_slab(
+    depth, confidence, ids, cosine, inner, f, m, fx, fy, cx, cy, target, gx, origin, voxel, trunc, tau, shell, shade,
+    num, den, freed, support, outside, behind, within, shaded,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Add the evidence of frame `f` to the sums (ny, nz) of the voxels at `gx`; see `fuse_object`."""
+    ny, nz = num.shape
+    h, w = depth.shape[1:]
+    hidden = -max(shade, 2.0 * trunc)  # voxels that far behind the surface learn nothing from it
+    for j in range(ny):
+        gy = origin[1] + (j + 0.5) * voxel
+        mx, my, mz = (
+            m[0, 0] * gx + m[0, 1] * gy,
+            m[1, 0] * gx + m[1, 1] * gy,
+            m[2, 0] * gx + m[2, 1] * gy,
+        )
+        for k in range(nz):
+            gz = origin[2] + (k + 0.5) * voxel
+            z = mz + m[2, 2] * gz + m[2, 3]
+            if z < 0.05:
+                continue
+            xn, yn = (mx + m[0, 2] * gz + m[0, 3]) / z, (my + m[1, 2] * gz + m[1, 3]) / z
+            u, v = fx * xn + cx, fy * yn + cy
+            if u < 0 or v < 0 or u >= w or v >= h:
+                continue
+            iu, iv = int(u), int(v)
+            d = depth[f, iv, iu]
+            if d <= 0:
+                continue
+            if ids[f, iv, iu] == target:
+                if d * (1.0 + _EDGE) - z < hidden:
+                    continue
+                cos = cosine[f, iv, iu]
+                # Bilinear where the four pixels around show the object and are one surface.
+                x0, y0 = int(math.floor(u - 0.5)), int(math.floor(v - 0.5))
+                if (
+                    x0 >= 0 and y0 >= 0 and x0 + 1 < w and y0 + 1 < h
+                    and ids[f, y0, x0] == target and ids[f, y0, x0 + 1] == target
+                    and ids[f, y0 + 1, x0] == target and ids[f, y0 + 1, x0 + 1] == target
+                ):  # fmt: skip
+                    d00, d01 = depth[f, y0, x0], depth[f, y0, x0 + 1]
+                    d10, d11 = depth[f, y0 + 1, x0], depth[f, y0 + 1, x0 + 1]
+                    low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
+                    if low > 0 and high - low <= _EDGE * d:
+                        tx, ty = u - 0.5 - x0, v - 0.5 - y0
+                        top, bottom = d00 * (1 - tx) + d01 * tx, d10 * (1 - tx) + d11 * tx
+                        d = top * (1 - ty) + bottom * ty
+                along = (d - z) * math.sqrt(xn * xn + yn * yn + 1.0)
+                s = along * max(cos, 0.25)
+                if along < -trunc and s < -0.5 * trunc:
+                    if along > -shade:
+                        shaded[j, k] += 1
+                    continue
+                if s >= trunc:
+                    if cos > 0:
+                        freed[j, k] += 1
+                    continue
+                if cos > 0:
+                    support[j, k] += 1
+                    if inner[f, iv, iu]:
+                        within[j, k] += 1
+                    if s < 0 and s > -shell:
+                        behind[j, k] += 1
+                weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
+                soft = weight * math.exp(max(s, -trunc) / tau)
+                num[j, k] += soft * max(s, -trunc)
+                den[j, k] += soft
+            elif d > z and cosine[f, iv, iu] > 0:
+                # Outlines are known to a pixel only.
+                if (
+                    (iu > 0 and ids[f, iv, iu - 1] == target)
+                    or (iu < w - 1 and ids[f, iv, iu + 1] == target)
+                    or (iv > 0 and ids[f, iv - 1, iu] == target)
+                    or (iv < h - 1 and ids[f, iv + 1, iu] == target)
+                ):
+                    continue
+                outside[j, k] += 1
+                ray = math.sqrt(xn * xn + yn * yn + 1.0)
+                if (d - z) * ray * max(cosine[f, iv, iu], 0.1) > 0.6 * trunc:
+                    freed[j, k] += 1
 
 
 @njit(cache=True, nogil=True)
@@ -111,104 +161,55 @@ def fuse_object(
     within = np.zeros((nx, ny, nz), np.uint16)
     shaded = np.zeros((nx, ny, nz), np.uint16)
     num, den = np.zeros((ny, nz)), np.zeros((ny, nz))
-    h, w = depth.shape[1:]
-    hidden = -max(shade, 2.0 * trunc)  # voxels that far behind the surface learn nothing from it
     for i in range(nx):
         gx = origin[0] + (i + 0.5) * voxel
         num[:] = 0.0
         den[:] = 0.0
         # Neighbours of a slab project to neighbouring pixels of a frame, which are in the processor's cache.
         for q in range(len(frames)):
-            f = frames[q]
-            m = camera_from_grid[q]
-            for j in range(ny):
-                gy = origin[1] + (j + 0.5) * voxel
-                mx, my, mz = (
-                    m[0, 0] * gx + m[0, 1] * gy,
-                    m[1, 0] * gx + m[1, 1] * gy,
-                    m[2, 0] * gx + m[2, 1] * gy,
-                )
-                for k in range(nz):
-                    gz = origin[2] + (k + 0.5) * voxel
-                    z = mz + m[2, 2] * gz + m[2, 3]
-                    if z < 0.05:
-                        continue
-                    xn, yn = (mx + m[0, 2] * gz + m[0, 3]) / z, (my + m[1, 2] * gz + m[1, 3]) / z
-                    u, v = fx * xn + cx, fy * yn + cy
-                    if u < 0 or v < 0 or u >= w or v >= h:
-                        continue
-                    iu, iv = int(u), int(v)
-                    d = depth[f, iv, iu]
-                    if d <= 0:
-                        continue
-                    if ids[f, iv, iu] == target:
-                        if d * (1.0 + _EDGE) - z < hidden:
-                            continue
-                        cos = cosine[f, iv, iu]
-                        d = _own_depth(depth, ids, f, target, u, v, w, h)
-                        along = (d - z) * math.sqrt(xn * xn + yn * yn + 1.0)
-                        s = along * max(cos, 0.25)
-                        if along < -trunc and s < -0.5 * trunc:
-                            if along > -shade:
-                                shaded[i, j, k] += 1
-                            continue
-                        if s >= trunc:
-                            if cos > 0:
-                                freed[i, j, k] += 1
-                            continue
-                        if cos > 0:
-                            support[i, j, k] += 1
-                            if inner[f, iv, iu]:
-                                within[i, j, k] += 1
-                            if s < 0 and s > -shell:
-                                behind[i, j, k] += 1
-                        weight = (0.1 + cos) * (1.0 if confidence[f, iv, iu] >= 2 else 0.3)
-                        soft = weight * math.exp(max(s, -trunc) / tau)
-                        num[j, k] += soft * max(s, -trunc)
-                        den[j, k] += soft
-                    elif d > z and cosine[f, iv, iu] > 0 and not _beside_own(ids, f, target, iu, iv, w, h):
-                        outside[i, j, k] += 1
-                        ray = math.sqrt(xn * xn + yn * yn + 1.0)
-                        if (d - z) * ray * max(cosine[f, iv, iu], 0.1) > 0.6 * trunc:
-                            freed[i, j, k] += 1
+            _fuse_slab(
+                depth, confidence, ids, cosine, inner, frames[q], camera_from_grid[q], fx, fy, cx, cy, target, gx,
+                origin, voxel, trunc, tau, shell, shade, num, den,
+                freed[i], support[i], outside[i], behind[i], within[i], shaded[i],
+            )  # fmt: skip
         numerator[i] = num
         denominator[i] = den
     return numerator, denominator, freed, support, outside, behind, within, shaded
 
 
-@njit(cache=True, inline="always")
-def _weight(
-    t, k, points, normals, camera_from_world, centers, images, depths, borders, fx, fy, cx, cy, dfx, dfy, dcx, dcy,
-    tolerance,
+@njit(cache=True, nogil=True)
+def _weigh(
+    first, k, points, normals, camera_from_world, centers, images, depths, borders, fx, fy, cx, cy, dfx, dfy, dcx, dcy,
+    tolerance, out,
 ):  # pragma: no cover - compiled  # fmt: skip
-    """Return the weight of frame `k` for point `t`, 0 where it does not see the point, and the point's column and row.
-
-    It takes whole arrays, as slices of arrays are counted references.
-    """
-    px, py, pz = points[t, 0], points[t, 1], points[t, 2]
-    m = camera_from_world
-    z = m[k, 2, 0] * px + m[k, 2, 1] * py + m[k, 2, 2] * pz + m[k, 2, 3]
-    if z < 0.05:
-        return 0.0, 0.0, 0.0
-    xn = (m[k, 0, 0] * px + m[k, 0, 1] * py + m[k, 0, 2] * pz + m[k, 0, 3]) / z
-    yn = (m[k, 1, 0] * px + m[k, 1, 1] * py + m[k, 1, 2] * pz + m[k, 1, 3]) / z
-    u, v = fx * xn + cx, fy * yn + cy
-    if u < 0.5 or v < 0.5 or u >= images.shape[2] - 0.5 or v >= images.shape[1] - 0.5:
-        return 0.0, 0.0, 0.0
-    iu = min(max(int(dfx * xn + dcx), 0), depths.shape[2] - 1)
-    iv = min(max(int(dfy * yn + dcy), 0), depths.shape[1] - 1)
-    here, border = depths[k, iv, iu], borders[k, iv, iu]
-    if here <= 0 or border <= 0:
-        return 0.0, 0.0, 0.0
-    vx, vy, vz = centers[k, 0] - px, centers[k, 1] - py, centers[k, 2] - pz
-    length = math.sqrt(vx * vx + vy * vy + vz * vz)
-    cos = (vx * normals[t, 0] + vy * normals[t, 1] + vz * normals[t, 2]) / max(length, 1e-9)
-    if cos < 0.08:
-        return 0.0, 0.0, 0.0
-    slope = 1.5 * z / dfx / max(cos, 0.1)  # change of depth over a pixel
-    if abs(here - z) > tolerance + slope:
-        return 0.0, 0.0, 0.0
-    return cos * cos / max(length, 0.1) ** 2 * border, u, v
+    """Write the weight of frame `k`, its column and row to `out` (n, 3) for points from `first` on; 0 where unseen."""
+    m = camera_from_world[k]
+    h, w = images.shape[1], images.shape[2]
+    for row in range(min(len(out), len(points) - first)):
+        t = first + row
+        out[row, 0] = 0.0
+        px, py, pz = points[t, 0], points[t, 1], points[t, 2]
+        z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+        if z < 0.05:
+            continue
+        xn = (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]) / z
+        yn = (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]) / z
+        u, v = fx * xn + cx, fy * yn + cy
+        if u < 0.5 or v < 0.5 or u >= w - 0.5 or v >= h - 0.5:
+            continue
+        iu = min(max(int(dfx * xn + dcx), 0), depths.shape[2] - 1)
+        iv = min(max(int(dfy * yn + dcy), 0), depths.shape[1] - 1)
+        here, border = depths[k, iv, iu], borders[k, iv, iu]
+        if here <= 0 or border <= 0:
+            continue
+        vx, vy, vz = centers[k, 0] - px, centers[k, 1] - py, centers[k, 2] - pz
+        length = math.sqrt(vx * vx + vy * vy + vz * vz)
+        cos = (vx * normals[t, 0] + vy * normals[t, 1] + vz * normals[t, 2]) / max(length, 1e-9)
+        if cos < 0.08:
+            continue
+        slope = 1.5 * z / dfx / max(cos, 0.1)  # change of depth over a pixel
+        if abs(here - z) <= tolerance + slope:
+            out[row, 0], out[row, 1], out[row, 2] = cos * cos / max(length, 0.1) ** 2 * border, u, v
 
 
 @njit(cache=True, inline="always")
@@ -233,15 +234,16 @@ def sample_frames(
     weights = np.zeros((frames, count), np.float32)
     fx, fy, cx, cy = intrinsics
     dfx, dfy, dcx, dcy = depth_intrinsics
+    place = np.zeros((count, 3))
     for k in range(frames):
+        _weigh(
+            0, k, points, normals, camera_from_world, centers, images, depths, borders,
+            fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, place,
+        )  # fmt: skip
         for t in range(count):
-            w, u, v = _weight(
-                t, k, points, normals, camera_from_world, centers, images, depths, borders,
-                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance,
-            )  # fmt: skip
-            if w > 0:
-                weights[k, t] = w
-                _sample_pixel(images, k, u, v, colors[k, t])
+            weights[k, t] = place[t, 0]
+            if place[t, 0] > 0:
+                _sample_pixel(images, k, place[t, 1], place[t, 2], colors[k, t])
     return colors, weights
 
 
@@ -255,32 +257,33 @@ def blend_frames(
     seen = np.zeros(count, np.bool_)
     fx, fy, cx, cy = intrinsics
     dfx, dfy, dcx, dcy = depth_intrinsics
-    weight, place, frame = (
-        np.zeros(3),
-        np.zeros((3, 2)),
-        np.zeros(3, np.int64),
-    )  # of the best frames, best first
-    best = np.zeros((3, 3), np.float32)
+    places, best = np.zeros((frames, _BLOCK, 3)), np.zeros((3, 3), np.float32)
+    weight, frame = np.zeros(3), np.zeros(3, np.int64)  # of the best frames, best first
     for t in range(count):
+        row = t % _BLOCK
+        if row == 0:
+            for k in range(frames):
+                _weigh(
+                    t, k, points, normals, camera_from_world, centers, images, depths, borders,
+                    fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance, places[k],
+                )  # fmt: skip
         weight[:] = 0.0
         for k in range(frames):
-            w, u, v = _weight(
-                t, k, points, normals, camera_from_world, centers, images, depths, borders,
-                fx, fy, cx, cy, dfx, dfy, dcx, dcy, tolerance,
-            )  # fmt: skip
+            w = places[k, row, 0]
             if w <= weight[2]:
                 continue
             slot = 2
             while slot > 0 and w > weight[slot - 1]:
-                weight[slot], frame[slot], place[slot] = weight[slot - 1], frame[slot - 1], place[slot - 1]
+                weight[slot], frame[slot] = weight[slot - 1], frame[slot - 1]
                 slot -= 1
-            weight[slot], frame[slot], place[slot, 0], place[slot, 1] = w, k, u, v
+            weight[slot], frame[slot] = w, k
         if weight[0] <= 0:
             continue
         seen[t] = True
         for slot in range(3):
             if weight[slot] > 0:
-                _sample_pixel(images, frame[slot], place[slot, 0], place[slot, 1], best[slot])
+                place = places[frame[slot], row]
+                _sample_pixel(images, frame[slot], place[1], place[2], best[slot])
                 for c in range(3):
                     best[slot, c] *= gains[frame[slot]]
         total = 0.0

@@ -1,5 +1,6 @@
 """Closed triangle meshes: extraction from a signed distance field, cleaning, smoothing, decimation, boxes and hulls."""
 
+import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ _LEG_GAP_M, _LEG_OVERLAP_M = 0.06, 0.003  # widest gap that is bridged; overlap 
 _MOST_POINTS = 5000  # seen points that are looked up
 _SEEN_SHARE = 0.01  # least share of the seen points on a body that is kept though small
 _MAX_VOLUME_CHANGE = 0.1  # by decimation, relative
+_DECIMATING = threading.Lock()  # fast_simplification keeps its mesh in global variables
 
 
 @dataclass(frozen=True)
@@ -157,15 +159,23 @@ def taubin(solid: Solid, iterations: int, fixed: np.ndarray) -> Solid:
     return Solid(vertices, solid.faces)
 
 
-def lightened(solid: Solid, max_faces: int) -> Solid | None:
-    """Decimate to about `max_faces` faces by quadric error; None where the result is open or changes the volume."""
+def decimate(
+    vertices: np.ndarray, faces: np.ndarray, max_faces: int, aggressiveness: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Decimate a mesh to about `max_faces` faces by quadric error: float64 (v, 3), int32 (f, 3)."""
     import fast_simplification
 
-    vertices, faces = fast_simplification.simplify(
-        np.ascontiguousarray(solid.vertices, np.float64), np.ascontiguousarray(solid.faces, np.int32),
-        target_count=max_faces, agg=4,
-    )[:2]  # fmt: skip
-    closed = to_manifold(compact(Solid(vertices.astype(np.float64), faces.astype(np.int32))))
+    with _DECIMATING:
+        vertices, faces = fast_simplification.simplify(
+            np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32),
+            target_count=max_faces, agg=aggressiveness,
+        )[:2]  # fmt: skip
+    return vertices.astype(np.float64), faces.astype(np.int32)
+
+
+def lightened(solid: Solid, max_faces: int) -> Solid | None:
+    """Decimate to about `max_faces` faces by quadric error; None where the result is open or changes the volume."""
+    closed = to_manifold(compact(Solid(*decimate(solid.vertices, solid.faces, max_faces, 4))))
     if closed is None or abs(closed.volume - solid.volume) >= 0.05 * solid.volume + 1e-7:
         return None
     return closed

@@ -8,6 +8,7 @@ import numpy as np
 
 from reconstruction.assets.generation.base import GenerationError
 from reconstruction.assets.loaded import colors_of, load_mesh, picture_of, upright
+from reconstruction.assets.solid import decimate
 
 _MOST_FACES = 60_000  # decimated to this many: finer detail is beyond what the video saw
 _SAMPLES = 120_000
@@ -96,16 +97,10 @@ def _colors(loaded: Any, corners: np.ndarray, weight: np.ndarray) -> np.ndarray 
 
 def _lighter(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Decimate to `_MOST_FACES` by quadric error."""
-    import fast_simplification
-
     # Merge the vertices that readers split at texture seams, or the seams would open.
     place, index = np.unique(
         np.round(vertices / np.ptp(vertices, axis=0).max(), 7), axis=0, return_inverse=True
     )
     joined = np.zeros_like(place)
     joined[index.ravel()] = vertices
-    out_vertices, out_faces = fast_simplification.simplify(
-        np.ascontiguousarray(joined), np.ascontiguousarray(index.ravel()[faces], np.int32),
-        target_count=_MOST_FACES, agg=3,
-    )[:2]  # fmt: skip
-    return np.asarray(out_vertices, np.float64), np.asarray(out_faces, np.int32)
+    return decimate(joined, index.ravel()[faces], _MOST_FACES, 3)
