@@ -1,5 +1,9 @@
 """Mass, materials and collision shapes of analytic solids."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -124,6 +128,17 @@ def test_decimation_keeps_the_solid_closed():
     assert len(light.faces) <= 500
     assert to_manifold(light) is not None
     assert light.volume == pytest.approx(ball.volume, rel=0.03)
+
+
+def test_decimations_on_several_threads_do_not_mix(request):
+    manifold3d = pytest.importorskip("manifold3d")
+    balls = [from_manifold(manifold3d.Manifold.sphere(1.0 + k, 96)) for k in range(4)] * 4
+    alone = [lighten(ball, 300, 0.01).vertices for ball in balls]
+    request.addfinalizer(partial(sys.setswitchinterval, sys.getswitchinterval()))
+    sys.setswitchinterval(1e-6)
+    with ThreadPoolExecutor(4) as pool:
+        for one, other in zip(alone, pool.map(lambda ball: lighten(ball, 300, 0.01).vertices, balls)):
+            np.testing.assert_array_equal(one, other)
 
 
 def test_decimation_keeps_parts_thinner_than_its_tolerance():
