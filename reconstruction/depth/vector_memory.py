@@ -5,6 +5,7 @@ then stays scalar: no check before the loop can exclude that it reads what it wr
 does not (LLVM's scoped aliasing). They check no bounds and take no negative indices.
 """
 
+from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
@@ -30,6 +31,24 @@ def load_only_read(typingctx, array, index):
         return value
 
     return array.dtype(array, index), codegen
+
+
+@intrinsic
+def load_two(typingctx, array, index):
+    """Return array[index] and array[index + 1] of a contiguous 1-d float32 array, as `load_only_read` does.
+
+    Looked up together they cost half: what counts is the number of places, not of bytes.
+    """
+
+    def codegen(context, builder, signature, args):
+        place = builder.bitcast(_address(context, builder, signature, args), ir.IntType(64).as_pointer())
+        both = builder.load(place, align=4)
+        both.set_metadata("alias.scope", _scope(builder))
+        halves = (both, builder.lshr(both, ir.Constant(ir.IntType(64), 32)))
+        values = [builder.bitcast(builder.trunc(half, ir.IntType(32)), ir.FloatType()) for half in halves]
+        return context.make_tuple(builder, signature.return_type, values)
+
+    return types.UniTuple(array.dtype, 2)(array, index), codegen
 
 
 @intrinsic

@@ -8,6 +8,8 @@ order of its sums is the compiler's choice (`FAST`): it depends on the machine, 
 import numba
 import numpy as np
 
+from reconstruction.depth.vector_memory import load_two
+
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 """What the compiler may assume of float arithmetic in loops that are to be vectorized; nan and inf keep their sense."""
 
@@ -89,8 +91,8 @@ def make_correlate(samples: int):
             ix, iy = np.int32(u), np.int32(v)
             fx, fy = u - np.float32(ix), v - np.float32(iy)
             p = np.uint32(iy * stride + ix)
-            a, b = source[p], source[p + np.uint32(1)]
-            c, d = source[p + np.uint32(width)], source[p + np.uint32(width + 1)]
+            a, b = load_two(source, p)  # pyright: ignore[reportCallIssue]
+            c, d = load_two(source, p + np.uint32(width))  # pyright: ignore[reportCallIssue]
             top = a + fx * (b - a)
             low = c + fx * (d - c)
             g = top + fy * (low - top)
