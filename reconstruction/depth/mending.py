@@ -187,9 +187,9 @@ def drop_unconfirmed(
         each: Runs a function for every frame: each(n, work, label, progress).
         progress: Where steps and shares are reported.
     """
-    agree, through = count_views(found.depth, posed, found.camera, found.neighbors, each, progress)
-    drop = (agree < least) | ((through >= _LOOK_THROUGH) & (through > agree + 1))
-    drop &= found.depth != before
+    changed = found.depth != before
+    agree, through = count_views(found.depth, posed, found.camera, found.neighbors, each, progress, changed)
+    drop = changed & ((agree < least) | ((through >= _LOOK_THROUGH) & (through > agree + 1)))
     progress.note(
         f"depth: views did not confirm {100 * float((drop & (found.depth > 0)).mean()):.1f} % of the pixels"
     )
