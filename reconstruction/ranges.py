@@ -55,6 +55,8 @@ _ONE: dict[str, Range] = {
     "depth.agree_px": Range(0.01, 1000),
     "depth.prior_agree_depth": _POSITIVE_SHARE,
     "depth.prior_agree_px": Range(0.01, 1000),
+    "depth.smooth_small": Range(0, 60),  # path costs are numbers of 16 bits
+    "depth.smooth_large": Range(0, 60),
     "depth.threads": Range(0, 4096),
     "depth.perturb": Range(0, 2**32 - 1),
     "world.object_measured_height_m": Range(0, 1000),

@@ -7,6 +7,7 @@ searched anew; where nothing can be written, every process searches.
 import contextlib
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from dataclasses import asdict, astuple
 from functools import cache
@@ -31,7 +32,7 @@ class KeptGrasps:
         """Read the file of a scene's revision, if there is one."""
         what = json.dumps([revision, asdict(hand), _search_digest(), np.__version__])
         name = hashlib.sha256(what.encode()).hexdigest()[:24]
-        self._file = home_folder() / "cache" / "grasps" / f"{name}.json"
+        self._file = _folder() / f"{name}.json"
         self._rows = _read(self._file)
         self._new = False
 
@@ -52,6 +53,14 @@ class KeptGrasps:
             _drop_oldest(self._file.parent)
             write_whole(self._file, json.dumps(self._rows).encode())
         self._new = False
+
+
+def _folder() -> Path:
+    """Return the folder of all files; one that cannot be made where the user has no home."""
+    try:
+        return home_folder() / "cache" / "grasps"
+    except RuntimeError:
+        return Path(os.devnull) / "grasps"
 
 
 def _read(file: Path) -> dict[str, list[list[float]]]:

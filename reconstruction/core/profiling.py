@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 
-_INTERVAL_S = 0.2  # between samples of memory
+_INTERVAL_S = 0.05  # between samples of memory
 _STATUS = Path("/proc/self/status")
 
 
@@ -31,7 +31,7 @@ class UsageMeter:
     """Context manager that measures this process and its descendants while the body runs.
 
     Memory is the resident set of this process plus the unique set of each descendant, so that pages shared after a fork
-    count once. It is sampled five times a second. Where the kernel keeps a high-water mark, peaks of this process
+    count once. It is sampled every 50 ms. Where the kernel keeps a high-water mark, peaks of this process
     between two samples count, too. CPU time includes descendants that have ended.
     """
 

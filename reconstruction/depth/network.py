@@ -77,7 +77,7 @@ class Mending(nn.Module):
         return self.scores(self.unet(functional.pixel_unshuffle(features, 2)))
 
     def scores(self, found: torch.Tensor):
-        """Return what `forward` does, from the features (b, widths[0], h / 2, w / 2) of the last convolution."""
+        """Map features (b, widths[0], h / 2, w / 2) of the U-Net to the logits that `forward` returns."""
         out = functional.pixel_shuffle(self.leave(found), 2)
         return out[:, : self.candidates + 1], out[:, self.candidates + 1 :]
 

@@ -65,7 +65,7 @@ def mark_doubt(rho, gx, gy, jump, band, doubt):  # pragma: no cover - compiled
 
 
 def edge_voters(rho: np.ndarray, score: np.ndarray, doubt: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """Return what `resolve_edges` needs to let pixels vote, of its arguments of the same names."""
+    """Return the voters of `resolve_edges`, float32 (5, h + 30, w + 30), from maps (h, w); see `votes.voters`."""
     return voters(rho, score, doubt, _DOUBTED_SAY, color, _REACH)
 
 

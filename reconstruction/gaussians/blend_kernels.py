@@ -33,6 +33,7 @@ from reconstruction.gaussians.kernels import (
     ZC,
 )
 from reconstruction.gaussians.patches import (
+    CHECK_EVERY,
     LANES,
     PATCH,
     PATCHES,
@@ -48,7 +49,6 @@ LIGHT, WEIGHT = (
     N_FEATURES,
     N_FEATURES + 1,
 )  # planes beside the features: transmittance, weight of the last splat
-_CHECK_EVERY = 16  # splats, after which finished patches are looked for
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
@@ -129,7 +129,7 @@ def _blend_tile(
         contributions[tile_start[tile] : tile_start[tile + 1]] = 0
     for e in range(tile_start[tile], tile_start[tile + 1]):
         rank = e - tile_start[tile]
-        if rank % _CHECK_EVERY == _CHECK_EVERY - 1 and mark_finished(image[LIGHT], stop, finished):
+        if rank % CHECK_EVERY == CHECK_EVERY - 1 and mark_finished(image[LIGHT], stop, finished):
             break
         s = splats[entries[e]]
         box = boxes[entries[e]]
@@ -237,7 +237,7 @@ def _blend_tile_backward(
     done = False
     for e in range(tile_start[tile], tile_start[tile + 1]):
         out = entry_gradients[e]
-        if (e - tile_start[tile]) % _CHECK_EVERY == _CHECK_EVERY - 1:
+        if (e - tile_start[tile]) % CHECK_EVERY == CHECK_EVERY - 1:
             done = done or mark_finished(given[15], stop, finished)
         if done:
             out[:] = 0

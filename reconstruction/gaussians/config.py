@@ -20,7 +20,7 @@ class GaussiansConfig:
     coarse_side_px: int = 320
     """Longer side of the images in the first part of the training."""
 
-    coarse_share: float = 0.75
+    coarse_share: float = 0.6
     """Share of the iterations at the coarse size."""
 
     max_gaussians: int = 60_000

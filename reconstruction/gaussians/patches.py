@@ -12,6 +12,7 @@ from reconstruction.gaussians.kernels import TILE
 PATCH = 4  # pixels a side
 PATCHES = TILE // PATCH  # a side of a tile
 LANES = PATCH * PATCH
+CHECK_EVERY = 16  # splats, after which finished patches are looked for
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5 * (PATCH - 1))  # from a patch's first pixel to its center
 _ROUND = np.float32(0.5**0.5)  # radius of the screen-space filter over the square root of `reach2`

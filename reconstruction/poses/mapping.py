@@ -1,6 +1,7 @@
 """Structure from motion by COLMAP: a database of verified pairs in, models out."""
 
 import contextlib
+import copy
 import signal
 import threading
 from collections.abc import Iterator
@@ -84,8 +85,9 @@ def write_database(
         for pair in pairs:
             i, j = pair.rows
             database.write_matches(i + 1, j + 1, pair.matches)
-            pair.geometry.inlier_matches = pair.matches
-            database.write_two_view_geometry(i + 1, j + 1, pair.geometry)
+            geometry = copy.copy(pair.geometry)  # two databases of the same pairs may be written at once
+            geometry.inlier_matches = pair.matches
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
 
 
 def incremental_models(

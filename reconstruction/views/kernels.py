@@ -37,6 +37,7 @@ from reconstruction.gaussians.kernels import (
     ZC,
 )
 from reconstruction.gaussians.patches import (
+    CHECK_EVERY,
     LANES,
     PATCH,
     PATCHES,
@@ -52,7 +53,6 @@ from reconstruction.gaussians.patches import (
 SEEN, WORTH, DEPTH = 0, 1, 2
 N_PLANES = 3
 _LIGHT, _WEIGHT = N_PLANES, N_PLANES + 1  # planes beside them: transmittance, weight of the last splat
-_CHECK_EVERY = 16  # splats, after which finished patches are looked for
 N_GRADIENTS = 9  # derivatives of a splat: by XC .. WY
 
 
@@ -131,7 +131,7 @@ def _blend_tile(
     contributions[tile_start[tile] : tile_start[tile + 1]] = 0
     for e in range(tile_start[tile], tile_end[tile]):
         rank = e - tile_start[tile]
-        if rank % _CHECK_EVERY == _CHECK_EVERY - 1 and mark_finished(sums[_LIGHT], stop, finished):
+        if rank % CHECK_EVERY == CHECK_EVERY - 1 and mark_finished(sums[_LIGHT], stop, finished):
             break
         s = splats[entries[e]]
         box = boxes[entries[e]]
@@ -213,7 +213,7 @@ def _blend_tile_backward(
     entry_gradients[tile_start[tile] : tile_start[tile + 1]] = 0
     for e in range(tile_start[tile], tile_end[tile]):
         rank = e - tile_start[tile]
-        if rank % _CHECK_EVERY == _CHECK_EVERY - 1 and mark_finished(given[N_PLANES + 1], stop, finished):
+        if rank % CHECK_EVERY == CHECK_EVERY - 1 and mark_finished(given[N_PLANES + 1], stop, finished):
             break
         if contributions[e, 0] == zero:
             continue

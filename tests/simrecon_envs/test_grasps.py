@@ -1,6 +1,7 @@
 """Grasps across an object, at its neck and at its wall; none without clearance."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -120,3 +121,18 @@ def test_damaged_files_of_grasps_are_searched_anew(tmp_path, monkeypatch, conten
     kept.save()
 
     assert len(KeptGrasps("a" * 16, HAND).of(1, list)) == len(found) > 0
+
+
+def test_a_user_without_a_home_searches_every_time(monkeypatch) -> None:
+    monkeypatch.delenv("SIMRECON_HOME", raising=False)
+
+    def no_home() -> None:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", no_home)
+    found = _grasps([_box(1, (0.16, 0.05, 0.10), (0.02, 0.01, 0))])
+    kept = KeptGrasps("a" * 16, HAND)
+
+    assert len(kept.of(1, lambda: found)) == len(found) > 0
+    kept.save()
+    assert KeptGrasps("a" * 16, HAND).of(1, list) == []
