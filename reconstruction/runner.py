@@ -15,6 +15,7 @@ from reconstruction.cache import DamagedResult, StageStore, digest_input, finger
 from reconstruction.code_digest import code_digest, tree_digest
 from reconstruction.config import PipelineConfig
 from reconstruction.core.compiling import compilation_shown
+from reconstruction.core.memory import return_free_memory
 from reconstruction.core.plugins import plugins_of
 from reconstruction.core.profiling import Usage, UsageMeter
 from reconstruction.core.progress import NO_PROGRESS, Progress, StageListener
@@ -133,6 +134,7 @@ class Run:
                 else:
                     self._keep(number, stage, key, lambda noted: self._compute(stage, noted), shown)
             self.computed.add(stage.name)
+            return_free_memory()
         # Load also what was just computed: a resumed run continues with the same values.
         found = kept or self._read(number, stage, key)
         self.results[stage.name], self.usage[stage.name] = found.value, found.usage
