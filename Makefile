@@ -7,7 +7,7 @@ JOBS ?= 2
 SPREAD = -n $(JOBS) --dist loadfile --no-loadscope-reorder
 PYTHON_IN_VENV = $(VENV)/bin/python
 
-.PHONY: setup demo test test-unit test-all lint format build clean
+.PHONY: setup demo test test-unit test-all perf lint format build clean
 
 setup:
 	@VENV=$(VENV) tools/setup.sh
@@ -23,6 +23,10 @@ test-unit: setup
 
 test-all: setup
 	$(PYTHON_IN_VENV) -m pytest $(SPREAD) -m "not gpu"
+
+# Kernels beside those of the commit in benchmarks/perf/base.txt, on this machine.
+perf: setup
+	$(PYTHON_IN_VENV) -m benchmarks.perf --against base
 
 lint: setup
 	$(VENV)/bin/ruff check .

@@ -38,6 +38,19 @@ def looking_down(height_m: float, x_m: float = 0.0, tilt: float = 0.3) -> np.nda
     return rigid(rotation, np.array([x_m, -height_m * np.tan(tilt), height_m]))
 
 
+def splats_on_a_sheet(count: int = 20_000) -> np.ndarray:
+    """Return packed Gaussians float32 (count, 13), discs of 1.5 cm that lie on a wavy sheet 2 m wide."""
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-1, 1, (2, count))
+    out = np.zeros((count, 13))
+    out[:, :3] = np.stack([x, y, 0.05 * np.sin(9 * x) * np.cos(7 * y)], axis=1)
+    out[:, 3] = 1.0  # no rotation: discs face up
+    out[:, 7:9] = np.log(0.015)
+    out[:, 9] = 1.5
+    out[:, 10:] = rng.uniform(0, 1, (count, 3))
+    return out.astype(np.float32)
+
+
 def textured_images(count: int, width: int, height: int) -> np.ndarray:
     """Return smooth random gray images float32 (n, h, w) about zero, each shifted a little against the last."""
     from scipy.ndimage import gaussian_filter

@@ -1,11 +1,10 @@
-"""Ratios, the stored ones, and when a kernel counts as slower."""
+"""Ratios of kernels to the reference, and when a kernel counts as slower than it was."""
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 
-BASELINE = Path(__file__).with_name("baseline.json")
-_TOLERANCE = 1.5  # a kernel that takes this many times as long as stored fails
+import numpy as np
+
+TOLERANCE = 1.2  # a kernel that takes this many times as long as before fails
 
 
 @dataclass(frozen=True)
@@ -15,29 +14,36 @@ class Ratio:
     median: float
     low: float  # first quartile over the rounds
     high: float  # third quartile
+    least: (
+        float  # least time of the kernel over least time of the reference: what other programs disturb least
+    )
     kernel_ms: float  # median, on this machine
     reference_ms: float
 
 
-def load_stored(path: Path) -> dict:
-    """Read the stored ratios by kernel and the tolerance; none are stored where there is no such file."""
-    return json.loads(path.read_text()) if path.is_file() else {"tolerance": _TOLERANCE, "ratios": {}}
-
-
-def complain(name: str, ratio: float, stored: dict) -> str:
-    """Return what is wrong with a ratio beside the stored ones, or nothing.
+def compare(before: list[dict[str, float]], now: list[dict[str, float]]) -> list[str]:
+    """Return a line for each kernel, and `FAILS` in that of each kernel that became slower by more than `TOLERANCE`.
 
     Args:
-        name: of the kernel.
-        ratio: as measured now.
-        stored: `tolerance` (a factor) and `ratios` by kernel.
+        before: ratio of each kernel, one entry for each time it was measured; the least counts.
+        now: the same of the present code.
     """
-    if name not in stored["ratios"]:
-        return f"{name}: no stored ratio; store one with python -m benchmarks.perf --save"
-    before = stored["ratios"][name]
-    if ratio <= stored["tolerance"] * before:
-        return ""
-    return (
-        f"{name}: {ratio:.2f} times the reference, {ratio / before:.2f} times the stored {before:.2f} "
-        f"(allowed: {stored['tolerance']:g} times). Slower on purpose? Then store it: python -m benchmarks.perf --save"
-    )
+    out = []
+    for name in now[0]:
+        after = min(ratios[name] for ratios in now)
+        if name not in before[0]:
+            out.append(f"{name:<18}{'-':>9}{after:>9.2f}   new")
+            continue
+        first = min(ratios[name] for ratios in before)
+        word = "   FAILS" if after > TOLERANCE * first else ""
+        out.append(f"{name:<18}{first:>9.2f}{after:>9.2f}{after / first - 1:>+9.0%}{word}")
+    gone = [name for name in before[0] if name not in now[0]]
+    return out + [f"{name:<18}{min(r[name] for r in before):>9.2f}{'-':>9}   gone" for name in gone]
+
+
+def ratio(kernel_s: np.ndarray, reference_s: np.ndarray) -> Ratio:
+    """Compare the times of each round, kernel and reference (n,)."""
+    low, median, high = np.percentile(kernel_s / reference_s, [25, 50, 75])
+    in_ms = (1e3 * float(np.median(times)) for times in (kernel_s, reference_s))
+    least = float(kernel_s.min() / reference_s.min())
+    return Ratio(float(median), float(low), float(high), least, *in_ms)

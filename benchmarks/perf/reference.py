@@ -2,7 +2,7 @@
 
 Machines differ, and the same machine differs from minute to minute. What is timed next to this kernel, in turns with
 it, can be told as a ratio that hardly changes. CPU time is taken, not wall time, so that other programs matter little.
-Never change this file: all stored ratios would lose their meaning.
+Never change this file: ratios of before and after could not be compared.
 """
 
 import time

@@ -51,6 +51,21 @@ def test_sgm(measure):
     assert (total.argmin(axis=2) == 11).mean() > 0.99
 
 
+def test_splats(measure):
+    from reconstruction.gaussians.rasterizer import RasterSettings, rasterize, rasterize_backward
+
+    packed, camera, pose = inputs.splats_on_a_sheet(), inputs.camera(320, 240), inputs.looking_down(1.5)
+    slope = np.random.default_rng(4).standard_normal((240, 320, 9)).astype(np.float32)
+
+    def kernel() -> tuple:
+        image = rasterize(packed, camera, pose, RasterSettings())
+        return image, rasterize_backward(image, slope)
+
+    image, gradients = measure(kernel)
+    assert (image.features[100:140, 140:180, 7] > 0.9).mean() > 0.9  # opacity
+    assert np.abs(gradients.parameters).max() > 0
+
+
 def test_tsdf_integrate(measure):
     from reconstruction.surface.pixels import prepare_views
     from reconstruction.surface.tsdf import BLOCK, integrate, surface_blocks, tile_reach
