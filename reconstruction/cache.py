@@ -17,6 +17,7 @@ import logging
 import os
 import secrets
 import shutil
+import time
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -34,7 +35,8 @@ _NEEDED_BYTES = 3 << 29  # the results of one video take about 1.5 GB
 _MANIFEST = "manifest.json"
 _WHOLE_BELOW_BYTES = 4 << 20  # larger files are sampled by `quick_digest`
 _SAMPLES, _SAMPLE_BYTES = 64, 1 << 16
-_TRIES = 5  # to put a result in place while other runs do the same
+_TRIES = 10  # to put a result in place while other runs do the same
+_WAIT_S = 0.005  # after the first of them, twice as long after each
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 _UNREADABLE = (BundleError, ValueError, TypeError, LookupError, AttributeError, EOFError, RecursionError)
 
@@ -235,7 +237,9 @@ class StageStore:
     def _put(self, partial: Path, number: int, stage: str, key: str) -> None:
         """Rename a complete result to its name, unless another run's intact one is there; lease the one that stays."""
         target = self._folder(number, stage, key)
-        for _ in range(_TRIES):
+        for attempt in range(_TRIES):
+            if attempt:  # another run may be about to remove what is there
+                time.sleep(_WAIT_S * 2**attempt)
             if self.has(number, stage, key):
                 try:
                     self.check(number, stage, key)

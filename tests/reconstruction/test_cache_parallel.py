@@ -1,16 +1,19 @@
 """Several runs that share a work folder: each finishes, and none removes what another one reads."""
 
+import fcntl
 import json
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from reconstruction.cache import StageStore
 from reconstruction.core.types import Edge, SceneGraph
-from reconstruction.leases import Leases, remove_unless_leased
+from reconstruction.leases import Leases, remove_at_once, remove_unless_leased
 from synthetic.videos import short_film, write_video
 
 pytestmark = pytest.mark.stage
@@ -117,6 +120,28 @@ def test_a_result_that_another_run_puts_in_place_meanwhile_is_kept(tmp_path, mon
     second.save(GRAPH, 10, "scene_graph", "k", {"by": 2})
     assert second.manifest(10, "scene_graph", "k") == {"by": 1}
     first.check(10, "scene_graph", "k")
+
+
+def test_a_result_is_put_in_place_of_one_that_another_run_is_about_to_remove(tmp_path):
+    """The other run holds the lock of removal for a while before the folder is gone."""
+    first, second = StageStore(tmp_path), StageStore(tmp_path)
+    first.save(GRAPH, 10, "scene_graph", "k", {"by": 1})
+    del first
+    folder = tmp_path / "10_scene_graph-k"
+    descriptor = os.open(folder, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def remove() -> None:
+        time.sleep(0.3)
+        remove_at_once(folder)
+        os.close(descriptor)
+
+    remover = threading.Thread(target=remove)
+    remover.start()
+    second.save(GRAPH, 10, "scene_graph", "k", {"by": 2})
+    remover.join()
+    assert second.manifest(10, "scene_graph", "k") == {"by": 2}
+    second.check(10, "scene_graph", "k")
 
 
 def test_a_result_in_use_is_not_pruned_and_goes_once_it_is_free(tmp_path):
