@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -51,8 +52,8 @@ def tree_at(repository: Path, commit: str) -> Iterator[Path | None]:
     """Give a folder with the files of a commit, None if the repository does not have it; removed at the end."""
     with tempfile.TemporaryDirectory(prefix="perf-") as folder:
         line = ["git", "-C", str(repository), "archive", "--format=tar", commit]
-        packed = subprocess.run(line, capture_output=True, check=False)
-        if packed.returncode:
+        packed = subprocess.run(line, capture_output=True, check=False) if shutil.which("git") else None
+        if packed is None or packed.returncode:
             yield None
             return
         subprocess.run(["tar", "-x", "-C", folder], input=packed.stdout, check=True)
