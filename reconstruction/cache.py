@@ -36,7 +36,7 @@ _MANIFEST = "manifest.json"
 _WHOLE_BELOW_BYTES = 4 << 20  # larger files are sampled by `quick_digest`
 _SAMPLES, _SAMPLE_BYTES = 64, 1 << 16
 _TRIES = 10  # to put a result in place while other runs do the same
-_WAIT_S = 0.005  # after the first of them, twice as long after each
+_WAIT_S = 0.01  # after the first of them, then twice as long each time
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 _UNREADABLE = (BundleError, ValueError, TypeError, LookupError, AttributeError, EOFError, RecursionError)
 
@@ -239,7 +239,7 @@ class StageStore:
         target = self._folder(number, stage, key)
         for attempt in range(_TRIES):
             if attempt:  # another run may be about to remove what is there
-                time.sleep(_WAIT_S * 2**attempt)
+                time.sleep(_WAIT_S * 2 ** (attempt - 1))
             if self.has(number, stage, key):
                 try:
                     self.check(number, stage, key)

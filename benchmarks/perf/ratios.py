@@ -14,31 +14,33 @@ class Ratio:
     median: float
     low: float  # first quartile over the rounds
     high: float  # third quartile
-    least: (
-        float  # least time of the kernel over least time of the reference: what other programs disturb least
-    )
+    least: float  # of the least times of both, which other programs disturb least
     kernel_ms: float  # median, on this machine
     reference_ms: float
 
 
-def compare(before: list[dict[str, float]], now: list[dict[str, float]]) -> list[str]:
-    """Return a line for each kernel, and `FAILS` in that of each kernel that became slower by more than `TOLERANCE`.
+def compare(before: list[dict[str, float]], now: list[dict[str, float]]) -> tuple[list[str], list[str]]:
+    """Return a line for each kernel, and the names of those that take more than `TOLERANCE` times as long as before.
 
     Args:
-        before: ratio of each kernel, one entry for each time it was measured; the least counts.
+        before: ratios by kernel, one entry for each time that they were measured; the least of each kernel counts.
         now: the same of the present code.
     """
-    out = []
-    for name in now[0]:
-        after = min(ratios[name] for ratios in now)
-        if name not in before[0]:
-            out.append(f"{name:<18}{'-':>9}{after:>9.2f}   new")
+    first, after = _least(before), _least(now)
+    out, slower = [], []
+    for name, value in after.items():
+        if name not in first:
+            out.append(f"{name:<18}{'-':>9}{value:>9.2f}   new")
             continue
-        first = min(ratios[name] for ratios in before)
-        word = "   FAILS" if after > TOLERANCE * first else ""
-        out.append(f"{name:<18}{first:>9.2f}{after:>9.2f}{after / first - 1:>+9.0%}{word}")
-    gone = [name for name in before[0] if name not in now[0]]
-    return out + [f"{name:<18}{min(r[name] for r in before):>9.2f}{'-':>9}   gone" for name in gone]
+        if value > TOLERANCE * first[name]:
+            slower.append(name)
+        out.append(f"{name:<18}{first[name]:>9.2f}{value:>9.2f}{value / first[name] - 1:>+9.0%}")
+    out += [f"{name:<18}{first[name]:>9.2f}{'-':>9}   gone" for name in first if name not in after]
+    return out, slower
+
+
+def _least(found: list[dict[str, float]]) -> dict[str, float]:
+    return {name: min(ratios.get(name, np.inf) for ratios in found) for name in found[0]}
 
 
 def ratio(kernel_s: np.ndarray, reference_s: np.ndarray) -> Ratio:
