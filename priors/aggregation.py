@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from priors.affinities import affinity_loss
 from priors.aggregation_pool import AggregationPool
+from priors.pictures import seen_in
 from priors.samples import Room, draw_sample, load_sample, stack
 from reconstruction.depth.network import Aggregation, place_of
 
@@ -30,7 +31,7 @@ def make_network(config: Any) -> Aggregation:
 def losses(net: Aggregation, batch, config: Any) -> dict[str, torch.Tensor]:
     """Return the parts of the loss of a batch (see `samples.stack`)."""
     correlation, smoothed, color, place, ids, border, rho = batch
-    logits, offset, affinity = net(correlation, smoothed, color)
+    logits, offset, affinity = net(correlation, smoothed, color, seen_in(color))
     known = place >= 0
     weight = known * (1 + config.border_weight * border)
     total = weight.sum().clamp_min(1)
@@ -70,7 +71,8 @@ def check(net: Aggregation, rooms: list[Room], keyframes: int) -> dict[str, floa
         row = number % len(room)
         sample = load_sample(room, row)
         correlation, smoothed, color, place, _, border, _ = stack([sample])
-        logits, offset, _ = net(*(tensor.to(device) for tensor in (correlation, smoothed, color)))
+        shown = [tensor.to(device) for tensor in (correlation, smoothed, color)]
+        logits, offset, _ = net(*shown, seen_in(shown[2]))
         found, surety = (tensor.cpu() for tensor in place_of(logits.softmax(1), offset))
         start, step = sample.rho
         truth = (start + step * place[0]).numpy()

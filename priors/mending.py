@@ -21,6 +21,7 @@ from priors.mending_pool import (
     ZOOM,
     MendingPool,
 )
+from priors.pictures import seen_in
 from priors.samples import Room, near_steps, other_light
 from reconstruction.depth.candidates import OFFSETS, candidate_depths, choose_candidates
 from reconstruction.depth.evidence import MEASURED, PREDICTED, inverse
@@ -181,7 +182,7 @@ def _entropy(logits: torch.Tensor, likelihood, weight) -> torch.Tensor:
 def losses(net: Mending, batch, config: Any) -> dict[str, torch.Tensor]:
     """Return the parts of the loss of a batch (see `stack`)."""
     features, likelihood, weight, ids = batch
-    logits, affinity = net(features)
+    logits, affinity = net(features, seen_in(features[:, :3] + 0.5))
     return {
         "entropy": _entropy(logits, likelihood, weight),
         "affinity": config.affinity_weight * affinity_loss(affinity.float(), ids),
@@ -202,7 +203,8 @@ def check(net: Mending, rooms: list[Room], keyframes: int) -> dict[str, float]:
         for agreed in (False, True):
             sample = load_sample(room, number % len(room), agreed=agreed)
             features, likelihood, weight, ids = stack([sample])
-            logits, affinity = (tensor.cpu() for tensor in net(features.to(device)))
+            shown = features.to(device)
+            logits, affinity = (tensor.cpu() for tensor in net(shown, seen_in(shown[:, :3] + 0.5)))
             share = logits.float().masked_fill(likelihood <= 0.5 * MISSING, MISSING).softmax(1)[0].numpy()
             mark = "agreed_" if agreed else ""
             add(mark + "entropy", _entropy(logits, likelihood, weight))

@@ -1,5 +1,6 @@
 """Rooms' proposals in crops of keyframes, with the trunk's features and true IoUs: the head's training samples."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import starmap
@@ -10,7 +11,8 @@ import numpy as np
 from priors.partition_clusters import RoomProposals, in_processes
 from priors.partition_rooms import cached, digest_of, room_view, write_arrays
 from priors.samples import Room
-from reconstruction.instances.partition.crop_scores import ALIKE, CropScorer, cluster_areas, color_input
+from reconstruction.core.trunk import WEIGHTS, load_trunk
+from reconstruction.instances.partition.crop_scores import ALIKE, cluster_areas, color_input
 from reconstruction.instances.partition.crops import crops_of
 from reconstruction.instances.partition.model import load_models
 from reconstruction.instances.partition.proposals import distinct
@@ -37,7 +39,7 @@ class RoomCrops:
 
 
 def crops_of_rooms(
-    rooms: Sequence[Room], found: Sequence[RoomProposals], cache: Path, trunk: CropScorer, processes: int
+    rooms: Sequence[Room], found: Sequence[RoomProposals], cache: Path, processes: int
 ) -> list[RoomCrops]:
     """Return each room's samples, cached.
 
@@ -45,39 +47,39 @@ def crops_of_rooms(
         rooms: arrays on disk.
         found: their proposals, by networks and trees that were not fitted to them.
         cache: folder with the fused surfaces.
-        trunk: its trunk is used.
         processes: at work at once.
     """
-    jobs = [(*job, cache, trunk) for job in zip(rooms, found, strict=True)]
+    jobs = [(*job, cache) for job in zip(rooms, found, strict=True)]
     return in_processes(_room_crops, jobs, processes)
 
 
-def _room_crops(job: tuple[Room, RoomProposals, Path, CropScorer]) -> RoomCrops:
-    room, found, cache, scorer = job
+def _room_crops(job: tuple[Room, RoomProposals, Path]) -> RoomCrops:
+    room, found, cache = job
     digest = digest_of([f"reconstruction.instances.partition.{name}" for name in ("crops", "cut")])
-    file = cached(room, cache, f"crops-{digest}-{scorer.trunk_digest()}").with_suffix(".npz")
+    trunk = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()[:12]
+    file = cached(room, cache, f"crops-{digest}-{trunk}").with_suffix(".npz")
     if not file.is_file():
-        made = _made(room, found, cache, scorer)
+        made = _made(room, found, cache)
         write_arrays(file, **{f.name: getattr(made, f.name) for f in fields(RoomCrops)})
     with np.load(file) as stored:
         return RoomCrops(**{f.name: stored[f.name] for f in fields(RoomCrops)})
 
 
-def _made(room: Room, found: RoomProposals, cache: Path, scorer: CropScorer) -> RoomCrops:
+def _made(room: Room, found: RoomProposals, cache: Path) -> RoomCrops:
     import torch
 
     said = load_models().proposals(found.rows) if len(found.rows) else np.zeros(0)
     rows = _drawn(found, said, np.random.default_rng(int(room.folder.name)))
     crops = crops_of(room_view(room, cache), found.region, found.members, rows)
-    trunk, _ = scorer.networks
+    trunk = load_trunk()
     fine, coarse = [], []
     with torch.inference_mode():
         for start in range(0, len(crops.proposal), _BATCH):
-            a, b = trunk(color_input(crops.color[start : start + _BATCH]))
+            a, b = trunk(color_input(crops.color[start : start + _BATCH]))[2:]
             fine.append(a.half().numpy())
             coarse.append(b.half().numpy())
         if not fine:
-            fine, coarse = ([x.half().numpy()] for x in trunk(color_input(crops.color)))
+            fine, coarse = ([x.half().numpy()] for x in trunk(color_input(crops.color))[2:])
     own = crops.proposal
     return RoomCrops(
         np.concatenate(fine), np.concatenate(coarse), crops.maps, crops.scalars, own,

@@ -56,7 +56,9 @@ class Room:
 
 def open_rooms(folder: Path, needed: tuple[str, ...] = ()) -> list[Room]:
     """Open the finished rooms of a split that hold all the needed arrays, in order."""
-    files = sorted(folder.glob("*/room.json"))
+    files = [
+        f for f in sorted(folder.glob("*/room.json")) if f.parent.suffix != ".part"
+    ]  # that is being written
     rooms = [
         Room(f.parent, {p.stem: np.load(p, mmap_mode="r") for p in f.parent.glob("*.npy")}) for f in files
     ]

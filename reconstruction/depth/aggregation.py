@@ -78,6 +78,7 @@ def aggregate_costs(
     """
     import torch
 
+    from reconstruction.core.trunk import load_trunk
     from reconstruction.depth.network import place_of
     from reconstruction.depth.weights import load_network
 
@@ -93,7 +94,8 @@ def aggregate_costs(
         for array in (correlation, smoothed, picture)
     ]
     with torch.inference_mode():
-        logits, offset, _ = load_network("aggregation", weights)(*tensors)
+        seen = load_trunk()(2 * tensors[2] - 1)
+        logits, offset, _ = load_network("aggregation", weights)(*tensors, seen)
         share = logits.permute(0, 2, 3, 1).softmax(3).permute(0, 3, 1, 2)  # as they lie in memory
         place, surety = place_of(share, offset)
     start, step = line_of_places(1.0 / rhos[0], 1.0 / rhos[-1], len(rhos))

@@ -90,6 +90,7 @@ def candidate_shares(
     import torch
     from torch.nn.functional import pixel_unshuffle
 
+    from reconstruction.core.trunk import load_trunk
     from reconstruction.depth.weights import load_network
 
     torch.set_num_threads(1)
@@ -99,7 +100,8 @@ def candidate_shares(
     together = np.empty((AFFINITIES, h, w), np.float32)
     network = load_network("mending", weights)
     with torch.inference_mode():
-        found = network.unet(pixel_unshuffle(torch.from_numpy(padded)[None], 2))
+        shown = torch.from_numpy(padded)[None]
+        found = network.unet(pixel_unshuffle(shown, 2), load_trunk()(2 * shown[:, :3]))
         for top in range(0, h, _STRIP_PX):  # what a strip needs stays in the processor's cache
             rows = slice(top, min(h, top + _STRIP_PX))
             logits, affinity = network.scores(found[:, :, top // 2 : (top + _STRIP_PX) // 2])

@@ -2,7 +2,8 @@
 
 A U-Net of 2D convolutions over the plane sweep's costs, planes as channels (SimpleRecon, Sayed et al., ECCV 2022). Its
 output is added to what semi-global aggregation says, so that the untrained network is that, and training only has to
-learn where it is wrong: beside occlusion borders and on blank regions.
+learn where it is wrong: beside occlusion borders and on blank regions. Beside costs or maps the U-Nets see features of
+the picture by a trunk that was trained on ImageNet (`reconstruction.core.trunk`), as SimpleRecon's image prior.
 """
 
 from itertools import pairwise
@@ -11,6 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from reconstruction.core.trunk import CHANNELS
 from reconstruction.depth.candidates import OFFSETS
 from reconstruction.depth.channels import BINS, FEATURES, OFFSETS_PX
 
@@ -18,14 +20,26 @@ WIDTHS = (48, 64, 96, 128, 128)
 """Channels at a half, a quarter, ... of the resolution."""
 MENDING_WIDTHS = (40, 64, 96, 128, 128)
 """The same of the mending network."""
+_DROP = 0.1  # share of the trunk's channels that training leaves out
 
 
 def _block(a: int, b: int) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(a, b, 3, padding=1, bias=False), nn.BatchNorm2d(b), nn.ReLU(inplace=True))
 
 
+class _Look(nn.Sequential):
+    """Channels for the U-Net from features of the trunk; none until trained."""
+
+    def __init__(self, a: int, b: int) -> None:
+        super().__init__(nn.BatchNorm2d(a), nn.Dropout2d(_DROP), nn.Conv2d(a, b, 1, bias=False))
+        nn.init.zeros_(self[2].weight)
+
+
 class UNet(nn.Module):
-    """Convolutions at a half to 1/32 of the resolution with skip connections, for features at a half of it."""
+    """Convolutions at a half to 1/32 of the resolution with skip connections, for features at a half of it.
+
+    At each resolution that the trunk has, its features of the picture are added.
+    """
 
     def __init__(self, inputs: int, widths: tuple[int, ...] = WIDTHS) -> None:
         """Make the layers; weights are random until loaded."""
@@ -36,12 +50,20 @@ class UNet(nn.Module):
             nn.Conv2d(a, b, 1) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)
         )
         self.up = nn.ModuleList(_block(2 * b, b) for b in widths[-2::-1])
+        self.look = nn.ModuleList(_Look(a, b) for a, b in zip(CHANNELS, widths, strict=False))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Map (b, inputs, h, w) to (b, widths[0], h, w)."""
-        kept = [self.enter(x.contiguous(memory_format=torch.channels_last))]  # convolutions are faster so
-        for layer in self.down:
-            kept.append(layer(functional.max_pool2d(kept[-1], 2, ceil_mode=True)))
+    def forward(self, x: torch.Tensor, seen: list[torch.Tensor]) -> torch.Tensor:
+        """Map (b, inputs, h, w) to (b, widths[0], h, w).
+
+        Args:
+            x: Features at a half of the picture's resolution.
+            seen: What the trunk says of the picture.
+        """
+        x = self.enter(x.contiguous(memory_format=torch.channels_last))  # convolutions are faster so
+        kept = [x + self.look[0](seen[0])]
+        for level, layer in enumerate(self.down, start=1):
+            x = layer(functional.max_pool2d(kept[-1], 2, ceil_mode=True))
+            kept.append(x + self.look[level](seen[level]) if level < len(self.look) else x)
         x = kept.pop()
         for narrow, up in zip(self.narrow, self.up, strict=True):
             skip = kept.pop()
@@ -68,13 +90,14 @@ class Mending(nn.Module):
         with torch.no_grad():
             self.leave.get_parameter("bias")[:4] = 3.0
 
-    def forward(self, features: torch.Tensor):
+    def forward(self, features: torch.Tensor, seen: list[torch.Tensor]):
         """Return logits (b, candidates + 1, h, w), the last of "none", and affinity logits (b, 6, h, w).
 
         Args:
             features: (b, FEATURES, h, w) of `mending.mending_features`; height and width are even.
+            seen: What the trunk says of the picture.
         """
-        return self.scores(self.unet(functional.pixel_unshuffle(features, 2)))
+        return self.scores(self.unet(functional.pixel_unshuffle(features, 2), seen))
 
     def scores(self, found: torch.Tensor):
         """Map features (b, widths[0], h / 2, w / 2) of the U-Net to the logits that `forward` returns."""
@@ -100,7 +123,9 @@ class Aggregation(nn.Module):
         for values in self.leave.parameters():
             nn.init.zeros_(values)
 
-    def forward(self, correlation: torch.Tensor, smoothed: torch.Tensor, color: torch.Tensor):
+    def forward(
+        self, correlation: torch.Tensor, smoothed: torch.Tensor, color: torch.Tensor, seen: list[torch.Tensor]
+    ):
         """Return logits (b, bins, h, w), offset in bins (b, h, w) and affinity logits (b, 6, h, w).
 
         Args:
@@ -108,10 +133,11 @@ class Aggregation(nn.Module):
                 and width are even.
             smoothed: (b, bins, h, w), 0 to 1, what semi-global aggregation says of each bin, 1 for its winner.
             color: (b, 3, h, w), 0 to 1.
+            seen: What the trunk says of the picture.
         """
         matched = self.costs(torch.cat([correlation, smoothed], 1))
         features = torch.cat([matched, functional.pixel_unshuffle(color - 0.5, 2)], 1)
-        out = functional.pixel_shuffle(self.leave(self.unet(features)), 2)
+        out = functional.pixel_shuffle(self.leave(self.unet(features, seen)), 2)
         logits = self.sharpness * smoothed + out[:, :BINS]
         return logits, torch.tanh(out[:, BINS]), out[:, BINS + 1 :]
 

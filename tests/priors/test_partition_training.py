@@ -14,7 +14,6 @@ from priors.partition_rooms import NEEDED, example, film_of
 from priors.partition_ruler import Figures, compare
 from priors.partition_trees import PAIRS, arrays_of, mean_of
 from priors.samples import open_rooms
-from reconstruction.instances.partition.crop_network import Trunk
 from reconstruction.instances.partition.model import FEATURES, TREES, load_models
 from registry.errors import UsageError
 
@@ -200,33 +199,6 @@ def test_heads_learn_from_crops_and_are_written_beside_what_ships(data, tmp_path
     assert len(losses) == 40
     assert np.mean(losses[-3:]) < 0.9 * losses[0]
     models, shipped = load_models(tmp_path / "partition.safetensors"), load_models()
-    trunk, heads = models.crops.networks
-    assert len(heads) == 1
-    assert torch.equal(trunk.stem.weight, shipped.crops.networks[0].stem.weight)
+    assert len(models.crops.heads) == 1
     np.testing.assert_array_equal(models.proposals.value, shipped.proposals.value)
     assert {"shapes, things", "train, things"} <= set(json.loads((tmp_path / "figures.json").read_text()))
-
-
-def test_a_trunk_of_pytorch_is_read_with_its_normalization_folded_in(tmp_path):
-    torch.manual_seed(0)
-    stored = {}
-    for name, shape, norm in [
-        ("_conv_stem", (32, 3, 3, 3), "_bn0"), ("_blocks.0._depthwise_conv", (32, 1, 3, 3), "_blocks.0._bn1"),
-    ]:  # fmt: skip
-        stored[f"{name}.weight"] = torch.randn(shape)
-        stored |= {
-            f"{norm}.{k}": torch.rand(shape[0]) + 0.5
-            for k in ("weight", "bias", "running_mean", "running_var")
-        }
-    torch.save(stored, tmp_path / "lite0.pth")
-    with pytest.raises(UsageError, match=r"no EfficientNet-Lite0 .*_blocks"):
-        crops.trunk_weights(tmp_path / "lite0.pth")
-    x = torch.rand(1, 3, 8, 8)
-    plain = torch.nn.functional.conv2d(
-        torch.nn.functional.pad(x, (0, 1, 0, 1)), stored["_conv_stem.weight"], stride=2
-    )
-    norm = [stored[f"_bn0.{k}"] for k in ("running_mean", "running_var", "weight", "bias")]
-    wanted = torch.nn.functional.batch_norm(plain, *norm, eps=1e-3)
-    stem = Trunk().stem
-    crops.fold(stem, stored, "_conv_stem", "_bn0")
-    torch.testing.assert_close(stem(x), wanted, atol=1e-4, rtol=1e-4)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from reconstruction.core.trunk import load_trunk
 from reconstruction.depth import DepthConfig, aggregation
 from reconstruction.depth.aggregation import (
     aggregate_costs,
@@ -50,7 +51,8 @@ def test_the_untrained_network_says_what_semi_global_aggregation_says():
     smoothed.scatter_(1, best, 1.0)
     correlation, color = torch.rand(1, BINS, 16, 24), torch.rand(1, 3, 16, 24)
     with torch.inference_mode():
-        logits, offset, affinity = Aggregation().eval()(correlation, smoothed, color)
+        seen = load_trunk()(2 * color - 1)
+        logits, offset, affinity = Aggregation().eval()(correlation, smoothed, color, seen)
     assert torch.equal(logits.argmax(1), best[:, 0])
     assert affinity.shape == (1, 6, 16, 24)
     place, total = place_of(logits.softmax(1), offset)

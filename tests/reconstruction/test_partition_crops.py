@@ -10,6 +10,7 @@ from scipy.sparse import csr_matrix
 from surfaces import frames_of, with_planes
 
 from reconstruction.core.progress import NO_PROGRESS
+from reconstruction.core.trunk import load_trunk
 from reconstruction.instances.cut import Shell
 from reconstruction.instances.partition.crop_scores import CropScorer, color_input, head_inputs, mirrored
 from reconstruction.instances.partition.crops import GRID, MAPS, SIZE_PX, VIEWS, crops_of
@@ -111,9 +112,9 @@ def test_scores_come_from_the_picture_and_are_the_same_each_time(seen):
 def test_the_mirror_image_of_a_mirror_image_is_the_input(seen):
     view, region, members = seen
     crops = crops_of(view, region, members, np.arange(3))
-    trunk, heads = load_models().crops.networks
+    heads = load_models().crops.heads
     with torch.inference_mode():
-        inputs = (*trunk(color_input(crops.color)), *head_inputs(crops.maps, crops.scalars))
+        inputs = (*load_trunk()(color_input(crops.color))[2:], *head_inputs(crops.maps, crops.scalars))
         again = mirrored(*mirrored(*inputs))
         assert all(torch.equal(a, b) for a, b in zip(inputs, again))
         assert not torch.equal(heads[0](*inputs), heads[0](*mirrored(*inputs)))
@@ -122,7 +123,9 @@ def test_the_mirror_image_of_a_mirror_image_is_the_input(seen):
 def test_weights_that_do_not_fit_say_what_to_do():
     weights = dict(load_models().crops.weights)
     with pytest.raises(KeyError, match="trunk"):
-        CropScorer({k: v for k, v in weights.items() if k.startswith("trunk.")}).check()
-    weights.pop("trunk.stem.bias")
+        CropScorer({**weights, "trunk.stem.bias": np.zeros(32)}).check()
+    with pytest.raises(KeyError, match="nothing"):
+        CropScorer({}).check()
+    weights.pop("heads.0.scalars.bias")
     with pytest.raises(EnvironmentMissing, match="Install the package again"):
-        _ = CropScorer(weights).networks
+        _ = CropScorer(weights).heads

@@ -1,6 +1,5 @@
 """Estimated IoU of proposals by networks that see them in keyframes: crops of the likeliest -> logits."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,21 +22,21 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class CropScorer:
-    """A trunk and heads whose logits are averaged.
+    """Heads whose logits are averaged.
 
-    Weights have the names of `crop_network`: `trunk.<name>`, `heads.<member>.<name>`.
+    Weights have the names of `crop_network.Head`: `heads.<member>.<name>`.
     """
 
     weights: dict[str, np.ndarray]
 
     def check(self) -> None:
-        """Look whether there are weights of both.
+        """Look whether there are weights of heads, and no others.
 
         Raises:
             KeyError: there are none.
         """
         kinds = {name.split(".")[0] for name in self.weights}
-        if kinds != {"trunk", "heads"}:
+        if kinds != {"heads"}:
             raise KeyError(f"crops: weights of {', '.join(sorted(kinds)) or 'nothing'}")
 
     def __call__(
@@ -66,13 +65,15 @@ class CropScorer:
         """Return the logit float64 (k,) of each crop: the mean of heads, and of the crop and its mirror image."""
         import torch
 
+        from reconstruction.core.trunk import load_trunk
+
         torch.set_num_threads(1)
-        trunk, heads = self.networks
+        trunk, heads = load_trunk(), self.heads
 
         def of(start: int) -> np.ndarray:
             part = slice(start, start + _BATCH)
             with torch.inference_mode():
-                fine, coarse = trunk(color_input(crops.color[part]))
+                fine, coarse = trunk(color_input(crops.color[part]))[2:]
                 seen = (fine, coarse, *head_inputs(crops.maps[part], crops.scalars[part]))
                 return mean_logit(heads, seen)
 
@@ -80,36 +81,28 @@ class CropScorer:
         return np.concatenate(every).astype(np.float64) if every else np.zeros(0)
 
     @cached_property
-    def networks(self) -> tuple:
-        """The trunk, and a tuple of heads (`torch.nn.Module` each), in evaluation mode.
+    def heads(self) -> tuple:
+        """The heads (`torch.nn.Module` each), in evaluation mode.
 
         Raises:
             EnvironmentMissing: weights are missing, too many, or of another shape.
         """
-        from reconstruction.instances.partition.crop_network import Head, Trunk
-
-        numbers = sorted({name.split(".")[1] for name in self.weights if name.startswith("heads.")})
-        heads = tuple(self._loaded(Head(), f"heads.{number}.") for number in numbers)
-        return self._loaded(Trunk(), "trunk."), heads
-
-    def trunk_digest(self) -> str:
-        """Return a digest of the trunk's weights, which features of crops follow from."""
-        digest = hashlib.sha256()
-        for name in sorted(name for name in self.weights if name.startswith("trunk.")):
-            digest.update(np.asarray(self.weights[name], np.float16).tobytes())
-        return digest.hexdigest()[:12]
-
-    def _loaded(self, network, prefix: str):
         import torch
 
-        own = {k.removeprefix(prefix): v for k, v in self.weights.items() if k.startswith(prefix)}
-        try:
-            network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in own.items()})
-        except RuntimeError as error:
-            raise EnvironmentMissing(
-                f"instances: the weights of the crops' networks do not fit ({error}). Install the package again."
-            ) from error
-        return network.eval()
+        from reconstruction.instances.partition.crop_network import Head
+
+        out = []
+        for number in sorted({name.split(".")[1] for name in self.weights}):
+            prefix, head = f"heads.{number}.", Head()
+            own = {k.removeprefix(prefix): v for k, v in self.weights.items() if k.startswith(prefix)}
+            try:
+                head.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in own.items()})
+            except RuntimeError as error:
+                raise EnvironmentMissing(
+                    f"instances: the weights of the crops' networks do not fit ({error}). Install the package again."
+                ) from error
+            out.append(head.eval())
+        return tuple(out)
 
 
 def cluster_areas(areas: np.ndarray, region: np.ndarray, members: csr_matrix) -> np.ndarray:
