@@ -31,8 +31,9 @@ class _Look(nn.Sequential):
     """Channels for the U-Net from features of the trunk; none until trained."""
 
     def __init__(self, a: int, b: int) -> None:
-        super().__init__(nn.BatchNorm2d(a), nn.Dropout2d(_DROP), nn.Conv2d(a, b, 1, bias=False))
-        nn.init.zeros_(self[2].weight)
+        mix = nn.Conv2d(a, b, 1, bias=False)
+        nn.init.zeros_(mix.weight)
+        super().__init__(nn.BatchNorm2d(a), nn.Dropout2d(_DROP), mix)
 
 
 class UNet(nn.Module):

@@ -8,6 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from registry import EnvironmentMissing, UsageError
+from simrecon_envs.processes import start_method
 
 
 class Workers:
@@ -29,8 +30,7 @@ class Workers:
         self._frozen_before = gc.get_freeze_count()
         prepare_process()
         if self.jobs > 1:
-            # spawn: a simulator must not be forked.
-            context = multiprocessing.get_context("spawn")
+            context = multiprocessing.get_context(start_method())
             self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=prepare_process)
         return self
 
