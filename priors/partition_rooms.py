@@ -97,7 +97,7 @@ def frames_and_depth(room: Room, cache: Path) -> tuple[PosedFrames, DepthMaps]:
     folder = cached(room, cache, "mended")
     if not folder.is_dir():
         config = DepthConfig()
-        mended = mend_depth(found, posed, config.mend_surety, config.fill_surety, Workers(1).each)
+        mended = mend_depth(found, posed, config.mend_surety, Workers(1).each)
         mended = drop_unconfirmed(mended, found.depth, posed, config.min_agreeing, Workers(1).each)
         _save(mended.maps(), folder)
     return posed, artifacts.load(DepthMaps, folder)

@@ -67,10 +67,7 @@ class DepthConfig:
     """Reprojection error up to which they do, at depth resolution."""
 
     mend_surety: float = 0.5
-    """Probability from which depth is believed after mending where there was depth before."""
-
-    fill_surety: float = 0.8
-    """The same where there was none: a hole costs less than wrong surface, for other views may see the place."""
+    """Probability from which depth is believed after mending."""
 
     complete: bool = True
     """Fill planes where there is no texture and the surroundings support it."""

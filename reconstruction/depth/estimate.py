@@ -50,7 +50,7 @@ def estimate_depth(
         from reconstruction.depth.mending import drop_unconfirmed, mend_depth
 
         each = Workers(config.threads).each
-        mended = mend_depth(found, posed, config.mend_surety, config.fill_surety, each, progress)
+        mended = mend_depth(found, posed, config.mend_surety, each, progress)
         found = drop_unconfirmed(mended, found.depth, posed, config.min_agreeing, each, progress)
     maps = found.maps()
     return replace(maps, depth=perturbed(maps.depth, config.perturb)) if config.perturb else maps

@@ -5,7 +5,6 @@ occlusion boundaries, Ramamonjisoa et al., CVPR 2020, as a choice among plane hy
 project; docs/priors.md has their data.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,6 @@ AROUND_PX = 49
 """Side of the window whose mean depth a pixel's depth is told against."""
 MANY_VIEWS = 10.0
 """Counts of views are told as shares of it."""
-_OWN_ODDS = 8.0  # odds of a pixel's own depth over those in the rooms of the training (docs/priors.md)
 _STRIP_PX = 32  # rows whose candidates are scored at a time
 _LOOK_THROUGH = 2  # views that see something beyond a point, from which it may be dropped
 
@@ -108,7 +106,6 @@ def candidate_shares(
             size = rows.stop - top
             logits = logits[0, :, :size, :w].permute(1, 2, 0)  # as they lie in memory
             logits[..., :-1].masked_fill_(torch.from_numpy(~there[:, rows]).permute(1, 2, 0), -1e4)
-            logits[..., 0] += math.log(_OWN_ODDS)
             share[rows] = logits.softmax(2).numpy()
             together[:, rows] = affinity[0, :, :size, :w].contiguous().sigmoid().numpy()
     return np.moveaxis(share, 2, 0)[:-1], together
@@ -123,7 +120,6 @@ def mend_depth(
     found: Evidence,
     posed: PosedFrames,
     least: float,
-    least_filled: float,
     each: Callable,
     progress: Progress = NO_PROGRESS,
     weights: Path = WEIGHTS,
@@ -133,8 +129,7 @@ def mend_depth(
     Args:
         found: Maps and the origin of every pixel.
         posed: Their frames.
-        least: Probability from which depth is believed where there was depth.
-        least_filled: The same where there was none.
+        least: Probability from which depth is believed.
         each: Runs a function for every frame: each(n, work, label, progress).
         progress: Where steps and shares are reported.
         weights: Of the network.
@@ -157,7 +152,6 @@ def mend_depth(
         together[i] = pack_affinities(affinity)
         rho, trust = np.empty_like(own), np.empty_like(own)
         choose_candidates(candidates, share, np.float32(least), rho, trust)
-        rho[(own == 0) & (trust < least_filled)] = 0
         kept = rho == own
         depth[i] = np.where(kept, found.depth[i], inverse(rho))
         origin[i] = np.where(depth[i] > 0, np.where(kept, found.origin[i], COMPLETED), 0)
