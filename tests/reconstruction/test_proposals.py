@@ -1,6 +1,7 @@
 """Proposals of whole things: merge trees, their features, and the best choice of disjoint regions."""
 
 import itertools
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +47,48 @@ def test_a_merge_tree_joins_what_belongs_together_first():
     for linkage in (trees.total_odds, trees._mean):
         merged = trees.regions_of_tree(np.ones(4), pairs, odds, linkage)
         assert merged == [frozenset({0, 1}), frozenset({2, 3}), frozenset({0, 1, 2, 3})]
+
+
+def _merged_one_by_one(pairs, odds, linkage):
+    """Merge the two regions with the greatest linkage, all links added up anew each time, until none are joined."""
+    regions, out = [frozenset([k]) for k in range(int(pairs.max()) + 1)], []
+    while True:
+        links: dict = {}
+        for (a, b), value in zip(pairs.tolist(), odds.tolist()):
+            x, y = (next(k for k, r in enumerate(regions) if c in r) for c in (a, b))
+            if x != y:
+                total, number = links.get((min(x, y), max(x, y)), (0.0, 0))
+                links[min(x, y), max(x, y)] = total + value, number + 1
+        if not links:
+            return out
+        x, y = max(links, key=lambda pair: linkage(links[pair]))
+        out.append(regions[x] | regions[y])
+        regions = [r for k, r in enumerate(regions) if k not in (x, y)] + [out[-1]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_merge_tree_is_that_of_links_added_up_anew(seed):
+    rng = np.random.default_rng(seed)
+    every = np.array(list(itertools.combinations(range(18), 2)))
+    pairs = every[rng.random(len(every)) < 0.3]
+    odds = rng.normal(0, 2, len(pairs))
+    area = 10.0 ** np.arange(18.0)[rng.permutation(18)]  # no region is almost as large as its parent
+    for linkage in (trees.total_odds, trees._mean):
+        wanted = _merged_one_by_one(pairs, odds, linkage)
+        found = trees.regions_of_tree(area, pairs, odds, linkage)
+        assert set(found) <= set(wanted)
+        size = {r: area[list(r)].sum() for r in wanted}
+        left_out = set(wanted) - set(found)
+        assert all(any(r < o and size[r] > size[o] / trees.ALIKE for o in wanted) for r in left_out)
+
+
+def test_a_merge_tree_around_one_large_region_takes_no_time():
+    count = 8000
+    pairs = np.stack([np.zeros(count - 1, int), np.arange(1, count)], axis=1)
+    started = time.process_time()
+    merged = trees.regions_of_tree(np.ones(count), pairs, -np.arange(1.0, count), trees.total_odds)
+    assert time.process_time() - started < 10  # .1 s; minutes where every merge copies all links
+    assert len(merged[-1]) == count
 
 
 def test_a_region_is_proposed_with_all_that_is_below_it():

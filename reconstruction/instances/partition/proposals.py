@@ -100,40 +100,55 @@ def _mean(link: Link) -> float:
 def regions_of_tree(
     area: np.ndarray, pairs: np.ndarray, odds: np.ndarray, linkage: Callable[[Link], float]
 ) -> list[frozenset[int]]:
-    """Return the regions of one merge tree, without those that are almost as large as their parent; see `ALIKE`."""
+    """Return the regions of one merge tree, without those that are almost as large as their parent; see `ALIKE`.
+
+    A merged region goes on under the number of the side with more links, whose links to others stay as they are.
+    """
     around: list[dict[int, Link]] = [{} for _ in area]
     for (a, b), value in zip(pairs.tolist(), odds.tolist()):
         around[a][b] = around[b][a] = (value, 1)
     heap = [(-linkage(link), a, b) for a, links in enumerate(around) for b, link in links.items() if a < b]
     heapq.heapify(heap)
-    members = [frozenset([k]) for k in range(len(area))]
+    sides: list[tuple[int, int]] = []  # of each merge; regions are numbered on from the clusters
+    region = list(range(len(area)))  # that goes on under a number
     size, since = area.tolist(), area.tolist()  # area of each region, and where its growth is measured from
-    alive, dropped = [True] * len(area), set()
+    dropped = set()
     while heap:
         value, a, b = heapq.heappop(heap)
-        if not (alive[a] and alive[b]) or -linkage(around[a][b]) != value:
+        if b not in around[a] or -linkage(around[a][b]) != value:
             continue
-        new = len(members)
-        members.append(members[a] | members[b])
-        links: dict[int, Link] = {}
-        for old in (a, b):
-            alive[old] = False
-            for other, (total, number) in around[old].items():
-                if alive[other]:
-                    before = links.get(other, (0.0, 0))
-                    links[other] = (before[0] + total, before[1] + number)
-        large = a if size[a] >= size[b] else b
-        size.append(size[a] + size[b])
-        alike = size[new] < ALIKE * since[large]
-        since.append(since[large] if alike else size[new])
+        kept, gone = (a, b) if len(around[a]) >= len(around[b]) else (b, a)
+        for other, (total, number) in around[gone].items():
+            del around[other][gone]
+            if other != kept:
+                before = around[kept].get(other, (0.0, 0))
+                link = before[0] + total, before[1] + number
+                around[kept][other] = around[other][kept] = link
+                heapq.heappush(heap, (-linkage(link), min(kept, other), max(kept, other)))
+        around[gone] = {}
+        first, second = region[kept], region[gone]
+        large = first if size[first] >= size[second] else second
+        region[kept] = len(size)
+        sides.append((first, second))
+        size.append(size[first] + size[second])
+        alike = size[-1] < ALIKE * since[large]
+        since.append(since[large] if alike else size[-1])
         if alike:
             dropped.add(large)
-        alive.append(True)
-        around.append(links)
-        for other, link in links.items():
-            around[other][new] = link
-            heapq.heappush(heap, (-linkage(link), other, new))
-    return [m for k, m in enumerate(members) if k >= len(area) and k not in dropped]
+    merged = range(len(area), len(size))
+    return [_clusters_of(k, sides, len(area)) for k in merged if k not in dropped]
+
+
+def _clusters_of(region: int, sides: list[tuple[int, int]], count: int) -> frozenset[int]:
+    """Return the clusters below a region of a merge tree over `count` clusters."""
+    out, below = set(), [region]
+    while below:
+        top = below.pop()
+        if top < count:
+            out.add(top)
+        else:
+            below += sides[top - count]
+    return frozenset(out)
 
 
 def distinct(members: csr_matrix, area: np.ndarray, score: np.ndarray, most: int, alike: float) -> np.ndarray:
