@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from registry import UsageError
-from simrecon_envs.processes import start_method
 from simrecon_envs.registration import make_cpu
 
 KINDS = ("sync", "async", "sb3")
@@ -42,17 +41,17 @@ def make_vec(
         raise UsageError(f"make_vec: kind {kind!r} is not one of {', '.join(KINDS)}")
     if num_envs < 1:
         raise UsageError(f"make_vec: num_envs={num_envs} is not at least 1")
-    # Picklable: they reach the processes through a pipe.
+    # Picklable, for the start method "spawn": a simulator must not be forked.
     makers = [functools.partial(make_one, scene, registry, kwargs)] * num_envs
     if kind == "sb3":
         from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-        vec = SubprocVecEnv(makers, start_method=start_method()) if num_envs > 1 else DummyVecEnv(makers)
+        vec = SubprocVecEnv(makers, start_method="spawn") if num_envs > 1 else DummyVecEnv(makers)
         vec.seed(seed)
         return VecMonitor(vec, info_keywords=())
     from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
-    return SyncVectorEnv(makers) if kind == "sync" else AsyncVectorEnv(makers, context=start_method())
+    return SyncVectorEnv(makers) if kind == "sync" else AsyncVectorEnv(makers, context="spawn")
 
 
 def make_one(scene: str, registry: Path | str | None, kwargs: dict[str, Any]) -> Any:

@@ -8,7 +8,6 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from registry import EnvironmentMissing, UsageError
-from simrecon_envs.processes import start_method
 
 
 class Workers:
@@ -30,7 +29,8 @@ class Workers:
         self._frozen_before = gc.get_freeze_count()
         prepare_process()
         if self.jobs > 1:
-            context = multiprocessing.get_context(start_method())
+            # spawn: a simulator must not be forked.
+            context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=prepare_process)
         return self
 
