@@ -1,4 +1,4 @@
-"""What the trunk that was trained on ImageNet says of the pictures of a batch; it is not trained."""
+"""Features of a batch of pictures by the trunk that was trained on ImageNet, without gradients."""
 
 import torch
 

@@ -66,7 +66,7 @@ class DepthConfig:
     prior_agree_px: float = 4.0
     """Reprojection error up to which they do, at depth resolution."""
 
-    mend_surety: float = 0.5
+    mend_surety: float = 0.4
     """Probability from which depth is believed after mending."""
 
     complete: bool = True
