@@ -106,9 +106,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
     net = task.make_network(config).to(device)
     if config.start:
         weights = load_file(config.start)
-        net.load_state_dict(
-            {name: value.to(net.state_dict()[name].dtype) for name, value in weights.items()}, strict=False
-        )  # weights from before the trunk lack what it adds, which starts at zero
+        net.load_state_dict({name: value.to(net.state_dict()[name].dtype) for name, value in weights.items()})
     slow = task.make_network(config).to(device)
     slow.load_state_dict(net.state_dict())
     averaged, current = (

@@ -58,7 +58,7 @@ class UNet(nn.Module):
 
         Args:
             x: Features at a half of the picture's resolution.
-            seen: What the trunk says of the picture.
+            seen: Features of the picture, of `core.trunk.Trunk`.
         """
         x = self.enter(x.contiguous(memory_format=torch.channels_last))  # convolutions are faster so
         kept = [x + self.look[0](seen[0])]
@@ -96,7 +96,7 @@ class Mending(nn.Module):
 
         Args:
             features: (b, FEATURES, h, w) of `mending.mending_features`; height and width are even.
-            seen: What the trunk says of the picture.
+            seen: Features of the picture, of `core.trunk.Trunk`.
         """
         return self.scores(self.unet(functional.pixel_unshuffle(features, 2), seen))
 
@@ -134,7 +134,7 @@ class Aggregation(nn.Module):
                 and width are even.
             smoothed: (b, bins, h, w), 0 to 1, what semi-global aggregation says of each bin, 1 for its winner.
             color: (b, 3, h, w), 0 to 1.
-            seen: What the trunk says of the picture.
+            seen: Features of the picture, of `core.trunk.Trunk`.
         """
         matched = self.costs(torch.cat([correlation, smoothed], 1))
         features = torch.cat([matched, functional.pixel_unshuffle(color - 0.5, 2)], 1)
