@@ -3,6 +3,7 @@
 
 import json
 from functools import partial
+from math import isinf
 from pathlib import Path
 from typing import Any, cast
 
@@ -72,7 +73,7 @@ def _constant(where: str, name: str) -> None:
 
 def _number(where: str, text: str) -> float:
     value = float(text)
-    if value in (float("inf"), float("-inf")):
+    if isinf(value):
         raise BundleError(f"{where}: {text[:40]} is not a finite number")
     return value
 
