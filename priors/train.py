@@ -156,6 +156,7 @@ def train(config: TrainConfig, must_resume: bool = False) -> None:
             fresh = (step + 1) % config.refresh_every == 0 or last
             coming = None if fresh else ahead.submit(draw_batch, task, rooms, config, step + 1)
         net.train()
+        torch.manual_seed(config.seed * 1_000_003 + step)  # of dropout
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
             parts = losses(net, batch, config)
         total = sum(parts.values())

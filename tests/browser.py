@@ -28,6 +28,40 @@ _WEBGL = (
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
 )
+_TEXTS = "button, a, label, input, [role=tab], summary, td, p, span, div"
+# Smallest visible element of a selector with a text, label or placeholder, scrolled into view.
+_FIND = """((wanted, selector) => {
+  let best = null, least = Infinity;
+  for (const e of document.querySelectorAll(selector)) {
+    const said = [e.innerText, e.getAttribute("aria-label"), e.placeholder, e.title];
+    if (!said.some((s) => s && s.trim() === wanted)) continue;
+    const b = e.getBoundingClientRect(), area = b.width * b.height;
+    if (b.width < 1 || b.height < 1 || getComputedStyle(e).visibility === "hidden") continue;
+    if (area < least) [best, least] = [e, area];
+  }
+  if (!best) return null;
+  best.scrollIntoView({ block: "nearest" });
+  const b = best.getBoundingClientRect();
+  return { x: b.x, y: b.y, width: b.width, height: b.height };
+})"""
+# Until endPress(), mouse events are stopped if the element is not under the pointer as the button goes down.
+_GUARD = """(() => {
+  const kinds = ["pointerdown", "mousedown", "pointerup", "mouseup", "click"];
+  let hit = null;
+  const guard = (event) => {
+    if (hit === null) {
+      const b = FIND;
+      hit = !!b && event.clientX >= b.x && event.clientX <= b.x + b.width
+        && event.clientY >= b.y && event.clientY <= b.y + b.height;
+    }
+    if (!hit) { event.stopImmediatePropagation(); event.preventDefault(); }
+  };
+  for (const kind of kinds) window.addEventListener(kind, guard, true);
+  window.endPress = () => {
+    for (const kind of kinds) window.removeEventListener(kind, guard, true);
+    return hit === true;
+  };
+})()"""
 _BUTTONS = {"left": 1, "right": 2, "middle": 4}
 _MODIFIERS = {"alt": 1, "ctrl": 2, "meta": 4, "shift": 8}
 # Keys that type no text: name -> (code, Windows virtual key code).
@@ -52,6 +86,10 @@ def require_browser() -> str:
         hint = "there is no Chromium on this machine; run tools/setup_browser.sh"
         (pytest.fail if os.environ.get("SIMRECON_REQUIRE_BROWSER") else pytest.skip)(hint)
     return executable
+
+
+def _find(text: str, selector: str) -> str:
+    return f"{_FIND}({json.dumps(text)}, {json.dumps(selector)})"
 
 
 class Page:
@@ -127,7 +165,7 @@ class Page:
     def box_of(
         self,
         text: str,
-        selector: str = "button, a, label, input, [role=tab], summary, td, p, span, div",
+        selector: str = _TEXTS,
         timeout_s: float = 30.0,
     ) -> Any:
         """Return x, y, width, height of the smallest visible element with this text, label or placeholder.
@@ -137,23 +175,8 @@ class Page:
         Raises:
             LookupError: there is none within `timeout_s`.
         """
-        find = f"""(() => {{
-              const wanted = {json.dumps(text)};
-              let best = null;
-              for (const e of document.querySelectorAll({json.dumps(selector)})) {{
-                const said = [e.innerText, e.getAttribute("aria-label"), e.placeholder, e.title];
-                if (!said.some((s) => s && s.trim() === wanted)) continue;
-                const b = e.getBoundingClientRect();
-                if (b.width < 1 || b.height < 1 || getComputedStyle(e).visibility === "hidden") continue;
-                if (!best || b.width * b.height < best[1]) best = [e, b.width * b.height];
-              }}
-              if (!best) return null;
-              best[0].scrollIntoView({{ block: "nearest" }});
-              const b = best[0].getBoundingClientRect();
-              return {{ x: b.x, y: b.y, width: b.width, height: b.height }};
-            }})()"""
         try:
-            return self.wait_for(find, timeout_s)
+            return self.wait_for(_find(text, selector), timeout_s)
         except TimeoutError:
             raise LookupError(
                 f"nothing visible says {text!r}; the page says: {self.text()[:2000]!r}"
@@ -184,10 +207,21 @@ class Page:
             raise LookupError(f"no input with the label {label!r}; the page says: {self.text()[:2000]!r}")
         return box
 
-    def press(self, text: str, selector: str | None = None) -> None:
-        """Click the middle of the element with this text."""
-        box = self.box_of(text) if selector is None else self.box_of(text, selector)
-        self.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    def press(self, text: str, selector: str = _TEXTS, timeout_s: float = 60.0) -> None:
+        """Click an element; where the page moves it away from under the pointer, the click is stopped and made again.
+
+        Raises:
+            LookupError: it was never under the pointer within `timeout_s`.
+        """
+        limit = time.monotonic() + timeout_s
+        while time.monotonic() < limit:
+            box = self.box_of(text, selector)
+            self.evaluate(_GUARD.replace("FIND", _find(text, selector)))
+            self.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+            if self.evaluate("window.endPress()"):
+                return
+            self.settle(0.3)
+        raise LookupError(f"{text!r} was not under the pointer within {timeout_s:.0f} s")
 
     def click(self, x: float, y: float, *, button: str = "left", modifiers: tuple[str, ...] = ()) -> None:
         """Press and release a mouse button at a place of the window, in CSS pixels."""

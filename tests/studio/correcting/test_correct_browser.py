@@ -112,12 +112,8 @@ class Viewer:
         self.browser.settle(0.5)
 
     def press(self, text: str) -> None:
-        """Press a button of the tab, once it has stopped moving."""
-        kinds, last = "button, label, [role=tab]", None
-        while (box := self.browser.box_of(text, kinds)) != last:
-            last = box
-            self.browser.settle(0.5)
-        self.browser.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        """Press a button of the tab."""
+        self.browser.press(text, "button, label, [role=tab]")
         self.browser.settle(0.5)
 
     def acts(self) -> list[dict]:
@@ -169,9 +165,6 @@ def play(studio: StudioPage, browser: Page) -> None:
     assert viewer.part.preview.merged == [{first, second}]
     viewer.press("Undo")
     viewer.until(lambda: len(viewer.acts()) == 1, "the merge is undone")
-    viewer.until(
-        lambda: "are one thing" not in browser.text(), "the list is shorter: it moves the buttons below it"
-    )
     viewer.press("Redo")
     viewer.until(lambda: len(viewer.acts()) == 2, "the merge is redone")
     viewer.press("Undo")
