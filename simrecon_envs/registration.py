@@ -36,7 +36,7 @@ _KIND_STEPS = {
     "rearrange": 600,
 }  # others: MAX_EPISODE_STEPS
 MULTI_ID = f"{NAMESPACE}/Multi-v0"
-_ENTRY_POINT = "simrecon_envs.scene_env:SceneEnv"
+_ENTRY_POINT = "simrecon_envs.entry:SceneEnv"
 _TASK_ID = re.compile(rf"{NAMESPACE}/(?P<scene>[a-z0-9_]+)-(?P<task>[A-Za-z0-9_-]+?)-v(?P<version>\d+)")
 _WRAPPERS = (
     WrapperSpec(name="BatchedTimeLimit", entry_point="simrecon_envs.wrappers:BatchedTimeLimit", kwargs={}),

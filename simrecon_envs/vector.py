@@ -4,11 +4,11 @@ With CUDA, one environment simulates many scenes: `simrecon_envs.make(scene, num
 simulates one environment per process: `make_vec` starts the processes.
 """
 
-import functools
 from pathlib import Path
 from typing import Any
 
 from registry import UsageError
+from simrecon_envs.processes import prepare_worker, start_method, with_environment
 from simrecon_envs.registration import make_cpu
 
 KINDS = ("sync", "async", "sb3")
@@ -41,22 +41,20 @@ def make_vec(
         raise UsageError(f"make_vec: kind {kind!r} is not one of {', '.join(KINDS)}")
     if num_envs < 1:
         raise UsageError(f"make_vec: num_envs={num_envs} is not at least 1")
-    # Picklable, for the start method "spawn": a simulator must not be forked.
-    makers = [functools.partial(make_one, scene, registry, kwargs)] * num_envs
+    method = start_method() if kind == "async" or (kind == "sb3" and num_envs > 1) else None
+    makers = [with_environment(make_one, scene, registry, kwargs)] * num_envs
     if kind == "sb3":
         from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-        vec = SubprocVecEnv(makers, start_method="spawn") if num_envs > 1 else DummyVecEnv(makers)
+        vec = SubprocVecEnv(makers, start_method=method) if method else DummyVecEnv(makers)
         vec.seed(seed)
         return VecMonitor(vec, info_keywords=())
     from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
-    return SyncVectorEnv(makers) if kind == "sync" else AsyncVectorEnv(makers, context="spawn")
+    return SyncVectorEnv(makers) if kind == "sync" else AsyncVectorEnv(makers, context=method)
 
 
 def make_one(scene: str, registry: Path | str | None, kwargs: dict[str, Any]) -> Any:
     """Make one environment in its own process, and limit torch to one thread."""
-    import torch
-
-    torch.set_num_threads(1)
+    prepare_worker()
     return make_cpu(scene, registry=registry, **kwargs)

@@ -8,6 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from registry import EnvironmentMissing, UsageError
+from simrecon_envs.processes import prepare_process, start_method, with_environment
 
 
 class Workers:
@@ -29,9 +30,10 @@ class Workers:
         self._frozen_before = gc.get_freeze_count()
         prepare_process()
         if self.jobs > 1:
-            # spawn: a simulator must not be forked.
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=prepare_process)
+            context = multiprocessing.get_context(start_method())
+            self._pool = ProcessPoolExecutor(
+                self.jobs, mp_context=context, initializer=with_environment(prepare_process)
+            )
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -58,18 +60,3 @@ class Workers:
                 f"one of {self.jobs} processes was killed, most likely because memory ran out; run the same command "
                 "again with fewer --jobs: finished work is kept"
             ) from error
-
-
-def prepare_process() -> None:
-    """Load the simulator and limit torch to one thread: arrays are small, and results must not depend on the machine.
-
-    Loaded modules are frozen out of garbage collection. ManiSkill collects at every rebuild of a scene, that is before
-    every episode, which took a third of the time.
-    """
-    import torch
-
-    import simrecon_envs.scene_env  # noqa: F401
-
-    torch.set_num_threads(1)
-    gc.collect()
-    gc.freeze()

@@ -1,7 +1,5 @@
 """Make the environments for training and evaluation: NumPy, in one process each for training."""
 
-import functools
-import multiprocessing
 import signal
 import time
 from typing import Any
@@ -10,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from registry import UsageError
+from simrecon_envs.processes import prepare_worker, start_method, with_environment
 from simrecon_envs.registration import episode_steps, make_cpu
 from simrecon_envs.training.config import TrainConfig
 from simrecon_envs.unwrapped import scene_of
@@ -58,13 +57,13 @@ def make_several(config: TrainConfig) -> Any:
     """Make the vector environment for training, without normalization; several environments have a process each."""
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-    makers = [functools.partial(_in_worker, config)] * config.envs
+    makers = [with_environment(_in_worker, config)] * config.envs
     if config.envs == 1:
         return DummyVecEnv(makers)
     # Ctrl-C reaches all processes of a terminal. Workers inherit SIG_IGN and leave it to the training process.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN) if _is_main_thread() else None
     try:
-        return SubprocVecEnv(makers, start_method="spawn")
+        return SubprocVecEnv(makers, start_method=start_method())
     finally:
         if before is not None:
             signal.signal(signal.SIGINT, before)
@@ -180,10 +179,7 @@ def _leaves(entry: Any) -> Any:
 
 
 def _in_worker(config: TrainConfig) -> gym.Env:
-    import torch
-
-    torch.set_num_threads(1)
-    if multiprocessing.parent_process() is not None:
+    if prepare_worker():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return make_one(config)
 

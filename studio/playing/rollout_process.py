@@ -100,7 +100,7 @@ def _work(request: RolloutRequest | TasksRequest, sender: Connection) -> None:
         if isinstance(request, TasksRequest):
             sender.send(_tasks(request))
         else:
-            from simrecon_envs.benchmark.parallel import prepare_process
+            from simrecon_envs.processes import prepare_process
             from studio.playing.rollout import record, replay
 
             prepare_process()

@@ -11,9 +11,9 @@ from made_suites import SUITE_CONFIG, DyingRecords, Killed
 
 from registry import SceneRegistry
 from simrecon_envs.benchmark.generate import generate_suite
-from simrecon_envs.benchmark.parallel import prepare_process
 from simrecon_envs.benchmark.records import Records
 from simrecon_envs.benchmark.suite import Suite, load_suite
+from simrecon_envs.processes import prepare_process
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -108,7 +108,7 @@ def test_specs_of_scenes_are_those_that_gymnasium_would_make(scenes_root: Path) 
     spec = gym.registry["SimRecon/room"]
     made = EnvSpec(
         id="SimRecon/room",
-        entry_point="simrecon_envs.scene_env:SceneEnv",
+        entry_point="simrecon_envs.entry:SceneEnv",
         max_episode_steps=200,
         disable_env_checker=True,
         kwargs={
