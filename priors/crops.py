@@ -21,7 +21,7 @@ from torch.nn import functional
 from priors.partition import split_rooms
 from priors.partition_clusters import RoomProposals, shipped_proposals
 from priors.partition_crops import RoomCrops, crops_of_rooms, joined
-from priors.partition_figures import best_least, proposal_figures
+from priors.partition_figures import proposal_figures
 from priors.rooms import Sources
 from reconstruction.instances.partition.crop_network import Head
 from reconstruction.instances.partition.crop_scores import (
@@ -54,11 +54,8 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(options.threads)  # making crops may have left it at one
     heads = [train(crops["train"], options.epochs, options.seed + k) for k in range(options.heads)]
     said = {name: [_said(heads, *pair) for pair in zip(crops[name], found[name])] for name in found}
-    chosen_on = [name for name in found if name != "train"] or ["train"]
-    least = best_least([r for n in chosen_on for r in found[n]], [v for n in chosen_on for v in said[n]])
-    print(f"proposals of an IoU above {least} are chosen", flush=True)
-    export(heads, least, options.out / "partition.safetensors")
-    figures = {f"{name}, things": proposal_figures(found[name], said[name], least) for name in found}
+    export(heads, options.out / "partition.safetensors")
+    figures = {f"{name}, things": proposal_figures(found[name], said[name]) for name in found}
     for name, row in figures.items():
         print(name, json.dumps(row), flush=True)
     (options.out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
@@ -111,14 +108,14 @@ def _said(heads: list[Head], crops: RoomCrops, found: RoomProposals) -> np.ndarr
     return out
 
 
-def export(heads: list[Head], least_iou: float, file: Path) -> None:
+def export(heads: list[Head], file: Path) -> None:
     """Write the weights that ship with new heads; filters are float16."""
     arrays = {k: v for k, v in load_file(WEIGHTS).items() if not k.startswith("crops.")}
     parts = {}
     for number, head in enumerate(heads):
         parts |= {f"crops.heads.{number}.{name}": value for name, value in head.state_dict().items()}
     arrays |= {k: (v.half() if v.ndim > 1 else v).contiguous() for k, v in parts.items()}
-    save_file(arrays | {"least_iou": torch.tensor([least_iou])}, file)
+    save_file(arrays, file)
     load_models.cache_clear()
 
 

@@ -33,7 +33,7 @@ from priors.partition_clusters import (
     proposals_of,
     shipped_proposals,
 )
-from priors.partition_figures import best_least, figures_of, proposal_figures
+from priors.partition_figures import figures_of, proposal_figures
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, Example
 from priors.partition_targets import Targets
@@ -106,19 +106,14 @@ def main(arguments: list[str] | None = None) -> int:
     )
     proposals = _fit_proposals(found["train"], options.rounds or _ROUNDS["proposals"], options.seed)
     said = {name: [expit(proposals(room.rows)) for room in rooms] for name, rooms in found.items()}
-    chosen_on = [name for name in found if name != "train"] or ["train"]
-    least = options.least
-    if least is None:
-        least = best_least([r for n in chosen_on for r in found[n]], [v for n in chosen_on for v in said[n]])
-    print(f"proposals of an IoU above {least} are chosen", flush=True)
     trees = {"pairs": scorers.pairs, "proposals": proposals}
-    export(scorers.superpoints, trees, least, options.out / "partition.safetensors")
+    export(scorers.superpoints, trees, options.out / "partition.safetensors")
     figures = {
         f"{name}, superpoints": figures_of(scorers.superpoints, [room.example for room in rooms])
         for name, rooms in found.items()
     }
     for name, rooms in found.items():
-        figures[f"{name}, things"] = proposal_figures(rooms, said[name], least)
+        figures[f"{name}, things"] = proposal_figures(rooms, said[name])
     for name, row in figures.items():
         print(name, json.dumps(row), flush=True)
     (options.out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
@@ -195,11 +190,6 @@ def _parser() -> argparse.ArgumentParser:
         "--rounds",
         type=int,
         help=f"trees (default: {_ROUNDS['pairs']} for pairs, {_ROUNDS['proposals']} for proposals)",
-    )
-    parser.add_argument(
-        "--least",
-        type=float,
-        help="IoU that proposals are chosen above (default: best for the rooms not trained on)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of weights and order (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="of training (default: %(default)s)")
@@ -354,7 +344,7 @@ def losses(network: Network, room: Example, targets: Targets) -> tuple[torch.Ten
     return edges, (each * weight).sum() / weight.sum().clamp_min(1e-6)
 
 
-def export(superpoints: Ensemble, trees: dict[str, Boosted], least_iou: float, file: Path) -> None:
+def export(superpoints: Ensemble, trees: dict[str, Boosted], file: Path) -> None:
     """Write the weights as `reconstruction.instances.partition.model.load_models` reads them, layers as float16.
 
     The networks of crops are those that ship; `priors.crops` trains them.
@@ -367,7 +357,6 @@ def export(superpoints: Ensemble, trees: dict[str, Boosted], least_iou: float, f
     }
     for kind, boosted in trees.items():
         arrays |= {f"{kind}.{name}": value for name, value in boosted.arrays().items()}
-    arrays |= {"least_iou": np.array([least_iou], np.float32)}
     crops = {name: value for name, value in load_file(WEIGHTS).items() if name.startswith("crops.")}
     save_file({name: torch.from_numpy(value.copy()) for name, value in arrays.items()} | crops, file)
 

@@ -12,9 +12,8 @@ from reconstruction.instances.partition.cut import clusters_of_things
 from reconstruction.instances.partition.graph import LABELS, Scores
 from reconstruction.instances.partition.model import Ensemble
 from reconstruction.instances.partition.multicut import partition_with_labels
-from reconstruction.instances.partition.proposals import best_disjoint
+from reconstruction.instances.partition.proposals import best_disjoint, likeliest_things
 
-_LEAST = tuple(0.025 * k for k in range(6, 17))  # IoU
 _HITS = (0.25, 0.5)
 
 
@@ -38,10 +37,15 @@ def partitioned(room: Example, scores: Scores) -> np.ndarray:
     return number[cluster]
 
 
-def proposal_figures(rooms: list[RoomProposals], said: list[np.ndarray], least: float) -> dict[str, float]:
+def proposal_figures(rooms: list[RoomProposals], said: list[np.ndarray]) -> dict[str, float]:
     """Return figures of the things chosen from proposals by their estimated IoU, and of the best choice there is."""
-    out = things_figures([r.example for r in rooms], [chosen(r, iou - least) for r, iou in zip(rooms, said)])
-    best = things_figures([r.example for r in rooms], [chosen(r, _worth(r.best_iou)) for r in rooms])
+    out = things_figures(
+        [r.example for r in rooms],
+        [chosen(r, likeliest_things(r.members, iou)) for r, iou in zip(rooms, said)],
+    )
+    best = things_figures(
+        [r.example for r in rooms], [chosen(r, best_disjoint(r.members, _worth(r.best_iou))) for r in rooms]
+    )
     error = np.concatenate([iou - room.best_iou for room, iou in zip(rooms, said)])
     out |= {f"by_truth_{name}": value for name, value in best.items()}
     return out | {"iou_error": round(float(np.sqrt(np.mean(error**2))), 4)}
@@ -51,9 +55,9 @@ def _worth(iou: np.ndarray) -> np.ndarray:
     return np.where(iou >= _HITS[0], 1.0 + (iou >= _HITS[1]) + 0.01 * iou, 0.0)
 
 
-def chosen(room: RoomProposals, gain: np.ndarray) -> np.ndarray:
-    """Return the thing int (v,) of each vertex by the best disjoint proposals, 0 = none or too small."""
-    members = room.members[best_disjoint(room.members, gain)]
+def chosen(room: RoomProposals, rows: np.ndarray) -> np.ndarray:
+    """Return the thing int (v,) of each vertex by rows of proposals, 0 = none or too small."""
+    members = room.members[rows]
     number = np.zeros(room.members.shape[1] + 1, np.int64)
     number[members.indices] = 1 + np.repeat(np.arange(members.shape[0]), np.diff(members.indptr))
     thing = number[np.minimum(room.region, room.members.shape[1])]
@@ -61,17 +65,6 @@ def chosen(room: RoomProposals, gain: np.ndarray) -> np.ndarray:
     config = InstancesConfig()
     kept = (area >= config.min_object_area_m2) & (np.bincount(thing) >= config.min_object_vertices)
     return np.where(kept[thing], thing, 0)
-
-
-def best_least(rooms: list[RoomProposals], said: list[np.ndarray]) -> float:
-    """Return the least IoU under which the choice is best: the mean of F1 at .25 and recall at .5."""
-
-    def merit(least: float) -> float:
-        figures = proposal_figures(rooms, said, least)
-        recall, precision = figures["recall_25"], figures["precision_25"]
-        return 2 * recall * precision / max(recall + precision, 1e-9) + figures["recall_50"]
-
-    return max(_LEAST, key=merit)
 
 
 def by_truth(room: Example) -> np.ndarray:

@@ -110,9 +110,8 @@ def test_numpy_says_what_pytorch_says(tmp_path):
     networks = [Network(FEATURES, 16, 2) for _ in range(2)]
     rng = np.random.default_rng(0)
     trees = {name: stumps(count, rng)[0] for name, count in TREES.items()}
-    partition.export(partition.ensemble_of(networks), trees, 0.25, tmp_path / "w.safetensors")
+    partition.export(partition.ensemble_of(networks), trees, tmp_path / "w.safetensors")
     models = load_models(tmp_path / "w.safetensors")
-    assert models.least_iou == 0.25
     nodes, edges, pairs = graph_of(rng, FEATURES)
     with torch.no_grad():
         # layers are float16 in the file
@@ -161,7 +160,6 @@ def test_training_learns_writes_weights_and_says_figures(data, tmp_path):
     assert len(models.superpoints.members) > 1
     assert len(models.pairs.first_leaf) == 20
     assert len(models.proposals.first_leaf) == partition._SEEDS * 20
-    assert 0 < models.least_iou < 1
 
 
 def test_noise_on_features_keeps_their_means(graph):

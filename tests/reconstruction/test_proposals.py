@@ -12,7 +12,7 @@ from reconstruction.instances.partition import proposals as trees
 from reconstruction.instances.partition.cut import labels_of, things_of
 from reconstruction.instances.partition.graph import LABELS, Scores
 from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES, proposal_features
-from reconstruction.instances.partition.proposals import best_disjoint, members_of, propose
+from reconstruction.instances.partition.proposals import best_disjoint, likeliest_things, members_of, propose
 
 pytestmark = pytest.mark.stage
 
@@ -40,6 +40,27 @@ def test_without_time_the_best_are_taken_one_by_one():
     chosen = trees.disjoint_by_gain(members_of(regions, 3), gain, np.arange(4))
     np.testing.assert_array_equal(chosen, [0, 1, 3])
     assert len(best_disjoint(members_of(regions, 3), -gain)) == 0
+
+
+def test_what_is_estimated_at_less_than_half_of_the_others_is_no_thing():
+    members = members_of([[0], [1], [2], [3], [2, 3]], 4)
+    iou = np.array([0.8, 0.7, 0.36, 0.3, 0.5])
+    np.testing.assert_array_equal(likeliest_things(members, iou), [0, 1, 4])
+    np.testing.assert_array_equal(likeliest_things(members, 0.4 * iou), [0, 1, 4])  # all lower alike
+    np.testing.assert_array_equal(likeliest_things(members, np.array([0.8, 0.7, 0.3, 0.25, 0.1])), [0, 1])
+    assert len(likeliest_things(members, 0.1 * iou)) == 0
+
+
+def test_the_choice_of_things_agrees_with_its_own_mean():
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        regions = [sorted(rng.choice(12, rng.integers(1, 4), replace=False).tolist()) for _ in range(40)]
+        members, iou = members_of(regions, 12), rng.beta(1, 2, 40)
+        chosen = likeliest_things(members, iou)
+        half = 0.5 * iou[chosen].mean()
+        assert (iou[chosen] > half - 1e-9).all()
+        again = best_disjoint(members, iou - half)
+        assert (iou[again] - half).sum() == pytest.approx((iou[chosen] - half).sum())
 
 
 def test_a_merge_tree_joins_what_belongs_together_first():

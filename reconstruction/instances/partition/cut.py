@@ -16,7 +16,7 @@ from reconstruction.instances.partition.graph import LABELS, RegionGraph, region
 from reconstruction.instances.partition.model import Models, load_models
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposal_features import proposal_features
-from reconstruction.instances.partition.proposals import best_disjoint, propose
+from reconstruction.instances.partition.proposals import likeliest_things, propose
 from reconstruction.instances.sightings import Sighting
 
 _THING, _BASE = LABELS.index("thing"), LABELS.index("base")
@@ -70,7 +70,7 @@ def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[n
     by_trees = models.proposals(rows)
     shown, by_crops = models.crops(view, pieces.graph.region, proposals.members, by_trees)
     members, iou = proposals.members[shown], estimated_iou(by_trees[shown], by_crops)
-    thing = things_of(members[best_disjoint(members, iou - models.least_iou)], pieces)
+    thing = things_of(members[likeliest_things(members, iou)], pieces)
     return labels_of(thing, label[graph.region], cluster[graph.region])
 
 

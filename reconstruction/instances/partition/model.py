@@ -116,14 +116,13 @@ class Models:
     pairs: Boosted  # log-odds that two clusters are pieces of one object
     proposals: Boosted  # logit of the estimated IoU of a proposal and its best object
     crops: CropScorer  # the same logit of the likeliest proposals, from keyframes
-    least_iou: float  # subtracted from the estimated IoU of a proposal: those below it are never objects
 
 
 @lru_cache(maxsize=2)
 def load_models(weights: Path = WEIGHTS) -> Models:
     """Read the models from a safetensors file.
 
-    Its arrays are `superpoints.<member>.<name>`, `<pairs or proposals>.<array>`, `crops.<name>` and `least_iou`.
+    Its arrays are `superpoints.<member>.<name>`, `<pairs or proposals>.<array>` and `crops.<name>`.
 
     Raises:
         EnvironmentMissing: the file is missing, or was made for other features.
@@ -146,13 +145,12 @@ def load_models(weights: Path = WEIGHTS) -> Models:
                 raise KeyError(f"{name}: made for {int(trees[name].features)} features")
         crops = CropScorer(_under(stored, "crops"))
         crops.check()
-        least = float(stored["least_iou"][0])
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise EnvironmentMissing(
             f"instances: the weights {weights} cannot be read ({error}). Install the package again."
         ) from error
     superpoints = Ensemble(tuple(Model(members[k]) for k in sorted(members)))
-    return Models(superpoints, trees["pairs"], trees["proposals"], crops, least)
+    return Models(superpoints, trees["pairs"], trees["proposals"], crops)
 
 
 def _under(stored: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
