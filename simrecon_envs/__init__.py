@@ -56,7 +56,7 @@ __all__ = [
 _LAZY = {
     "Randomization": "simrecon_envs.randomization",
     "Oracle": "simrecon_envs.oracle",
-    "SceneEnv": "simrecon_envs.scene_env",
+    "SceneEnv": "simrecon_envs.entry",
     "record_rollout": "simrecon_envs.rollout",
     "render_scene_picture": "simrecon_envs.rollout",
 }

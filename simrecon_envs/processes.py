@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing import forkserver
 from typing import Any
 
@@ -36,24 +37,9 @@ def prepare_process() -> None:
         import simrecon_envs.scene_env  # noqa: F401
 
     torch.set_num_threads(1)
-    if _PRELOADED in sys.modules and multiprocessing.parent_process() is not None:
-        return  # frozen by the fork server
-    gc.collect()
-    gc.freeze()
-
-
-def prepare_worker() -> bool:
-    """Prepare a process that was started for environments, and return whether this is one.
-
-    Of any other process only torch is limited to one thread.
-    """
-    if multiprocessing.parent_process() is None:
-        import torch
-
-        torch.set_num_threads(1)
-        return False
-    prepare_process()
-    return True
+    if not gc.get_freeze_count():  # a fork server has frozen them already
+        gc.collect()
+        gc.freeze()
 
 
 def start_method() -> str:
@@ -69,22 +55,24 @@ def start_method() -> str:
     return "forkserver"
 
 
-def with_environment(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """Return a picklable function(*arguments, ...) that runs with the environment variables of now.
+def in_worker(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """Return a picklable function(*arguments, ...) that prepares the process that it runs in, if it is another one.
 
-    Processes of a fork server have those of the time at which the server started.
+    That process gets the environment variables of now: a fork server's are those of the time at which it started.
     """
-    return _WithEnvironment(function, arguments, dict(os.environ))
+    return _InWorker(function, arguments, dict(os.environ), os.getpid())
 
 
-class _WithEnvironment:
-    def __init__(
-        self, function: Callable[..., Any], arguments: tuple[Any, ...], environment: dict[str, str]
-    ) -> None:
-        self.function, self.arguments, self.environment = function, arguments, environment
+@dataclass(frozen=True)
+class _InWorker:
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    environment: dict[str, str]
+    asker: int  # process
 
     def __call__(self, *more: Any) -> Any:
-        if dict(os.environ) != self.environment:
+        if os.getpid() != self.asker:
             os.environ.clear()
             os.environ.update(self.environment)
+            prepare_process()
         return self.function(*self.arguments, *more)

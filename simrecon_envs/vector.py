@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from registry import UsageError
-from simrecon_envs.processes import prepare_worker, start_method, with_environment
+from simrecon_envs.processes import in_worker, start_method
 from simrecon_envs.registration import make_cpu
 
 KINDS = ("sync", "async", "sb3")
@@ -42,7 +42,7 @@ def make_vec(
     if num_envs < 1:
         raise UsageError(f"make_vec: num_envs={num_envs} is not at least 1")
     method = start_method() if kind == "async" or (kind == "sb3" and num_envs > 1) else None
-    makers = [with_environment(make_one, scene, registry, kwargs)] * num_envs
+    makers = [in_worker(make_one, scene, registry, kwargs)] * num_envs
     if kind == "sb3":
         from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
@@ -56,5 +56,7 @@ def make_vec(
 
 def make_one(scene: str, registry: Path | str | None, kwargs: dict[str, Any]) -> Any:
     """Make one environment in its own process, and limit torch to one thread."""
-    prepare_worker()
+    import torch
+
+    torch.set_num_threads(1)
     return make_cpu(scene, registry=registry, **kwargs)

@@ -8,7 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from registry import EnvironmentMissing, UsageError
-from simrecon_envs.processes import prepare_process, start_method, with_environment
+from simrecon_envs.processes import in_worker, prepare_process, start_method
 
 
 class Workers:
@@ -32,7 +32,7 @@ class Workers:
         if self.jobs > 1:
             context = multiprocessing.get_context(start_method())
             self._pool = ProcessPoolExecutor(
-                self.jobs, mp_context=context, initializer=with_environment(prepare_process)
+                self.jobs, mp_context=context, initializer=in_worker(prepare_process)
             )
         return self
 

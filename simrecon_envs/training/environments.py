@@ -1,5 +1,6 @@
 """Make the environments for training and evaluation: NumPy, in one process each for training."""
 
+import multiprocessing
 import signal
 import time
 from typing import Any
@@ -8,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from registry import UsageError
-from simrecon_envs.processes import prepare_worker, start_method, with_environment
+from simrecon_envs.processes import in_worker, start_method
 from simrecon_envs.registration import episode_steps, make_cpu
 from simrecon_envs.training.config import TrainConfig
 from simrecon_envs.unwrapped import scene_of
@@ -57,7 +58,7 @@ def make_several(config: TrainConfig) -> Any:
     """Make the vector environment for training, without normalization; several environments have a process each."""
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-    makers = [with_environment(_in_worker, config)] * config.envs
+    makers = [in_worker(_make_one, config)] * config.envs
     if config.envs == 1:
         return DummyVecEnv(makers)
     # Ctrl-C reaches all processes of a terminal. Workers inherit SIG_IGN and leave it to the training process.
@@ -178,8 +179,11 @@ def _leaves(entry: Any) -> Any:
         yield entry
 
 
-def _in_worker(config: TrainConfig) -> gym.Env:
-    if prepare_worker():
+def _make_one(config: TrainConfig) -> gym.Env:
+    import torch
+
+    torch.set_num_threads(1)
+    if multiprocessing.parent_process() is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return make_one(config)
 

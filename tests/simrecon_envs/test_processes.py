@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from simrecon_envs.processes import start_method, with_environment, without_collection
+from simrecon_envs.processes import in_worker, start_method, without_collection
 
 pytestmark = pytest.mark.env
 
@@ -25,7 +25,7 @@ def _ask() -> None:
     os.environ["SIMRECON_TRIED"] = "after the server"
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         loaded, frozen, parent, _ = pool.submit(_loaded).result()
-        variable = pool.submit(with_environment(_loaded)).result()[3]
+        variable = pool.submit(in_worker(_loaded)).result()[3]
     print(loaded, frozen, parent == os.getpid(), "torch" in sys.modules, variable, sep="\n")  # noqa: T201
 
 
