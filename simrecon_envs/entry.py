@@ -1,6 +1,6 @@
 """The entry point of registered environments: `SceneEnv`, imported without garbage collection."""
 
-from simrecon_envs.processes import without_collection
+from simrecon_envs.collection import without_collection
 
 with without_collection():
     from simrecon_envs.scene_env import SceneEnv

@@ -5,12 +5,9 @@ happens if the scene has a newer one. `SimRecon/scene0001-pick_mug-v0` is a task
 of success and reward. Scenes have entries in Gymnasium's registry; specs of tasks are created on demand from the id.
 """
 
-import gc
 import re
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from copy import copy
 from dataclasses import fields
 from functools import cached_property
@@ -23,6 +20,7 @@ from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 from registry import SimReconError, UsageError, default_registry_root, open_registry, registry_folder
 from registry.errors import did_you_mean
+from simrecon_envs.collection import without_collection
 from simrecon_envs.errors import EnvNotFound
 
 NAMESPACE = "SimRecon"
@@ -73,7 +71,7 @@ def _register(root: Path | str | None, known_only: bool = False) -> dict[str, En
     """
     # Absolute, because the working folder may change before the environment is made.
     folder = str(registry_folder(root).absolute())
-    with _collection_paused():
+    with without_collection():
         # Not by `gym.register`, which searches the whole registry in every call and warns about replaced ids.
         revisions = open_registry(folder).revisions(ordered=False, known_only=known_only)
         specs = _scene_specs(revisions, folder)
@@ -82,18 +80,6 @@ def _register(root: Path | str | None, known_only: bool = False) -> dict[str, En
                 del gym.registry[known]
         gym.registry.update(specs)
     return specs
-
-
-@contextmanager
-def _collection_paused() -> Iterator[None]:
-    """Pause the garbage collector, which would look through all new specs again and again."""
-    was = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was:
-            gc.enable()
 
 
 def register_default_scenes() -> None:

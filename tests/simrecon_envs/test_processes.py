@@ -9,7 +9,8 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from simrecon_envs.processes import in_worker, start_method, without_collection
+from simrecon_envs.collection import without_collection
+from simrecon_envs.processes import in_worker, start_method
 
 pytestmark = pytest.mark.env
 

@@ -19,7 +19,7 @@ from reconstruction.instances.partition.features import View
 
 LARGEST_M = 4.0  # largest diagonal of a proposal's bounding box
 LEAST_AREA_M2 = 0.002  # of a proposal
-LEAST_COST = 0.1  # estimated IoU under which a proposal is no object in any scene
+_LEAST_COST = 0.1  # estimated IoU under which a proposal is no object in any scene
 ALIKE = 1.03  # a region is left out if its parent in the merge tree is larger by less than this factor
 _CLIP_ODDS = 20.0
 _TIME_S = 20.0  # limit of the integer program; the best solution until then is used
@@ -182,18 +182,18 @@ def distinct(members: csr_matrix, area: np.ndarray, score: np.ndarray, most: int
 
 
 def likeliest_things(members: csr_matrix, iou: np.ndarray) -> np.ndarray:
-    """Return the rows of the disjoint proposals that are objects: the largest choice that no other has a better F1 than.
+    """Return the rows of the disjoint proposals that are objects: a choice that agrees with its own expected F1.
 
     If as many objects are there as are chosen, the expected F1 is the mean of the chosen estimates, and proposals
     below half of it lower it (Lipton et al., Optimal thresholding of classifiers to maximize F1 measure, ECML 2014).
-    So the cost of a proposal rises from `LEAST_COST` to half of the mean of the choice. In a scene unlike those trained
-    on, whose estimates are lower throughout, it is lower.
+    So the cost of a proposal rises from `_LEAST_COST` to half of the mean of the choice. In a scene unlike those that
+    models were trained on, whose estimates are lower throughout, it is lower.
 
     Args:
         members: (m, n) 1 = the cluster is in the proposal.
         iou: float (m,) estimated IoU of each proposal and its best object.
     """
-    cost = LEAST_COST
+    cost = _LEAST_COST
     while True:
         chosen = best_disjoint(members, iou - cost)
         half = 0.5 * float(iou[chosen].mean()) if len(chosen) else 0.0
