@@ -5,11 +5,14 @@ Usage:
 
 Of the films, `--real` are short films of a generated room with the cheapest options of the real pipeline; the others
 cannot be reconstructed (no video, empty, cut off, blank, at rest, …). Every `--kill-every` seconds a process of a
-running video is killed by SIGKILL; `--driver-kills` times the driver is, and the same command is run again. Then every
-video must have ended as expected, once, and a further run must do nothing.
+running video is killed by SIGKILL; `--driver-kills` times the driver is, and the same command is run again. With
+`--full-disk S` work folders lie on a disk of their own, which is full for S seconds in the last run of the driver
+(needs root on Linux, to mount it); a batch that stops for it is run again. Then every video must have ended as
+expected, once, and a further run must do nothing.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -40,6 +43,7 @@ CHEAP = (
     *("assembly.settle_s=0.5", "assembly.joint_settle_s=0.5", "world.max_frames=8"),
 )
 """The cheapest options of the real pipeline that still give a scene."""
+_MOST_STOPS = 5  # of a batch, before it counts as failed
 _BROKEN = ("not_a_video", "empty", "cut_before_index", "black")
 _WORKERS = ("reconstruction.batch.child", "ray::simrecon")
 
@@ -94,6 +98,52 @@ class Killer:
                     self.kills += 1
                 except psutil.Error:
                     pass
+
+
+class FullDisk:
+    """A disk of its own for work folders, which is full for some seconds once `fill` is called."""
+
+    _SIZE_MB, _LEFT_MB = 2048, 1  # a run wants 1.5 GB
+
+    def __init__(self, folder: Path, full_s: float) -> None:
+        self._folder, self._full_s = folder, full_s
+        self._filled = threading.Event()
+        self.thread = threading.Thread(target=self._work, daemon=True)
+
+    def __enter__(self) -> "FullDisk":
+        """Mount it."""
+        if self._full_s:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            done = subprocess.run(
+                ["mount", "-t", "tmpfs", "-o", f"size={self._SIZE_MB}m", "tmpfs", self._folder],
+                capture_output=True,
+                text=True,
+            )
+            if done.returncode:
+                raise UsageError(f"--full-disk: cannot mount a disk at {self._folder}: {done.stderr.strip()}")
+        return self
+
+    def fill(self, after_s: float) -> None:
+        """Fill it after some seconds; `thread` ends when it has been freed."""
+        self._after_s = after_s
+        if self._full_s:
+            self.thread.start()
+
+    def __exit__(self, *exc: object) -> None:
+        """Unmount it."""
+        if self._full_s:
+            subprocess.run(["umount", "-l", self._folder], check=False)
+
+    def _work(self) -> None:
+        time.sleep(self._after_s)
+        filler, end = self._folder / "filler", time.monotonic() + self._full_s
+        block = bytes(1 << 20)
+        while time.monotonic() < end:  # again and again: runs that end free some
+            with contextlib.suppress(OSError), filler.open("ab", buffering=0) as stream:
+                while psutil.disk_usage(str(self._folder)).free > self._LEFT_MB << 20:
+                    stream.write(block)
+            time.sleep(0.2)
+        filler.unlink()
 
 
 def _is_worker(process: psutil.Process) -> bool:
@@ -187,21 +237,31 @@ def measure(options: argparse.Namespace, home: Path) -> dict[str, Any]:
         arguments += ["--set", option]
     began, drivers = time.monotonic(), 0
     chance = random.Random(options.seed)
-    with Killer(options.kill_every, options.seed) as killer:
+    with (
+        FullDisk(home / "work", options.full_disk) as disk,
+        Killer(options.kill_every, options.seed) as killer,
+    ):
         for _ in range(options.driver_kills):
             code = run_batch(
                 films, home, arguments, kill_after_s=chance.uniform(0.5, 1.5) * options.driver_life
             )
             drivers += code == -signal.SIGKILL
+        disk.fill(after_s=options.driver_life / 2)
         code = run_batch(films, home, arguments)
-        if code == 4:  # a video was killed more often than it is retried
+        stops = 0
+        while (
+            code == 4 and stops < _MOST_STOPS
+        ):  # killed more often than it is retried, or stopped by the full disk
+            stops += 1
+            if options.full_disk:
+                disk.thread.join()
             code = run_batch(films, home, arguments)
-    seconds = time.monotonic() - began
-    found = judge(home, expected)
-    before = SceneRegistry(home / "registry").revisions()
-    lines = len(Journal(home / "out").events())
-    again = time.monotonic()
-    run_batch(films, home, arguments)
+        seconds = time.monotonic() - began
+        found = judge(home, expected)
+        before = SceneRegistry(home / "registry").revisions()
+        lines = len(Journal(home / "out").events())
+        again = time.monotonic()
+        run_batch(films, home, arguments)
     if len(Journal(home / "out").events()) != lines or SceneRegistry(home / "registry").revisions() != before:
         found["problems"].append("a further run did something")
     return {
@@ -209,6 +269,8 @@ def measure(options: argparse.Namespace, home: Path) -> dict[str, Any]:
         "wall_s": round(seconds, 1),
         "worker_kills": killer.kills,
         "driver_kills": drivers,
+        "full_disk_s": options.full_disk,
+        "stops": stops,
         "exit_code": code,
         "again_s": round(time.monotonic() - again, 1),
         **found,
@@ -234,6 +296,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add("--driver-kills", type=int, default=2, help="kills of the driver (default 2)")
     add("--driver-life", type=float, default=90.0, metavar="S", help="mean seconds until a driver is killed")
+    add(
+        "--full-disk",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="seconds that the disk of work folders is full",
+    )
     add("--at-once", type=int, default=2, help="videos at the same time (default 2)")
     add("--engine", default="local", help="local (default) or ray")
     add("--seed", type=int, default=0, help="of the kills")

@@ -43,6 +43,7 @@ def s3_server(bucket: str) -> Generator[dict[str, str], None, None]:
     os.environ.update(settings)
     try:
         _wait(process, settings["AWS_ENDPOINT_URL"])
+        s3fs.S3FileSystem.clear_instance_cache()  # clients of another server
         s3fs.S3FileSystem(use_listings_cache=False).mkdir(bucket)
         yield settings
     finally:

@@ -130,6 +130,13 @@ class StageStore:
                 f"{_NEEDED_BYTES / 2**30:.1f} GB. Free some, or choose another disk with --work-dir."
             )
 
+    def __enter__(self) -> "StageStore":
+        """Use it for a run."""
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """End its use; results in other places are complete then."""
+
     def _folder(self, number: int, stage: str, key: str) -> Path:
         return self.work_dir / f"{number:02d}_{stage}-{key}"
 
@@ -142,6 +149,10 @@ class StageStore:
 
     def has(self, number: int, stage: str, key: str) -> bool:
         """Return whether a result with this fingerprint exists; if so, other runs keep it while this one uses it."""
+        return self._is_here(number, stage, key)
+
+    def _is_here(self, number: int, stage: str, key: str) -> bool:
+        """As `has`, on this disk."""
         folder = self._folder(number, stage, key)
         if not (folder / _MANIFEST).is_file() or not self._leases.take(stage, folder):
             return False
@@ -240,7 +251,7 @@ class StageStore:
         for attempt in range(_TRIES):
             if attempt:  # another run may be about to remove what is there
                 time.sleep(_WAIT_S * 2 ** (attempt - 1))
-            if self.has(number, stage, key):
+            if self._is_here(number, stage, key):
                 try:
                     self.check(number, stage, key)
                     return

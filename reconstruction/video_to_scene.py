@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reconstruction.cache import KEPT_PER_STAGE, StageStore, digest_input
+from reconstruction.cache import KEPT_PER_STAGE, digest_input
 from reconstruction.config import PipelineConfig
 from reconstruction.core.progress import NO_PROGRESS, StageListener
 from reconstruction.core.types import ObjectAsset
@@ -16,6 +16,7 @@ from reconstruction.editing.overrides import Overrides
 from reconstruction.frames.load import check_input
 from reconstruction.made_by import note_made_by
 from reconstruction.publish import publish_scene
+from reconstruction.remote_cache import open_store
 from reconstruction.runner import Run
 from registry import SceneRecord, open_registry
 from registry.errors import InputError, UsageError
@@ -46,7 +47,7 @@ def reconstruct(
     *,
     scene_id: str | None = None,
     registry_root: Path | None = None,
-    work_dir: Path | None = None,
+    work_dir: Path | str | None = None,
     config: PipelineConfig | None = None,
     overrides: Overrides | None = None,
     oracle: "Oracle | None" = None,
@@ -61,7 +62,8 @@ def reconstruct(
         video: any file that ffmpeg decodes, or a folder of images in name order.
         scene_id: id in the registry, `[a-z0-9_]+`; None: the next free `sceneNNNN`.
         registry_root: folder of the registry; None: `$SIMRECON_HOME/registry` or `~/.simrecon/registry`.
-        work_dir: folder of the stage cache; None: a folder beside the registry, named by the digest of the input.
+        work_dir: folder of the stage cache; None: a folder beside the registry, named by the digest of the input. An
+            address of fsspec (`s3://lab/work`): that folder, with a copy at the address.
         config: options of all stages.
         overrides: the user's corrections.
         oracle: stages that the ground truth replaces, to measure their share of the errors.
@@ -88,28 +90,28 @@ def reconstruct(
         scene_id = scene_id or held_id
         assert scene_id is not None
         digest = digest_input(video)
-        folder = Path(work_dir) if work_dir else registry.root.parent / "work" / digest[:16]
-        run = Run(
-            video,
-            config,
-            StageStore(folder, keep_results),
-            overrides or Overrides(),
-            oracle,
-            listener,
-            input_digest=digest,
-            started=started,
-            after_stage=_after(after_stage),
-        )
-        try:
-            run.execute()
-        except InputError as error:
-            if run.results.keys() & {"poses"}:
-                raise
-            raise InputError("\n".join([str(error), *_check_summary(video)])) from error
-        run = _with_object_scale(run)
-        record = publish_scene(run, registry, scene_id, require_stable=require_stable)
-        run.store.note_published(scene_id, record.revision, run.keys)
-        note_made_by(folder, scene_id, video, run.overrides.file)
+        with open_store(work_dir, registry.root, digest, keep_results, listener.note) as store:
+            run = Run(
+                video,
+                config,
+                store,
+                overrides or Overrides(),
+                oracle,
+                listener,
+                input_digest=digest,
+                started=started,
+                after_stage=_after(after_stage),
+            )
+            try:
+                run.execute()
+            except InputError as error:
+                if run.results.keys() & {"poses"}:
+                    raise
+                raise InputError("\n".join([str(error), *_check_summary(video)])) from error
+            run = _with_object_scale(run)
+            record = publish_scene(run, registry, scene_id, require_stable=require_stable)
+            store.note_published(scene_id, record.revision, run.keys)
+            note_made_by(store.work_dir, scene_id, video, run.overrides.file)
     return Reconstruction(record, run)
 
 

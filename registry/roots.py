@@ -44,8 +44,9 @@ def registry_folder(address: Path | str | None) -> Path:
     """
     if address is None:
         return default_registry_root()
-    if isinstance(address, Path) or not _URL.match(address):
+    if not is_address(address):
         return Path(address).expanduser()
+    address = str(address)
     if "@" in address or "?" in address:
         raise UsageError(
             "the address of a registry holds no user, password or query: clients find credentials by themselves "
@@ -63,6 +64,11 @@ def registry_folder(address: Path | str | None) -> Path:
                 "choose another $SIMRECON_HOME"
             ) from error
     return folder / _FOLDER
+
+
+def is_address(where: Path | str | None) -> bool:
+    """Return whether this is an address of fsspec (`s3://lab/scenes`), not a path."""
+    return isinstance(where, str) and bool(_URL.match(where))
 
 
 def address_of(root: Path) -> str | None:

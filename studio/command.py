@@ -6,6 +6,7 @@ from pathlib import Path
 
 from registry import SceneRegistry, open_registry
 from registry.errors import EnvironmentMissing, UsageError
+from registry.roots import is_address
 
 # Parts of a page, `module:class`, in the order of their tabs.
 PARTS = (
@@ -31,13 +32,23 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _remember(registry: SceneRegistry, arguments: argparse.Namespace) -> None:
-    """Keep what the command line says about the scene's film, work folder and corrections."""
+    """Keep what the command line says about the scene's film, work folder and corrections.
+
+    What lies at an address is downloaded: the film, and stage results into the scene's default work folder.
+    """
     from studio.remembered import remember
 
-    remember(
-        registry.root, arguments.scene, video=arguments.video, work_dir=arguments.work_dir,
-        overrides=arguments.overrides,
-    )  # fmt: skip
+    video, work_dir = arguments.video, arguments.work_dir
+    if is_address(video):
+        from reconstruction.downloads import local_copy
+
+        video = local_copy(video)
+    if is_address(work_dir):
+        from reconstruction.measure.stage_results import StageResults
+
+        StageResults.find(registry.load(arguments.scene), registry.root, work_dir)
+        work_dir = None
+    remember(registry.root, arguments.scene, video=video, work_dir=work_dir, overrides=arguments.overrides)
 
 
 def check_viser() -> None:

@@ -4,6 +4,7 @@ A test's lane is a marker. Without a marker, tests in `simrecon_envs/` are `env`
 all others `unit`; of two markers `end_to_end` counts. A unit test has twenty seconds and starts no process.
 """
 
+import logging
 import subprocess
 from pathlib import Path
 
@@ -63,3 +64,28 @@ def demo_video() -> Path:
     """Return the path of the video that ships with the project; its truth lies beside it."""
     assert DEMO_VIDEO.is_file(), "examples/data/demo_room.mp4 is missing: run tools/make_demo_video.py"
     return DEMO_VIDEO
+
+
+@pytest.fixture(scope="session")
+def s3():
+    """Start an S3 server in this process; return its address. Its clients find it by the environment."""
+    pytest.importorskip("s3fs", reason="S3 is tested with the extra s3")
+    server_module = pytest.importorskip("moto.server", reason="S3 is tested with moto")
+    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    host, port = server.get_host_and_port()
+    settings = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in settings.items():
+            patch.setenv(name, value)
+        import s3fs
+
+        s3fs.S3FileSystem(use_listings_cache=False).mkdir("lab")
+        yield settings["AWS_ENDPOINT_URL"]
+    server.stop()

@@ -16,7 +16,11 @@ from pathlib import Path
 import psutil
 
 from reconstruction.batch.outcomes import CURES, Outcome, classify, plain
-from registry import registry_folder
+from reconstruction.cache import digest_input
+from reconstruction.downloads import as_local, drop_copy
+from reconstruction.remote_cache import drop_results
+from registry import SimReconError, registry_folder
+from registry.roots import is_address
 
 _POLL_S = 0.25
 _GRACE_S = 30.0  # from SIGINT to SIGKILL
@@ -69,9 +73,7 @@ def run_attempt(job: Job, stop: threading.Event | None = None) -> Outcome:
 
 def _reconstruct(job: Job, stop: threading.Event) -> Outcome:
     job.log.parent.mkdir(parents=True, exist_ok=True)
-    work = (
-        None if job.work_dir is None else Path(os.path.expandvars(job.work_dir)).expanduser() / job.scene_id
-    )
+    work = _work_of(job)
     command = ["reconstruct", *job.arguments, "--registry", str(job.registry)]
     if work is not None:
         command += ["--work-dir", str(work)]
@@ -80,7 +82,7 @@ def _reconstruct(job: Job, stop: threading.Event) -> Outcome:
         watched = _watch(command, job, stop, log)
     if watched.verdict is not None:
         return watched.verdict
-    folders = [f for f in (work, registry_folder(job.registry), job.log.parent) if f is not None]
+    folders = [f for f in (work, registry_folder(job.registry), job.log.parent) if isinstance(f, Path)]
     outcome = classify(
         watched.exit_code,
         tail(job.log),
@@ -91,11 +93,33 @@ def _reconstruct(job: Job, stop: threading.Event) -> Outcome:
     if outcome.kind == "published":
         notes += _write_report(job, work, stop)
         if work is not None and not job.keep_work:
-            shutil.rmtree(work, ignore_errors=True)
+            notes += _drop(job, work)
     return replace(outcome, peak_memory_mb=watched.peak_mb, notes=tuple(notes))
 
 
-def _write_report(job: Job, work: Path | None, stop: threading.Event) -> list[str]:
+def _work_of(job: Job) -> Path | str | None:
+    """Return the work folder of an attempt on this machine, its address, or None for the default."""
+    if job.work_dir is None or is_address(job.work_dir):
+        return job.work_dir
+    return Path(os.path.expandvars(job.work_dir)).expanduser() / job.scene_id
+
+
+def _drop(job: Job, work: Path | str) -> list[str]:
+    """Delete the stage results of a published scene, and a downloaded film; return a note if an address fails."""
+    video, notes = job.arguments[0], []
+    try:
+        if isinstance(work, Path):
+            shutil.rmtree(work, ignore_errors=True)
+        else:
+            drop_results(work, registry_folder(job.registry), digest_input(as_local(video)))
+        if is_address(video):
+            drop_copy(video)
+    except SimReconError as error:
+        notes.append(f"results are not deleted: {plain(str(error))}")
+    return notes
+
+
+def _write_report(job: Job, work: Path | str | None, stop: threading.Event) -> list[str]:
     """Write the page of `simrecon report`; return a note if that fails, which does not fail the video."""
     if job.report is None:
         return []

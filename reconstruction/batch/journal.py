@@ -66,9 +66,9 @@ class Journal:
         """Return the state of each video by scene id."""
         return fold(self.events())
 
-    def known_ids(self) -> dict[Path, str]:
-        """Return the scene ids that earlier runs gave to videos, by path."""
-        return {Path(state.video): state.scene_id for state in self.states().values() if state.video}
+    def known_ids(self) -> dict[str, str]:
+        """Return the scene ids that earlier runs gave to videos, by path or address."""
+        return {state.video: state.scene_id for state in self.states().values() if state.video}
 
     @contextmanager
     def held(self) -> Iterator["Journal"]:

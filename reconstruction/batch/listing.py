@@ -11,9 +11,10 @@ from pathlib import Path
 
 from reconstruction.batch import sources
 from reconstruction.batch.naming import assign_ids
-from reconstruction.batch.rows import VideoRow
+from reconstruction.batch.rows import AnyPath, VideoRow
 from reconstruction.phone_exports.exports import natural
 from registry.errors import SimReconError, UsageError, did_you_mean
+from registry.roots import is_address
 from registry.schema import check_scene_id
 
 COLUMNS = ("path", "id", "preset", "options", "marker_size", "scale", "poses", "overrides", "seed")
@@ -46,7 +47,7 @@ class _Problems:
         raise UsageError("\n".join(lines + ([f"  and {more} more"] if more else [])))
 
 
-def read_rows(address: str, defaults: VideoRow, known: Mapping[Path, str] | None = None) -> Listing:
+def read_rows(address: str, defaults: VideoRow, known: Mapping[str, str] | None = None) -> Listing:
     """Return the checked rows of a folder or a list.
 
     Args:
@@ -57,7 +58,12 @@ def read_rows(address: str, defaults: VideoRow, known: Mapping[Path, str] | None
     Raises:
         UsageError: the address cannot be read, or rows are wrong; the message names every problem.
     """
-    place = sources.local_path(address)
+    place = sources.path_of(address)
+    with sources.reading(place):
+        return _read_rows(place, defaults, known)
+
+
+def _read_rows(place: AnyPath, defaults: VideoRow, known: Mapping[str, str] | None) -> Listing:
     left_out: list[str] = []
     problems = _Problems()
     if place.is_dir():
@@ -77,7 +83,7 @@ def read_rows(address: str, defaults: VideoRow, known: Mapping[Path, str] | None
     return Listing(place.stem if place.is_file() else place.name, tuple(rows), tuple(left_out))
 
 
-def _rows_of_list(path: Path, defaults: VideoRow, problems: _Problems) -> list[VideoRow]:
+def _rows_of_list(path: AnyPath, defaults: VideoRow, problems: _Problems) -> list[VideoRow]:
     text = sources.read_list(path)
     header = text.split("\n", 1)[0]
     delimiter = max(",;\t", key=header.count)
@@ -117,17 +123,26 @@ def _rows_of_list(path: Path, defaults: VideoRow, problems: _Problems) -> list[V
 
 
 def _row_of(
-    values: dict[str, str], where: str, folder: Path, defaults: VideoRow, problems: _Problems
+    values: dict[str, str], where: str, folder: AnyPath, defaults: VideoRow, problems: _Problems
 ) -> VideoRow:
     """Return the row of one line; a value that cannot be parsed is a problem, and the default stays."""
 
-    def path_of(column: str) -> Path | None:
+    def path_of(column: str) -> "AnyPath | None":
         text = values.get(column, "")
         try:
-            return sources.local_path(str(folder / text) if "://" not in text else text) if text else None
-        except UsageError as error:
+            return sources.path_of(text if is_address(text) else str(folder / text)) if text else None
+        except SimReconError as error:
             problems.add(f"{where}, {column}", error)
             return None
+
+    def local_path_of(column: str) -> Path | None:
+        path = path_of(column)
+        if path is None or isinstance(path, Path):
+            return path
+        problems.add(
+            f"{where}, {column}", f"{path}: only videos are read from addresses; copy the file first"
+        )
+        return None
 
     def number(column: str, kind: type) -> float | int | None:
         text = values.get(column, "")
@@ -151,14 +166,14 @@ def _row_of(
         options=(*defaults.options, *options),
         marker_size_m=defaults.marker_size_m if marker is None else float(marker),
         scale=values.get("scale") or defaults.scale,
-        poses=path_of("poses") or defaults.poses,
-        overrides=path_of("overrides") or defaults.overrides,
+        poses=local_path_of("poses") or defaults.poses,
+        overrides=local_path_of("overrides") or defaults.overrides,
         seed=defaults.seed if seed is None else int(seed),
         where=where,
     )
 
 
-def _with_ids(rows: list[VideoRow], problems: _Problems, known: Mapping[Path, str] | None) -> list[VideoRow]:
+def _with_ids(rows: list[VideoRow], problems: _Problems, known: Mapping[str, str] | None) -> list[VideoRow]:
     """Fill in missing ids; ids that are wrong or there twice are problems."""
     given: dict[str, VideoRow] = {}
     for row in rows:
@@ -174,7 +189,7 @@ def _with_ids(rows: list[VideoRow], problems: _Problems, known: Mapping[Path, st
             )
         given.setdefault(row.scene_id, row)
     nameless = [row for row in rows if not row.scene_id]
-    seen: dict[Path, VideoRow] = {}
+    seen: dict[AnyPath, VideoRow] = {}
     for row in nameless:
         if row.video in seen:
             problems.add(
@@ -190,8 +205,8 @@ def check_row(row: VideoRow, report) -> None:
     """Check the files and options of a row; call `report(where, message)` for each problem."""
     if row.video == Path():
         report(f"{row.where}, path", "missing")
-    elif not row.video.exists():
-        report(f"{row.where}, path", f"{row.video}: no such file or folder")
+    elif problem := _video_problem(row.video):
+        report(f"{row.where}, path", problem)
     for name, path in (("poses", row.poses), ("overrides", row.overrides)):
         if path is not None and not path.exists():
             report(f"{row.where}, {name}", f"{path}: no such file")
@@ -201,6 +216,14 @@ def check_row(row: VideoRow, report) -> None:
         report(f"{row.where}, marker_size", f"{row.marker_size_m:g} is no length in metres; 0.10 is 10 cm")
     if problem := _option_problem(row.preset, row.options, row.scale):
         report(f"{row.where}, {problem[0]}", problem[1])
+
+
+def _video_problem(video: AnyPath) -> str:
+    try:
+        with sources.reading(video):
+            return "" if video.exists() else f"{video}: no such file or folder"
+    except SimReconError as error:
+        return str(error)
 
 
 @cache

@@ -6,6 +6,8 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from reconstruction.batch.rows import AnyPath
+
 _LONGEST = 64
 
 
@@ -22,26 +24,27 @@ def id_of_name(name: str) -> str:
 
 
 def assign_ids(
-    videos: Sequence[Path], taken: Mapping[str, Path], known: Mapping[Path, str] | None = None
-) -> dict[Path, str]:
+    videos: Sequence[AnyPath], taken: Mapping[str, AnyPath], known: Mapping[str, str] | None = None
+) -> dict[AnyPath, str]:
     """Return a scene id for each video: that of an earlier run, or one from its file name with `_2`, `_3` … if taken.
 
     Args:
         videos: paths without repeats, in order.
         taken: ids that rows of the list give.
-        known: ids of an earlier run of the batch, by path.
+        known: ids of an earlier run of the batch, by path or address.
     """
     known = known or {}
-    ids: dict[Path, str] = {}
+    ids: dict[AnyPath, str] = {}
     used = set(taken)
     for video in videos:
-        if video in known and known[video] not in used:
-            ids[video] = known[video]
-            used.add(known[video])
+        before = known.get(str(video))
+        if before is not None and before not in used:
+            ids[video] = before
+            used.add(before)
     for video in videos:
         if video in ids:
             continue
-        base = id_of_name(video.name if video.is_dir() else video.stem)
+        base = id_of_name(video.name if isinstance(video, Path) and video.is_dir() else video.stem)
         number, found = 1, base
         while found in used:
             number += 1

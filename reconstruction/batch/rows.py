@@ -4,6 +4,12 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from upath import UPath
+
+AnyPath: TypeAlias = "Path | UPath"  # a path object of universal_pathlib is of an address
 
 
 @dataclass(frozen=True)
@@ -11,7 +17,7 @@ class VideoRow:
     """One video and its options. Paths are absolute."""
 
     scene_id: str
-    video: Path  # a file, or a folder of images
+    video: AnyPath  # a file, or a folder of images
     preset: str = "default"
     options: tuple[str, ...] = ()  # of --set, each `stage.field=value`
     marker_size_m: float | None = None
@@ -56,13 +62,17 @@ class VideoRow:
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def size_bytes(path: Path) -> int:
+def size_bytes(path: AnyPath) -> int:
     """Return the size of a file, or of all files in a folder."""
     return sum(size for _, size, _ in _state(path))
 
 
-def _state(path: Path) -> list[tuple[str, int, int]]:
-    """Return (name, bytes, time of change in ns) of a file, or of each file below a folder."""
+def _state(path: AnyPath) -> list[tuple[str, int, int | str]]:
+    """Return (name, bytes, time of change in ns or version) of a file, or of each file below a folder."""
+    if not isinstance(path, Path):
+        from reconstruction.downloads import files_of
+
+        return [(str(file), size, version) for file, size, version in files_of(path)]
     files = [path] if not path.is_dir() else sorted(p for p in path.rglob("*") if p.is_file())
     stats = [(file, file.stat()) for file in files]
     return [(file.relative_to(path.parent).as_posix(), s.st_size, s.st_mtime_ns) for file, s in stats]

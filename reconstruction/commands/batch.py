@@ -24,7 +24,8 @@ again only if its options or its files changed. Tables of all figures and a page
 the journal."""
 
 _EPILOG = """a folder: each video in it, and each folder of images in it; scene ids come from the file names.
-a list: CSV with a row for each video. Only `path` is needed; paths count from the list's folder:
+a list: CSV with a row for each video. Only `path` is needed; paths count from the list's folder,
+and may be addresses:
   path,id,preset,options,marker_size,scale,poses,overrides,seed
   kitchen.mp4,,,,0.10,,,,
   photos/dorm,dorm,quality,depth.depth_side_px=640 frames.max_keyframes=80,,camera-height=1.5,,dorm.yaml,
@@ -45,6 +46,7 @@ examples:
   simrecon batch rooms.csv --preset fast --at-once 4 --out rooms
   simrecon batch films/ --engine ray            # local Ray; pip install 'simrecon[ray]'
   simrecon batch /nfs/films --engine ray --address auto --registry /nfs/registry --work-dir /nfs/work
+  simrecon batch s3://lab/films --engine ray --address auto --registry s3://lab/scenes --work-dir s3://lab/work
   simrecon batch films/ --retry-failed          # after a new version, or new films under the old names
 """
 
@@ -53,7 +55,11 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     """Add the verb."""
     parser = add_verb(verbs, "batch", "reconstruct many videos, several at once", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
-    add("videos", metavar="FOLDER|LIST.csv", help="a folder of videos, or a list of them")
+    add(
+        "videos",
+        metavar="FOLDER|LIST.csv",
+        help="a folder of videos, or a list of them; also at an address (s3://bucket/films)",
+    )
     add("--out", type=Path, metavar="DIR", help="folder of journal and results (default: ./NAME.batch)")
     add("--dry-run", action="store_true", help="print what would run, and why; change nothing")
     of_rows = parser.add_argument_group("options of rows that say nothing else")
@@ -74,7 +80,8 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     for_all.add_argument(
         "--work-dir",
         metavar="DIR",
-        help="folder of the stage caches, DIR/SCENE each; $VARIABLES are those of the machine that runs the video",
+        help="folder of the stage caches, DIR/SCENE each; $VARIABLES are those of the machine that runs the video. At "
+        "an address (s3://bucket/work) lie copies of them: a video goes on from its finished stages on any machine",
     )
     for_all.add_argument(
         "--drop-work", action="store_true", help="with --work-dir: delete the cache of a published scene"
@@ -131,12 +138,14 @@ def run(arguments: argparse.Namespace) -> int:
     from reconstruction.batch.journal import Journal
     from reconstruction.batch.listing import read_rows
     from reconstruction.batch.plan import Choice, make_plan
-    from reconstruction.batch.sources import local_path
+    from reconstruction.batch.sources import path_of, reading
     from registry import open_registry
 
     _check_flags(arguments)
-    place = local_path(arguments.videos)
-    out = Path(arguments.out or f"{place.stem if place.is_file() else place.name}.batch").absolute()
+    place = path_of(arguments.videos)
+    with reading(place):
+        name = place.stem if place.is_file() else place.name
+    out = Path(arguments.out or f"{name}.batch").absolute()
     journal = Journal(out)
     registry = open_registry(arguments.registry)
     registry.root = registry.root.absolute()
@@ -240,13 +249,13 @@ def _tasks(
     from reconstruction.batch.driver import Task
     from reconstruction.batch.engines.base import CORES, MEMORY_MB
     from reconstruction.batch.rows import size_bytes
+    from registry.roots import is_address
 
     out, common = journal.path.parent, _common(arguments)
     work_dir = None
     if arguments.work_dir:
-        work_dir = (
-            arguments.work_dir if "$" in arguments.work_dir else str(Path(arguments.work_dir).absolute())
-        )
+        as_it_is = "$" in arguments.work_dir or is_address(arguments.work_dir)
+        work_dir = arguments.work_dir if as_it_is else str(Path(arguments.work_dir).absolute())
     tasks = []
     for step in steps:
         if not step.runs:
@@ -267,7 +276,9 @@ def _tasks(
             time_limit_s=60 * arguments.time_limit,
             keep_work=not arguments.drop_work,
         )
-        tasks.append(Task(job, str(step.row.video), apart=None if work_dir else size_bytes(step.row.video)))
+        own_folder = work_dir is not None and not is_address(work_dir)
+        apart = None if own_folder else size_bytes(step.row.video)
+        tasks.append(Task(job, str(step.row.video), apart=apart))
     return tasks
 
 

@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from reconstruction.commands.options import add_common, add_scene, add_verb, write_output
+from reconstruction.commands.options import add_common, add_scene, add_verb, path_or_address, write_output
 from reconstruction.commands.truth import add_ground_truth, split_truth
 
 _DESCRIPTION = """Compare SCENE with the ground truth: cameras, geometry, objects, relations, images, physics, and the
@@ -33,7 +33,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     add_ground_truth(parser, "folder with the ground truth, or file of outlines drawn by hand")
     add = parser.add_argument
     add("--json", type=Path, metavar="FILE", help="also write JSON; -: print JSON instead of the table")
-    add("--work-dir", type=Path, metavar="DIR", help="stage cache of the scene")
+    add("--work-dir", type=path_or_address, metavar="DIR", help="stage cache of the scene")
     add("--video", type=Path, metavar="VIDEO", help="for held-out frames, if the stage cache is gone")
     add("--quiet", action="store_true", help="no progress")
     add_common(parser, json=False)

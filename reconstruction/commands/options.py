@@ -9,7 +9,7 @@ from pathlib import Path
 
 from registry.errors import EnvironmentMissing, SimReconError
 from registry.files import write_whole
-from registry.roots import registry_folder
+from registry.roots import is_address, registry_folder
 
 
 def add_verb(
@@ -39,6 +39,11 @@ def add_common(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
     parser.add_argument("--verbose", action="store_true", help="log the decisions of each stage")
     if json:
         parser.add_argument("--json", action="store_true", help="print JSON for programs instead of text")
+
+
+def path_or_address(text: str) -> Path | str:
+    """Return an address of fsspec (`s3://bucket/key`) as it is, anything else as a path; a type for argparse."""
+    return text if is_address(text) else Path(text)
 
 
 def _registry(text: str) -> Path:

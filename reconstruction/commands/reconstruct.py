@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reconstruction.commands.options import SEEDS, add_common, add_verb, number, whole_number
+from reconstruction.commands.options import SEEDS, add_common, add_verb, number, path_or_address, whole_number
 
 if TYPE_CHECKING:
     from reconstruction.config import PipelineConfig
@@ -47,12 +47,19 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
     add(
         "video",
         metavar="VIDEO",
-        type=Path,
+        type=path_or_address,
         nargs="?",
-        help="a video file, a folder of images, or an export of Record3D or Polycam with its poses",
+        help="a video file, a folder of images, or an export of Record3D or Polycam with its poses; also at an address "
+        "(s3://bucket/room.mp4), from which it is downloaded once",
     )
     add("--scene", metavar="ID", help="scene id, a-z 0-9 _ (default: the next free sceneNNNN)")
-    add("--work-dir", type=Path, metavar="DIR", help="folder of the stage cache")
+    add(
+        "--work-dir",
+        type=path_or_address,
+        metavar="DIR",
+        help="folder of the stage cache; at an address (s3://bucket/work), a copy of it lies there, and any machine "
+        "goes on from its finished stages",
+    )
     add(
         "--keep-results",
         type=whole_number(1),
@@ -113,6 +120,10 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.video is None:
         raise UsageError("no video is given. Give a file or a folder of images: simrecon reconstruct VIDEO")
+    if isinstance(arguments.video, str):
+        from reconstruction.downloads import local_copy
+
+        arguments.video = local_copy(arguments.video)
     if not arguments.video.exists():
         raise UsageError(f"{arguments.video}: no such file or folder")
     from reconstruction.commands.reporting import make_listener

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from reconstruction.commands.options import add_common, add_scene, add_verb, write_output
+from reconstruction.commands.options import add_common, add_scene, add_verb, path_or_address, write_output
 from reconstruction.commands.truth import add_ground_truth, split_truth
 
 
@@ -29,7 +29,12 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         metavar="FILE",
         help="output of `simrecon evaluate --json FILE`, to save the minute of computing it",
     )
-    add("--work-dir", type=Path, metavar="DIR", help="as given to `simrecon reconstruct --work-dir`")
+    add(
+        "--work-dir",
+        type=path_or_address,
+        metavar="DIR",
+        help="as given to `simrecon reconstruct --work-dir`",
+    )
     add("--quiet", action="store_true", help="no progress")
     add_common(parser, json=False)
     parser.set_defaults(run=run)

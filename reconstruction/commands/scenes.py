@@ -6,7 +6,14 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from reconstruction.commands.options import add_common, add_scene, add_verb, output_errors, write_output
+from reconstruction.commands.options import (
+    add_common,
+    add_scene,
+    add_verb,
+    output_errors,
+    path_or_address,
+    write_output,
+)
 from registry import SceneBundle, SceneRecord, open_registry
 from registry.errors import UsageError
 from registry.plain_text import plain
@@ -56,7 +63,10 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         help="with --views: an option of avo, for example avo.strategy=canonical",
     )
     show.add_argument(
-        "--work-dir", type=Path, metavar="DIR", help="with --views or --graph: as given to reconstruct"
+        "--work-dir",
+        type=path_or_address,
+        metavar="DIR",
+        help="with --views or --graph: as given to reconstruct",
     )
     show.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the pictures (default: SCENE_instances and so on)"

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from reconstruction.commands.environments import run_by_name
-from reconstruction.commands.options import add_common, add_verb, whole_number
+from reconstruction.commands.options import add_common, add_verb, path_or_address, whole_number
 
 _DESCRIPTION = """Serve scenes as web pages: look at SCENE from all sides, compare it with the photographs, see what was
 seen and what was guessed, correct it and play it. Without SCENE: all scenes, as a gallery. With --export: write one
@@ -47,8 +47,18 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         metavar="N",
         help="port (default: 8090 or the next free one; 0: any free one)",
     )
-    add("--video", type=Path, metavar="FILE", help="the film of the scene, if it is no longer where it was")
-    add("--work-dir", type=Path, metavar="DIR", help="folder of the stage cache, as given to reconstruct")
+    add(
+        "--video",
+        type=path_or_address,
+        metavar="FILE",
+        help="the film of the scene, if it is no longer where it was",
+    )
+    add(
+        "--work-dir",
+        type=path_or_address,
+        metavar="DIR",
+        help="folder of the stage cache, as given to reconstruct; what lies at an address is downloaded",
+    )
     add("--overrides", type=Path, metavar="FILE", help="file of corrections (default: that of the last run)")
     add_common(parser, json=False)
     parser.set_defaults(run=run_by_name("studio.command:run"))

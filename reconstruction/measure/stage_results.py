@@ -9,7 +9,9 @@ from reconstruction.cache import DamagedResult, read_result
 from reconstruction.core.types import DepthMaps, PosedFrames, WorldFrame
 from reconstruction.gaussians import Gaussians
 from reconstruction.pipeline import STAGES
+from reconstruction.remote_cache import open_store, work_folder
 from registry import SceneBundle
+from registry.roots import is_address
 
 _MANIFEST = "manifest.json"
 
@@ -24,19 +26,26 @@ class StageResults:
     _loaded: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def find(cls, bundle: SceneBundle, registry_root: Path, work_dir: Path | None = None) -> "StageResults":
+    def find(
+        cls, bundle: SceneBundle, registry_root: Path, work_dir: Path | str | None = None
+    ) -> "StageResults":
         """Locate the results that a bundle was made from.
 
         Args:
             bundle: the scene.
             registry_root: its registry; the default work folders lie beside it.
-            work_dir: value of `simrecon reconstruct --work-dir`, if it was given.
+            work_dir: value of `simrecon reconstruct --work-dir`, if it was given. Results at an address are
+                downloaded.
+
+        Raises:
+            EnvironmentMissing: the address cannot be reached.
         """
         work = bundle.scene["report"].get("volatile", {}).get("work")
         if not work:
             reason = "the bundle does not name the stage results that it was made from"
             return cls({}, {stage.name: reason for stage in STAGES})
-        folder = work_dir or registry_root.parent / "work" / work["input_digest"][:16]
+        folder = work_folder(work_dir, registry_root, work["input_digest"])
+        store = open_store(work_dir, registry_root, work["input_digest"]) if is_address(work_dir) else None
         keys = {**work["stage_keys"], **_latest_keys(folder, bundle)}
         folders, missing = {}, {}
         for number, stage in enumerate(STAGES, start=1):
@@ -46,7 +55,7 @@ class StageResults:
                 continue
             if key is None:
                 missing[stage.name] = "this scene was made without the stage"
-            elif not (place / _MANIFEST).is_file():
+            elif not (place / _MANIFEST).is_file() and not (store and store.has(number, stage.name, key)):
                 missing[stage.name] = f"{place} does not exist; reconstruct the scene again to create it"
             else:
                 folders[stage.name] = place

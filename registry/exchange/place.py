@@ -11,10 +11,13 @@ from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from registry.errors import BundleError, EnvironmentMissing, SimReconError, UsageError
 from registry.exchange.wholefile import whole_file
+
+if TYPE_CHECKING:
+    from upath import UPath
 
 _CHUNK = 1 << 20
 _AT_ONCE = 16
@@ -217,6 +220,19 @@ def open_place(address: str | Path) -> Place:
     text = str(Path(address).expanduser().absolute()) if "://" not in str(address) else str(address)
     fs, root = _file_system(text)
     return Place(url=shown(text).rstrip("/"), fs=fs, root=root)
+
+
+def open_path(address: str) -> "UPath":
+    """Return a path object of an fsspec address (`universal_pathlib`); reaches no network.
+
+    Raises:
+        UsageError: There is no such protocol.
+        EnvironmentMissing: The extra of the protocol is not installed; names it.
+    """
+    from upath import UPath
+
+    _file_system(address)  # for its errors
+    return UPath(address, **_options(address.split("://")[0].lower()))
 
 
 def download(url: str, target: Path, limit: int) -> None:

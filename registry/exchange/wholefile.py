@@ -55,17 +55,21 @@ def whole_file(path: Path, *, sweep: str | None = None) -> Generator[BinaryIO, N
 
 
 @contextlib.contextmanager
-def scratch_folder(prefix: str) -> Generator[Path, None, None]:
+def scratch_folder(prefix: str, parent: Path | None = None) -> Generator[Path, None, None]:
     """Make a private temporary folder for the block; remove those of killed processes with the same prefix.
+
+    Args:
+        prefix: Of its name.
+        parent: Folder that it lies in; None for that of the system.
 
     Raises:
         OSError: No temporary folder can be made.
     """
-    for old in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
+    for old in (parent or Path(tempfile.gettempdir())).glob(f"{glob.escape(prefix)}*"):
         with contextlib.suppress(OSError):
             if old.is_dir() and not old.is_symlink() and _is_abandoned(old) and not is_leased(old):
                 shutil.rmtree(old, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=prefix) as name:
+    with tempfile.TemporaryDirectory(prefix=prefix, dir=parent) as name:
         lease = lease_folder(Path(name))
         try:
             yield Path(name)

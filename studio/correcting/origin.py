@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from reconstruction import remote_cache
 from reconstruction.made_by import read_made_by
 from registry import SceneBundle
 from registry.errors import UsageError
@@ -75,7 +76,7 @@ def find_origin(
 
 def work_folder(bundle: SceneBundle, registry_root: Path, work_dir: Path | None = None) -> Path:
     """Return the folder of a scene's stage results: as it was given, else the default one beside the registry."""
-    return (work_dir or registry_root.parent / "work" / _input_digest(bundle)[:16]).absolute()
+    return remote_cache.work_folder(work_dir, registry_root, _input_digest(bundle)).absolute()
 
 
 def _input_digest(bundle: SceneBundle) -> str:

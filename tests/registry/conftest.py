@@ -1,7 +1,6 @@
 """Fixtures for a small handmade bundle: a floor, a table and a cup on it."""
 
 import copy
-import logging
 from pathlib import Path
 
 import pytest
@@ -56,28 +55,3 @@ def make_bundle(tmp_path_factory):
         return folder
 
     return make
-
-
-@pytest.fixture(scope="session")
-def s3():
-    """Start an S3 server in this process; return its address. Its clients find it by the environment."""
-    pytest.importorskip("s3fs", reason="S3 is tested with the extra s3")
-    server_module = pytest.importorskip("moto.server", reason="S3 is tested with moto")
-    server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    host, port = server.get_host_and_port()
-    settings = {
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": "secret",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in settings.items():
-            patch.setenv(name, value)
-        import s3fs
-
-        s3fs.S3FileSystem(use_listings_cache=False).mkdir("lab")
-        yield settings["AWS_ENDPOINT_URL"]
-    server.stop()

@@ -24,7 +24,7 @@ def test_a_folder_gives_a_row_for_each_film_and_folder_of_images(films, defaults
 
 
 def test_ids_of_an_earlier_run_stay_when_a_film_comes_before_them(films, defaults):
-    known = {films / "room.mp4": "room"}
+    known = {str(films / "room.mp4"): "room"}
     found = {row.video.name: row.scene_id for row in read_rows(str(films), defaults, known).rows}
     assert found["room.mp4"] == "room"
     assert found["room.MOV"] == "room_2"
