@@ -107,16 +107,16 @@ def test_a_finished_result_of_another_run_is_kept(tmp_path):
 
 def test_a_result_that_another_run_puts_in_place_meanwhile_is_kept(tmp_path, monkeypatch):
     first, second = StageStore(tmp_path), StageStore(tmp_path)
-    has, asked = second.has, []
+    is_here, asked = second._is_here, []
 
     def too_early(*result):
         if not asked:
             asked.append(result)
             first.save(GRAPH, 10, "scene_graph", "k", {"by": 1})
             return False
-        return has(*result)
+        return is_here(*result)
 
-    monkeypatch.setattr(second, "has", too_early)
+    monkeypatch.setattr(second, "_is_here", too_early)
     second.save(GRAPH, 10, "scene_graph", "k", {"by": 2})
     assert second.manifest(10, "scene_graph", "k") == {"by": 1}
     first.check(10, "scene_graph", "k")
