@@ -6,7 +6,9 @@ each file there, so a video is downloaded once, and again when it has changed. A
 
 import contextlib
 import hashlib
+import logging
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,13 +21,18 @@ from registry.roots import home_folder, is_address
 if TYPE_CHECKING:
     from upath import UPath
 
+logger = logging.getLogger(__name__)
 _FOLDER = "videos"
 _VERSIONS = ("ETag", "etag", "LastModified", "last_modified", "mtime", "created")  # of fsspec's clients
 _MOST_FILES = 20_000
 
 
-def local_copy(address: str) -> Path:
+def local_copy(address: str, say: Callable[[str], None] = logger.info) -> Path:
     """Return the path of a video, or of a folder of images, on this machine; downloads it if it is not there.
+
+    Args:
+        address: of a file or a folder.
+        say: receives one line before a download.
 
     Raises:
         UsageError: there is nothing at the address.
@@ -34,6 +41,7 @@ def local_copy(address: str) -> Path:
     source, files = _listed(address)
     folder = _copy_folder(source, files)
     if not folder.is_dir():
+        say(f"downloading {shown(address)}, {sum(size for _, size, _ in files) / 1e6:.1f} MB, to {folder}")
         with place_errors(shown(address), "download it"):
             _download(source, files, folder)
     return folder / source.name

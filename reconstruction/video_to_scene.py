@@ -12,6 +12,7 @@ from reconstruction.cache import KEPT_PER_STAGE, digest_input
 from reconstruction.config import PipelineConfig
 from reconstruction.core.progress import NO_PROGRESS, StageListener
 from reconstruction.core.types import ObjectAsset
+from reconstruction.downloads import as_local
 from reconstruction.editing.overrides import Overrides
 from reconstruction.frames.load import check_input
 from reconstruction.made_by import note_made_by
@@ -43,7 +44,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    video: Path,
+    video: Path | str,
     *,
     scene_id: str | None = None,
     registry_root: Path | None = None,
@@ -59,7 +60,8 @@ def reconstruct(
     """Reconstruct a video, or a folder of images, as a scene of the registry.
 
     Args:
-        video: any file that ffmpeg decodes, or a folder of images in name order.
+        video: any file that ffmpeg decodes, or a folder of images in name order; also at an address of fsspec, from
+            which it is downloaded once.
         scene_id: id in the registry, `[a-z0-9_]+`; None: the next free `sceneNNNN`.
         registry_root: folder of the registry; None: `$SIMRECON_HOME/registry` or `~/.simrecon/registry`.
         work_dir: folder of the stage cache; None: a folder beside the registry, named by the digest of the input. An
@@ -79,7 +81,7 @@ def reconstruct(
         EnvironmentMissing: no disk space, no permission, or a missing package, key or endpoint.
     """
     started = time.perf_counter()
-    video = Path(video)
+    video = as_local(video)
     check_input(video)
     _check_names(video, registry_root, work_dir)
     config = config or PipelineConfig()

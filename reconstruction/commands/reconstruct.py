@@ -123,7 +123,10 @@ def run(arguments: argparse.Namespace) -> int:
     if isinstance(arguments.video, str):
         from reconstruction.downloads import local_copy
 
-        arguments.video = local_copy(arguments.video)
+        quiet = arguments.quiet or arguments.json
+        arguments.video = local_copy(
+            arguments.video, lambda line: None if quiet else print(line, file=sys.stderr)
+        )
     if not arguments.video.exists():
         raise UsageError(f"{arguments.video}: no such file or folder")
     from reconstruction.commands.reporting import make_listener
