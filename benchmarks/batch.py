@@ -106,8 +106,7 @@ class FullDisk:
     _SIZE_MB, _LEFT_MB = 2048, 1  # a run wants 1.5 GB
 
     def __init__(self, folder: Path, full_s: float) -> None:
-        self._folder, self._full_s = folder, full_s
-        self._filled = threading.Event()
+        self._folder, self._full_s, self._after_s = folder, full_s, 0.0
         self.thread = threading.Thread(target=self._work, daemon=True)
 
     def __enter__(self) -> "FullDisk":

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reconstruction.frames.decoding import IMAGE_SUFFIXES
 from registry.errors import EnvironmentMissing, UsageError
 from registry.exchange.place import open_path, place_errors, shown
 from registry.exchange.wholefile import scratch_folder
@@ -57,8 +56,10 @@ def drop_copy(address: str) -> None:
     shutil.rmtree(_copy_folder(*_listed(address)), ignore_errors=True)
 
 
-def files_of(source: "UPath") -> list[tuple["UPath", int, str]]:
+def files_of(source: "UPath") -> list[tuple[str, int, str]]:
     """Return (path, bytes, version) of a file, or of all files below a folder, ordered by path; reaches the network.
+
+    A film costs one request, a folder two. Paths are those of its file system.
 
     Raises:
         UsageError: there is nothing, or far more than a video.
@@ -67,51 +68,41 @@ def files_of(source: "UPath") -> list[tuple["UPath", int, str]]:
     name = shown(str(source))
     with place_errors(name, "list it"):
         try:
-            found = (
-                [source] if source.is_file() else sorted(path for path in source.rglob("*") if path.is_file())
-            )
+            found: dict = {source.path: source.fs.info(source.path)}
+            if found[source.path]["type"] == "directory":
+                found = dict(source.fs.find(source.path, detail=True))
         except FileNotFoundError:  # nor a bucket
-            found = []
+            found = {}
         if not found:
             raise UsageError(f"{name}: no such file, and no folder of images")
         if len(found) > _MOST_FILES:
             raise UsageError(f"{name}: more than {_MOST_FILES} files; name one video, or a folder of images")
-        stats = [(path, path.fs.info(path.path)) for path in found]
-    return [(path, int(info.get("size") or 0), _version(info)) for path, info in stats]
+    return [(path, int(info.get("size") or 0), _version(info)) for path, info in sorted(found.items())]
 
 
-def _listed(address: str) -> tuple["UPath", list[tuple["UPath", int, str]]]:
+def _listed(address: str) -> tuple["UPath", list[tuple[str, int, str]]]:
     source = open_path(address.rstrip("/"))
     return source, files_of(source)
-
-
-def is_video_at(path: "UPath", suffixes: tuple[str, ...]) -> bool:
-    """Return whether something at an address is a video by its suffix, or a folder that holds images."""
-    if path.is_file():
-        return path.suffix.lower() in (*suffixes, ".zip")
-    return any(
-        entry.suffix.lower() in IMAGE_SUFFIXES for entry in path.iterdir() if not entry.name.startswith(".")
-    )
 
 
 def _version(info: dict) -> str:
     return next((str(info[name]) for name in _VERSIONS if info.get(name)), "")
 
 
-def _copy_folder(source: "UPath", files: list[tuple["UPath", int, str]]) -> Path:
+def _copy_folder(source: "UPath", files: list[tuple[str, int, str]]) -> Path:
     said = [str(source), *(f"{path}\n{size}\n{version}" for path, size, version in files)]
     return home_folder() / _FOLDER / hashlib.sha256("\n".join(said).encode()).hexdigest()[:16]
 
 
-def _download(source: "UPath", files: list[tuple["UPath", int, str]], folder: Path) -> None:
+def _download(source: "UPath", files: list[tuple[str, int, str]], folder: Path) -> None:
     """Download files into a new folder, which appears whole or not at all."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with scratch_folder(f".{folder.name}-", folder.parent) as scratch:
             for path, _, _ in files:
-                target = scratch / folder.name / source.name / path.relative_to(source).as_posix()
+                target = scratch / folder.name / source.name / path.removeprefix(source.path).lstrip("/")
                 target.parent.mkdir(parents=True, exist_ok=True)
-                path.fs.get_file(path.path, str(target))
+                source.fs.get_file(path, str(target))
             with contextlib.suppress(OSError):  # another process has put it there
                 (scratch / folder.name).rename(folder)
     except OSError as error:

@@ -17,9 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from reconstruction.cache import KEPT_PER_STAGE, StageStore
+from reconstruction.cache import KEPT_PER_STAGE, DamagedResult, StageStore
 from reconstruction.leases import remove_unless_leased
-from registry.errors import EnvironmentMissing, SimReconError
+from registry.errors import SimReconError
 from registry.exchange.place import Place, open_place
 from registry.roots import is_address
 
@@ -115,7 +115,8 @@ class RemoteResults:
         """Download a result into an empty folder; return False if there is none.
 
         Raises:
-            EnvironmentMissing: the address cannot be reached, or what lies there is no result.
+            EnvironmentMissing: the address cannot be reached.
+            DamagedResult: the archive is damaged, or holds more than plain files.
         """
         archive = folder / f"{name}{_SUFFIX}"
         try:
@@ -128,9 +129,7 @@ class RemoteResults:
                     raise tarfile.TarError("it holds more than plain files")
                 tar.extractall(folder, filter="data")
         except tarfile.TarError as error:
-            raise EnvironmentMissing(
-                f"{self.place.url}/{self._key(name)}: no stage result: {error}"
-            ) from error
+            raise DamagedResult(f"{self.place.url}/{self._key(name)}: no stage result: {error}") from error
         finally:
             archive.unlink(missing_ok=True)
         return True
@@ -195,14 +194,15 @@ class RemoteStageStore(StageStore):
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         """Wait for the uploads; after Ctrl-C for the running one only."""
         self._uploader.shutdown(cancel_futures=kind is KeyboardInterrupt)
+        if kind is None:
+            for upload in self._uploads:
+                upload.result()
         if self._failure:
             self._note(f"{self._failure}. The run went on without it: other machines lack its later results")
 
     def has(self, number: int, stage: str, key: str) -> bool:
         """Return whether a result with this fingerprint exists here or, after a download, came from the address."""
-        return self._is_here(number, stage, key) or (
-            self._download(number, stage, key) and self._is_here(number, stage, key)
-        )
+        return self._is_here(number, stage, key) or self._download(number, stage, key)
 
     def load(self, cls: type[T], number: int, stage: str, key: str) -> T:
         """Load a result; one that the address lacks is uploaded while the run goes on."""
@@ -238,6 +238,9 @@ class RemoteStageStore(StageStore):
                     self._put(partial, number, stage, key)
                     self._there.add(name)
                     return True
+        except DamagedResult as error:  # computed again, and uploaded in its place
+            logger.info("%s", error)
+            self._there.discard(name)
         finally:
             self.discard(partial)
         return False
@@ -259,6 +262,8 @@ class RemoteStageStore(StageStore):
         """Keep the first error of the address, after which it is not asked again."""
         try:
             yield
+        except DamagedResult:
+            raise
         except (SimReconError, OSError) as error:
             logger.info("%s", error)
             self._failure = self._failure or str(error)

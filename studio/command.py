@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _remember(registry: SceneRegistry, arguments: argparse.Namespace) -> None:
     """Keep what the command line says about the scene's film, work folder and corrections.
 
-    What lies at an address is downloaded: the film, and stage results into the scene's default work folder.
+    A film and stage results at addresses are downloaded, the results into the scene's default work folder.
     """
     from studio.remembered import remember
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from reconstruction.batch import sources
 from reconstruction.batch.naming import assign_ids
-from reconstruction.batch.rows import AnyPath, VideoRow
+from reconstruction.batch.rows import AnyPath, VideoRow, check_there
 from reconstruction.phone_exports.exports import natural
 from registry.errors import SimReconError, UsageError, did_you_mean
 from registry.roots import is_address
@@ -220,8 +220,8 @@ def check_row(row: VideoRow, report) -> None:
 
 def _video_problem(video: AnyPath) -> str:
     try:
-        with sources.reading(video):
-            return "" if video.exists() else f"{video}: no such file or folder"
+        check_there(video)
+        return ""
     except SimReconError as error:
         return str(error)
 

@@ -3,8 +3,11 @@
 import hashlib
 import json
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
+
+from registry.errors import UsageError
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -67,12 +70,31 @@ def size_bytes(path: AnyPath) -> int:
     return sum(size for _, size, _ in _state(path))
 
 
+def check_there(path: AnyPath) -> None:
+    """Raise unless there is such a video.
+
+    Raises:
+        UsageError: there is none.
+        EnvironmentMissing: its address cannot be reached.
+    """
+    if not isinstance(path, Path):
+        _remote_state(path)
+    elif not path.exists():
+        raise UsageError(f"{path}: no such file or folder")
+
+
 def _state(path: AnyPath) -> list[tuple[str, int, int | str]]:
     """Return (name, bytes, time of change in ns or version) of a file, or of each file below a folder."""
     if not isinstance(path, Path):
-        from reconstruction.downloads import files_of
-
-        return [(str(file), size, version) for file, size, version in files_of(path)]
+        return _remote_state(path)
     files = [path] if not path.is_dir() else sorted(p for p in path.rglob("*") if p.is_file())
     stats = [(file, file.stat()) for file in files]
     return [(file.relative_to(path.parent).as_posix(), s.st_size, s.st_mtime_ns) for file, s in stats]
+
+
+@cache
+def _remote_state(path: "UPath") -> list[tuple[str, int, int | str]]:
+    """Ask for the state of a video at an address, once in a command."""
+    from reconstruction.downloads import files_of
+
+    return list(files_of(path))

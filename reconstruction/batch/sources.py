@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reconstruction.downloads import is_video_at
 from reconstruction.frames.decoding import IMAGE_SUFFIXES
 from reconstruction.phone_exports.exports import find_export
 from registry.errors import UsageError
@@ -93,11 +92,16 @@ def videos_in(folder: "AnyPath") -> "tuple[list[AnyPath], list[str]]":
 
 def is_video(path: "AnyPath") -> bool:
     """Return whether a path is a video by its name, or a folder that holds images."""
-    if not isinstance(path, Path):
-        return is_video_at(path, VIDEO_SUFFIXES)
+    if not isinstance(path, Path):  # exports are not looked into
+        suffix = path.suffix.lower()
+        return suffix in (*VIDEO_SUFFIXES, ".zip") or (not suffix and _holds_images(path))
     if path.is_dir():
-        inside = any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir() if not p.name.startswith("."))
-        return inside or find_export(path) is not None
+        return _holds_images(path) or find_export(path) is not None
     if path.suffix.lower() == ".zip":
         return path.is_file() and find_export(path) is not None
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def _holds_images(folder: "AnyPath") -> bool:
+    """Return whether a folder holds images that are not hidden."""
+    return any(p.suffix.lower() in IMAGE_SUFFIXES for p in folder.iterdir() if not p.name.startswith("."))

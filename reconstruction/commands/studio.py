@@ -57,7 +57,7 @@ def add_parser(verbs: argparse._SubParsersAction) -> None:
         "--work-dir",
         type=path_or_address,
         metavar="DIR",
-        help="folder of the stage cache, as given to reconstruct; what lies at an address is downloaded",
+        help="folder of the stage cache, as given to reconstruct; results at an address are downloaded",
     )
     add("--overrides", type=Path, metavar="FILE", help="file of corrections (default: that of the last run)")
     add_common(parser, json=False)
