@@ -265,3 +265,9 @@ def stage_of(path: Path) -> str:
     """Return the stage that a running log ends in, such as `3/11 depth`, or ""."""
     found = re.findall(r"^\[(\d+/\d+)\] (\w+)", tail(path), re.MULTILINE)
     return " ".join(found[-1]) if found else ""
+
+
+def stage_number(path: Path) -> int:
+    """Return the number of the stage that a log ends in, such as 3; 0 before the first."""
+    found = re.match(r"\d+", stage_of(path))
+    return int(found[0]) if found else 0

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from reconstruction.batch.attempt import Job
+from reconstruction.batch.attempt import Job, stage_number
 from reconstruction.batch.engines import Engine
 from reconstruction.batch.journal import Journal
 from reconstruction.batch.outcomes import MACHINE, Outcome, plain
@@ -26,8 +26,8 @@ _TROUBLE = 3  # videos in a row that fail for the machine's fault end the batch
 class Policy:
     """When an attempt is repeated."""
 
-    retries: int = 3  # further attempts after a transient failure
-    pause_s: float = 2.0  # before the second attempt; doubled for each further one,
+    retries: int = 3  # further attempts after a transient failure that reached no further stage
+    pause_s: float = 2.0  # before the next attempt; doubled for each in a row that reached no further stage,
     longest_pause_s: float = 60.0  # up to this
 
 
@@ -38,6 +38,8 @@ class Task:
     job: Job
     video: str
     apart: object = None
+    furthest: int = 0  # number of the last stage that an attempt began
+    in_vain: int = 0  # failed attempts since then
 
 
 @dataclass
@@ -213,13 +215,16 @@ class Driver:
         if outcome.kind == "interrupted" or (outcome.transient and self._stopping):
             self._waiting.append((0.0, task))
             return "interrupted"
-        if outcome.transient and task.job.attempt <= self._policy.retries:
-            pause = min(self._policy.pause_s * 2 ** (task.job.attempt - 1), self._policy.longest_pause_s)
+        reached = stage_number(task.job.log)
+        in_vain = 1 if reached > task.furthest else task.in_vain + 1
+        if outcome.transient and in_vain <= self._policy.retries:
+            pause = min(self._policy.pause_s * 2 ** (in_vain - 1), self._policy.longest_pause_s)
             avoid = task.job.avoid
             if outcome.kind in MACHINE and outcome.node:
                 avoid = (*avoid, outcome.node)
             again = replace(task.job, attempt=task.job.attempt + 1, avoid=avoid)
-            self._waiting.insert(0, (time.monotonic() + pause, replace(task, job=again)))
+            task = replace(task, job=again, furthest=max(reached, task.furthest), in_vain=in_vain)
+            self._waiting.insert(0, (time.monotonic() + pause, task))
             return "retry"
         return "failed"
 

@@ -128,7 +128,11 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
         "--time-limit", type=float, default=0.0, metavar="MINUTES", help="end a video that takes longer"
     )
     where.add_argument(
-        "--retries", type=int, default=3, metavar="N", help="attempts after the first (default 3)"
+        "--retries",
+        type=int,
+        default=3,
+        metavar="N",
+        help="attempts after one that failed, without reaching a further stage (default 3)",
     )
     where.add_argument("--quiet", action="store_true", help="no progress")
 

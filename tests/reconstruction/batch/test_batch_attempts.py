@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from reconstruction.batch.attempt import Job, run_attempt, stage_of
+from reconstruction.batch.attempt import Job, run_attempt, stage_number, stage_of
 from reconstruction.batch.engines import Resources, load_engine
 from synthetic.videos import write_empty, write_not_a_video
 
@@ -122,9 +122,9 @@ def test_the_process_of_a_video_ends_when_its_parent_is_killed(tmp_path):
 
 def test_the_stage_of_a_running_video_is_read_from_its_log(tmp_path):
     log = tmp_path / "log"
-    assert stage_of(log) == ""
+    assert (stage_of(log), stage_number(log)) == ("", 0)
     log.write_text("[1/10] frames: 0.7 s\n[2/10] poses: ...\n[2/10] poses: note: x\n")
-    assert stage_of(log) == "2/10 poses"
+    assert (stage_of(log), stage_number(log)) == ("2/10 poses", 2)
 
 
 @pytest.mark.skipif(

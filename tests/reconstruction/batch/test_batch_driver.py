@@ -94,6 +94,22 @@ def test_each_video_ends_once_and_transient_failures_are_repeated(tmp_path):
     assert all(state.cause and state.cure for state in states.values())
 
 
+def test_an_attempt_that_reaches_a_further_stage_is_no_retry(tmp_path):
+    class Advancing(ScriptedEngine):
+        """Writes the stage that each attempt reached into its log."""
+
+        def start(self, job: Job) -> None:
+            super().start(job)
+            stage = (1, 2, 2, 5, 5, 5, 5, 6)[job.attempt - 1]
+            job.log.parent.mkdir(exist_ok=True)
+            job.log.write_text(f"[{stage}/11] name: ...\n")
+
+    engine = Advancing({"a": ["killed"] * 8}, 2)
+    summary, _, journal = drive(tmp_path, None, "a", engine=engine)  # two retries at each stage
+    assert summary.failed == 1
+    assert journal.states()["a"].attempts == 6  # 1, 2, 2, 5, 5, 5
+
+
 def test_a_failure_of_the_machine_keeps_the_next_attempt_off_it(tmp_path):
     _, engine, _ = drive(tmp_path, {"a": ["disk", "killed", "video"]}, "a")
     assert [job.avoid for job in engine.started] == [(), ("n1",), ("n1",)]
