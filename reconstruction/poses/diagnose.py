@@ -15,6 +15,11 @@ _STILL_SHARE = 0.01  # of the image diagonal; largest image motion of a camera a
 _HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
 _ROTATION_EXPLAINED = 0.95  # inlier share of the homography under pure rotation
 _MIN_TRIANGULATION_DEG = 2.0  # median triangulation angle
+_MOST_DEPTH_RATIO = (
+    200.0  # of the points in one frame, from 10 cm to 20 m; collapsed models have 1e3 and more
+)
+_DEPTH_QUANTILES = (0.1, 0.9)
+_MOST_COLLAPSED_SHARE = 0.1  # of the frames
 
 _HOW_TO_FILM = (
     "Film again: walk slowly around the objects for 10-60 s, in good light, seeing all from several places."
@@ -65,8 +70,24 @@ def check_motion(features: list[Features], pairs: list[VerifiedPair], image_size
         )
 
 
+def is_collapsed(model: Reconstruction) -> bool:
+    """Return whether a part of the camera path shrank to a point: its frames see points at depths that no room has.
+
+    Where two parts of a film share few points, the mapper may lose the scale of one of them.
+    """
+    images = [model.image(i) for i in model.reg_image_ids()]
+    ratios = []
+    for image in images:
+        points = [model.point3D(p.point3D_id).xyz for p in image.points2D if p.has_point3D()]
+        if points:
+            depth = np.asarray(image.cam_from_world() * np.array(points))[:, 2]
+            low, high = np.quantile(np.maximum(depth, 0.0), _DEPTH_QUANTILES)
+            ratios.append(high > _MOST_DEPTH_RATIO * low)
+    return sum(ratios) > _MOST_COLLAPSED_SHARE * len(images)
+
+
 def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, min_share: float) -> None:
-    """Raise `InputError` where too few frames are registered or triangulation angles are too small."""
+    """Raise `InputError` where too few frames are registered, a part collapsed or angles of triangulation are small."""
     registered = [] if model is None else sorted(i - 1 for i in model.reg_image_ids())
     least = max(MIN_FRAMES, int(np.ceil(min_share * chosen)))
     if len(registered) < least:
@@ -84,6 +105,12 @@ def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, 
             f"texture, or share too little with the others. {_HOW_TO_FILM}"
         )
     assert model is not None
+    if is_collapsed(model):
+        raise InputError(
+            "poses: parts of the film share too few points to have one scale: one of them shrank to a point. Film "
+            "again without fast turns, so that each thing stays in view for a while; or give each part as a video of "
+            "its own."
+        )
     angle = _median_triangulation_deg(model)
     if angle < _MIN_TRIANGULATION_DEG:
         raise InputError(

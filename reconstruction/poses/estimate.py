@@ -127,22 +127,41 @@ def _reconstruct(
         frames, features, pairs = cut_to_part(part, frames, features, pairs, progress)
         models = _map(features, pairs, camera, config, work_dir, progress)
     chosen = len(frames.images)
-    first = models[0].num_reg_images() if models else 0
     parts = label_parts(chosen, pairs)
-    if first < config.second_try_below_share * int((parts == 0).sum()):
-        other = mapping.global_models(work_dir / _DATABASE, work_dir, config)
-        second = other[0].num_reg_images() if other else 0
-        progress.note(
-            f"poses: the incremental mapper registered {first} of {chosen} frames, the global mapper "
-            f"{second}; the {'global' if second > first else 'incremental'} model is kept"
-        )
-        models = other if second > first else models
+    models = _with_second_try(models, int((parts == 0).sum()), config, work_dir, progress)
     if models:
         refine_model(models[0], config)
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
     for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
         progress.note(note)
     return frames, features, models[0]
+
+
+def _with_second_try(
+    models: list[Reconstruction], connected: int, config: PosesConfig, work_dir: Path, progress: Progress
+) -> list[Reconstruction]:
+    """Return the models of the global mapper where it does better on what the incremental mapper did badly.
+
+    Args:
+        models: of the incremental mapper, largest first.
+        connected: number of frames in the largest component of the match graph.
+        config: when to try.
+        work_dir: folder with the database of the frames.
+        progress: receives a note.
+    """
+    first = models[0].num_reg_images() if models else 0
+    collapsed = bool(models) and diagnose.is_collapsed(models[0])
+    if first >= config.second_try_below_share * connected and not collapsed:
+        return models
+    other = mapping.global_models(work_dir / _DATABASE, work_dir, config)
+    second = other[0].num_reg_images() if other else 0
+    better = second > (0 if collapsed else first) and not diagnose.is_collapsed(other[0])
+    of_them = ", a part of them at one point" if collapsed else ""
+    progress.note(
+        f"poses: of {connected} connected frames the incremental mapper registered {first}{of_them}, the global mapper "
+        f"{second}; the {'global' if better else 'incremental'} model is kept"
+    )
+    return other if better else models
 
 
 def _map(

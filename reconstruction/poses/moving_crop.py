@@ -83,7 +83,8 @@ def resect(camera: ColmapCamera, points: np.ndarray, pixels: np.ndarray, offset:
         error = project(camera, moved) + offset - pixels
         jacobian = _jacobian(camera, moved)
         weight = 1 / (LOSS_SCALE_PX**2 + (error**2).sum(1))
-        used = np.isfinite(weight)
+        # Not points so near the camera's plane that a step of the derivative puts them behind it.
+        used = np.isfinite(weight) & np.isfinite(jacobian).all(axis=(1, 2))
         jacobian, error, weight = jacobian[used], error[used], weight[used]
         normal = np.einsum("k,kij,kil->jl", weight, jacobian, jacobian)
         right = np.einsum("k,kij,ki->j", weight, jacobian, error)

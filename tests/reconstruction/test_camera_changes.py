@@ -99,6 +99,19 @@ def test_resection_finds_the_principal_point_beside_the_pose():
 
 
 @pytest.mark.unit
+def test_resection_leaves_out_points_beside_the_camera():
+    import pycolmap
+
+    camera = pycolmap.Camera.create_from_model_name(1, "RADIAL", 400.0, 480, 360)
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-1.5, -1.0, 2.0], [1.5, 1.0, 5.0], (200, 3))
+    points[:80] *= 1e-5  # as in a model that collapsed: one step of the derivative leads behind the camera
+    true = np.array([9.0, -6.0])
+    pixels = np.asarray(camera.img_from_cam(points)) + true
+    assert np.abs(resect(camera, points, pixels, np.zeros(2)) - true).max() < 0.1
+
+
+@pytest.mark.unit
 def test_images_of_a_moving_crop_become_those_of_one_camera():
     import pycolmap
 

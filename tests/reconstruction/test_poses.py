@@ -9,6 +9,7 @@ import pytest
 
 from reconstruction.core.types import FrameSet, PosedFrames
 from reconstruction.poses import POSES_PRESETS, PosesConfig, estimate_poses
+from reconstruction.poses.diagnose import check_model, is_collapsed
 from reconstruction.poses.lens import Lens
 from reconstruction.poses.undistort import undistort
 from registry.errors import InputError
@@ -247,3 +248,30 @@ def test_too_few_frames_are_refused(frames, tmp_path):
 def test_presets_are_complete():
     assert set(POSES_PRESETS) == {"fast", "default", "quality"}
     assert POSES_PRESETS["default"] == PosesConfig()
+
+
+def test_a_model_with_a_part_that_shrank_to_a_point_is_refused():
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = (
+        1,
+        1,
+        12,
+        200,
+    )
+    model = pycolmap.synthesize_dataset(options)
+    assert not is_collapsed(model)
+    check_model(model, 12, np.arange(12), 0.5)
+    ids = sorted(model.point3D_ids())
+    for image_id in (
+        3,
+        4,
+        5,
+    ):  # a third of the points goes to each of them, a hundred thousandth of the way off
+        center = model.image(image_id).projection_center()
+        for point_id in ids[image_id::6]:
+            point = model.point3D(point_id)
+            point.xyz = center + 1e-5 * (point.xyz - center)
+    assert is_collapsed(model)
+    with pytest.raises(InputError, match="shrank to a point"):
+        check_model(model, 12, np.arange(12), 0.5)
