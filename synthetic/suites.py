@@ -1,4 +1,4 @@
-"""Named captures: two small ones for continuous integration, a suite of harder ones, and presets to draw from."""
+"""Named captures: a small one for continuous integration, a suite of harder ones, and presets to draw from."""
 
 from dataclasses import replace
 
@@ -11,9 +11,6 @@ from synthetic.procedural import RoomSpec
 _SMALL = CaptureSpec(frames=50, width=480, height=360, noise=1.4)
 
 CI_CAPTURES: dict[str, CaptureSpec] = {
-    "ci_table": replace(
-        _SMALL, room=RoomSpec(seed=1, objects=6, stacks=0.0, containers=0.0, clutter_gap_m=0.1)
-    ),
     "ci_stack": replace(
         _SMALL, room=RoomSpec(seed=4, objects=8, stacks=0.4, containers=0.12, clutter_gap_m=0.08)
     ),

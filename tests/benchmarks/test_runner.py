@@ -137,7 +137,7 @@ def test_the_last_lines_of_a_failed_command_are_kept(tmp_path):
 @pytest.mark.end_to_end
 @pytest.mark.timeout(1800)
 def test_interrupted_and_resumed_a_small_capture_gets_its_figures(tmp_path):
-    write_capture(CI_CAPTURES["ci_table"], tmp_path / "captures" / "room")
+    write_capture(CI_CAPTURES["ci_stack"], tmp_path / "captures" / "room")
     out, page = tmp_path / "out", tmp_path / "page.md"
     line = [
         sys.executable,

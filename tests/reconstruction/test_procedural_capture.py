@@ -230,7 +230,7 @@ def test_the_command_chooses_and_writes(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        ("--name nowhere", "there are ci_table"),
+        ("--name nowhere", "there are ci_stack"),
         ("--objects many", "5-40"),
         ("--objects 40-5", "40-5"),
         ("--size 640", "640x480"),
