@@ -38,7 +38,10 @@ class Entity:
     pieces: tuple[np.ndarray, ...] = ()  # convex (v, 3), world space; set where a solid is hollow
 
     def mesh(self):
-        """Return the closed outer surface in world space as a `trimesh.Trimesh` (union of the parts)."""
+        """Return the outer surface in world space as a `trimesh.Trimesh`.
+
+        It is closed, the union of the parts, unless one of them is open, as in meshes of others: then it is all parts.
+        """
         import trimesh
 
         parts = []
@@ -50,7 +53,9 @@ class Entity:
             part.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=7)
             part.update_faces(part.nondegenerate_faces())
             parts.append(part)
-        return parts[0] if len(parts) == 1 else trimesh.boolean.union(parts, engine="manifold")
+        if len(parts) > 1 and all(part.is_volume for part in parts):
+            return trimesh.boolean.union(parts, engine="manifold")
+        return trimesh.util.concatenate(parts)
 
 
 @dataclass(frozen=True)

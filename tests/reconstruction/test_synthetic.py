@@ -1,6 +1,7 @@
 """Generated rooms: what they claim to be true must be true, because all other tests measure against it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,6 +60,15 @@ def test_things_touch_their_support_exactly(room, meshes):
             assert thing.relation == "attached_to"
             assert parent == "wall_north"
             assert meshes[thing.name].bounds[1, 1] == pytest.approx(NORTH_M, abs=1e-6)
+
+
+def test_a_thing_of_an_open_part_has_a_mesh_too():
+    table = build_room(0, step_m=COARSE, density=0.05).entity("table")
+    assert table.mesh().is_volume
+    open_part = table.solids[0][1:]  # without one of the patches that close it
+    mesh = replace(table, solids=(open_part, *table.solids[1:])).mesh()
+    assert not mesh.is_volume
+    assert np.allclose(mesh.bounds, table.mesh().bounds, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
