@@ -15,9 +15,7 @@ _STILL_SHARE = 0.01  # of the image diagonal; largest image motion of a camera a
 _HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
 _ROTATION_EXPLAINED = 0.95  # inlier share of the homography under pure rotation
 _MIN_TRIANGULATION_DEG = 2.0  # median triangulation angle
-_MOST_DEPTH_RATIO = (
-    200.0  # of the points in one frame, from 10 cm to 20 m; collapsed models have 1e3 and more
-)
+_MOST_DEPTH_RATIO = 200.0  # of the points in one frame: 10 cm to 20 m; a collapsed one has 1e3 and more
 _DEPTH_QUANTILES = (0.1, 0.9)
 _MOST_COLLAPSED_SHARE = 0.1  # of the frames
 
