@@ -6,6 +6,8 @@ import numpy as np
 from reconstruction.core.types import FrameSet
 from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.features import Features
+from reconstruction.poses.mapping import poses_of
+from reconstruction.poses.observations import Observations
 from reconstruction.poses.pairs import VerifiedPair
 from registry.errors import InputError
 
@@ -73,15 +75,13 @@ def is_collapsed(model: Reconstruction) -> bool:
 
     Where two parts of a film share few points, the mapper may lose the scale of one of them.
     """
-    images = [model.image(i) for i in model.reg_image_ids()]
-    ratios = []
-    for image in images:
-        points = [model.point3D(p.point3D_id).xyz for p in image.points2D if p.has_point3D()]
-        if points:
-            depth = np.asarray(image.cam_from_world() * np.array(points))[:, 2]
+    observations, poses, collapsed = Observations(model), poses_of(model), 0
+    for row in observations.rows:
+        depth = observations.points_in_camera(row, poses[row])[:, 2]
+        if len(depth):
             low, high = np.quantile(np.maximum(depth, 0.0), _DEPTH_QUANTILES)
-            ratios.append(high > _MOST_DEPTH_RATIO * low)
-    return sum(ratios) > _MOST_COLLAPSED_SHARE * len(images)
+            collapsed += bool(high > _MOST_DEPTH_RATIO * low)
+    return collapsed > _MOST_COLLAPSED_SHARE * len(observations.rows)
 
 
 def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, min_share: float) -> None:

@@ -47,16 +47,20 @@ class Observations:
         return (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
 
     def cost(self) -> float:
-        """Return the mean Cauchy loss of the reprojection errors, relative to its scale."""
+        """Return the mean Cauchy loss of the reprojection errors, relative to its scale; infinite where none has one.
+
+        Points behind a camera have no error.
+        """
         poses, total, count = poses_of(self.model), 0.0, 0
         for row in self.rows:
             image = self.model.image(row + 1)
             seen = project(self.camera, self.points_in_camera(row, poses[row]))
             given = np.array([image.point2D(k).xy for k in self.indices[row]]).reshape(-1, 2)
             error = ((seen - given) ** 2).sum(1)
-            total += float(np.nansum(np.log1p(error / LOSS_SCALE_PX**2)))
+            error = error[np.isfinite(error)]
+            total += float(np.log1p(error / LOSS_SCALE_PX**2).sum())
             count += len(error)
-        return total / max(count, 1)
+        return total / count if count else np.inf
 
 
 def thinned(model: Reconstruction, folder: Path) -> Reconstruction:
