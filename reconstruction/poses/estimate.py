@@ -21,10 +21,9 @@ from reconstruction.poses.features import Features, extract_features, match
 from reconstruction.poses.held_out import candidates_in_time, locate_frames
 from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
-from reconstruction.poses.moving_crop import correct_moving_crop
 from reconstruction.poses.pairs import VerifiedPair
+from reconstruction.poses.phone_camera import PhoneCamera, find_phone_camera
 from reconstruction.poses.refine import refine_model
-from reconstruction.poses.rolling_shutter import Shutter, correct_rolling_shutter
 from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import cut_to_part, search_zoom
 
@@ -78,13 +77,12 @@ def estimate_poses(
             model, known = use_imported(predicted, frames, features, always, work_dir, progress)
         else:
             frames, features, model = _reconstruct(frames, features, config, work_dir, progress)
-        registered = sorted(i - 1 for i in model.reg_image_ids())
-        offsets = shutter = None
+        phone = PhoneCamera(model)
         if not known and frames.ordered:
-            offsets = correct_moving_crop(model, work_dir, progress)
-            shutter = correct_rolling_shutter(model, frames, work_dir, progress)
-        held_out = _locate_held_out(frames, features, model, registered, known, offsets, config, progress)
-    return replace(_package(frames, model, registered, held_out, offsets, shutter), metric=metric)
+            phone = find_phone_camera(model, frames, config, progress)
+        registered = sorted(i - 1 for i in phone.model.reg_image_ids())
+        held_out = _locate_held_out(frames, features, phone, registered, known, config, progress)
+    return replace(_package(frames, phone, registered, held_out), metric=metric)
 
 
 def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> importers.ImportedPoses:
@@ -179,10 +177,9 @@ def _map(
 def _locate_held_out(
     frames: FrameSet,
     features: list[Features],
-    model: Reconstruction,
+    phone: PhoneCamera,
     registered: list[int],
     known: dict[int, np.ndarray],
-    offsets: dict[int, np.ndarray] | None,
     config: PosesConfig,
     progress: Progress,
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
@@ -199,13 +196,16 @@ def _locate_held_out(
     rough = None
     if frames.ordered:
         times_s = frames.held_out_times_s[rows]
-        if offsets is not None:
-            known_s, at = frames.times_s[list(offsets)], np.array(list(offsets.values()))
+        if phone.offsets is not None:
+            rows_of = sorted(phone.offsets)
+            known_s, at = frames.times_s[rows_of], np.array([phone.offsets[row] for row in rows_of])
             rough = np.stack([np.interp(times_s, known_s, axis) for axis in at.T], axis=1)
         candidates = [candidates_in_time(frames.times_s, registered, time_s) for time_s in times_s]
     else:
         candidates = [_most_alike(query, features, registered) for query in queries]
-    located = dict(zip(rows, locate_frames(queries, candidates, features, model, config, progress, rough)))
+    located = dict(
+        zip(rows, locate_frames(queries, candidates, features, phone.model, config, progress, rough))
+    )
     for row in set(range(total)) - set(rows):
         located[row] = known[int(frames.held_out_indices[row])], np.zeros(2)
     failed = [row for row in range(total) if located[row] is None]
@@ -226,13 +226,12 @@ def _most_alike(query: Features, features: list[Features], registered: list[int]
 
 def _package(
     frames: FrameSet,
-    model: Reconstruction,
+    phone: PhoneCamera,
     registered: list[int],
     held_out: list[tuple[int, np.ndarray, np.ndarray]],
-    offsets: dict[int, np.ndarray] | None,
-    shutter: Shutter | None,
 ) -> PosedFrames:
     """Undo rolling shutter, moving crop and distortion of the images; collect poses, points and observations."""
+    model, offsets, shutter = phone.model, phone.offsets, phone.shutter
     poses = mapping.poses_of(model)
     point_ids = sorted(model.point3D_ids())
     frame_row = {row + 1: new for new, row in enumerate(registered)}

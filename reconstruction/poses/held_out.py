@@ -6,8 +6,8 @@ from reconstruction.core.progress import Progress
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, match
-from reconstruction.poses.moving_crop import resect
 from reconstruction.poses.parallel import ordered_map
+from reconstruction.poses.resection import resect
 
 _NEIGHBORS = 8  # keyframes that each query is matched to
 _MAX_ERROR_PX = 3.0  # inlier threshold of RANSAC

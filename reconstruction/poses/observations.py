@@ -1,15 +1,10 @@
 """The observed points of a model: where each frame shows them, to be moved and compared with their projections."""
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
-from reconstruction.poses.mapping import poses_of
-from reconstruction.poses.refine import LOSS_SCALE_PX
-
-_TRIAL_POINTS = 1500  # with the longest tracks, that trials of a model keep
 
 
 def project(camera: ColmapCamera, points: np.ndarray) -> np.ndarray:
@@ -45,32 +40,3 @@ class Observations:
             [self.model.point3D(image.point2D(k).point3D_id).xyz for k in self.indices[row]]
         ).reshape(-1, 3)
         return (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
-
-    def cost(self) -> float:
-        """Return the mean Cauchy loss of the reprojection errors, relative to its scale; infinite where none has one.
-
-        Points behind a camera have no error.
-        """
-        poses, total, count = poses_of(self.model), 0.0, 0
-        for row in self.rows:
-            image = self.model.image(row + 1)
-            seen = project(self.camera, self.points_in_camera(row, poses[row]))
-            given = np.array([image.point2D(k).xy for k in self.indices[row]]).reshape(-1, 2)
-            error = ((seen - given) ** 2).sum(1)
-            error = error[np.isfinite(error)]
-            total += float(np.log1p(error / LOSS_SCALE_PX**2).sum())
-            count += len(error)
-        return total / count if count else np.inf
-
-
-def thinned(model: Reconstruction, folder: Path) -> Reconstruction:
-    """Return a copy of a model with its points of the longest tracks; `folder` receives the model."""
-    import pycolmap
-
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write(folder)
-    thin = pycolmap.Reconstruction(folder)
-    by_length = sorted(thin.point3D_ids(), key=lambda i: (-thin.point3D(i).track.length(), i))
-    for point_id in by_length[_TRIAL_POINTS:]:
-        thin.delete_point3D(point_id)
-    return thin

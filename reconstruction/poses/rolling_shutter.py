@@ -1,29 +1,17 @@
 """Rolling shutter: rows are taken one after the other, so a moving camera has another pose at every row.
 
-Each frame moves evenly during its readout, as between its neighbors in time. Observed points are moved to where a
-camera with the pose of the middle row would see them, and the bundle is adjusted anew. The readout time is the one with
-the least reprojection error.
+Each frame moves evenly during its readout, as between its neighbors in time. `self_calibration.py` estimates the
+readout time; images are resampled to the poses of their middle rows.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from reconstruction.core.progress import Progress
-from reconstruction.core.types import FrameSet
-from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
-from reconstruction.poses.mapping import poses_of
-from reconstruction.poses.observations import Observations, project, thinned
-from reconstruction.poses.refine import bundle_adjust
+from reconstruction.poses.colmap_types import ColmapCamera
+from reconstruction.poses.observations import project
 
-_STEP_S = 0.016  # between readout times that are tried; phones have 5 to 35 ms
-_MATTERS_PX = 0.5  # shift of the outer tenth of the points, in a quarter of the frames: the error of SIFT
-_TYPICAL_S = 0.02  # readout time that the shift is judged by
-_LEAST_S = 0.004  # shorter readouts move points by less than they are off
-_LEAST_GAIN = 0.01  # of the cost; films without rolling shutter gain nothing
-_LONGEST_S = 0.04
 _MAX_GAP_S = 1.0  # between the neighbors in time that the motion of a frame comes from
 
 
@@ -71,32 +59,6 @@ def row_times(pixels: np.ndarray, size: tuple[int, int], readout_s: float, quart
     return readout_s * (y, x, -y, -x)[quarter_turns % 4]
 
 
-class ShutterObservations(Observations):
-    """The observed points of a model, to be moved to the middle row and back."""
-
-    def __init__(self, model: Reconstruction, times_s: np.ndarray, quarter_turns: int) -> None:
-        """Keep the pixels as observed."""
-        super().__init__(model)
-        self.times_s, self.quarter_turns = times_s, quarter_turns
-
-    def shifts(self, readout_s: float) -> list[np.ndarray]:
-        """Return for each frame how far each point (k, 2) is from where the camera of the middle row sees it."""
-        poses = poses_of(self.model)
-        motion = Motion.of(self.times_s[self.rows], np.stack([poses[row] for row in self.rows]))
-        size = self.camera.width, self.camera.height
-        out = []
-        for number, row in enumerate(self.rows):
-            points = self.points_in_camera(row, poses[row])
-            when = row_times(self.pixels[row], size, readout_s, self.quarter_turns)
-            seen = project(self.camera, moved(points, motion.angular[number], motion.linear[number], when))
-            out.append(np.nan_to_num(project(self.camera, points) - seen))
-        return out
-
-    def move(self, readout_s: float) -> None:
-        """Put the observed points where the camera of the middle row sees them, for a readout time."""
-        self.place({row: -shift for row, shift in zip(self.rows, self.shifts(readout_s))})
-
-
 @dataclass(frozen=True)
 class Shutter:
     """The rolling shutter of a film, and the motion and depth of its registered keyframes."""
@@ -139,57 +101,3 @@ def _shifted(image: np.ndarray, shift: np.ndarray) -> np.ndarray:
     dense = cv2.remap(shift, x / 8, y / 8, cv2.INTER_LINEAR)
     pixels, mode = np.ascontiguousarray(image), cv2.BORDER_REPLICATE
     return cv2.remap(pixels, x + dense[..., 0], y + dense[..., 1], cv2.INTER_LANCZOS4, borderMode=mode)
-
-
-def correct_rolling_shutter(
-    model: Reconstruction, frames: FrameSet, work_dir: Path, progress: Progress
-) -> Shutter | None:
-    """Estimate the readout time and adjust the model to it, in place; None where it does not matter or is not found."""
-    observations = ShutterObservations(model, frames.times_s, frames.quarter_turns)
-    largest = [np.quantile(np.hypot(*s.T), 0.9) for s in observations.shifts(_TYPICAL_S) if len(s)]
-    if np.quantile(largest, 0.75) < _MATTERS_PX:
-        return None
-    readout_s, gain = _least_cost(model, frames, work_dir / "rolling_shutter")
-    if readout_s < _LEAST_S or gain < _LEAST_GAIN:
-        return None
-    observations.move(readout_s)
-    bundle_adjust(model)
-    observations.move(readout_s)
-    model.update_point_3d_errors()
-    poses = poses_of(model)
-    depth = [np.median(observations.points_in_camera(row, poses[row])[:, 2]) for row in observations.rows]
-    times_s = frames.times_s[observations.rows]
-    motion = Motion.of(times_s, np.stack([poses[row] for row in observations.rows]))
-    progress.note(
-        f"poses: rolling shutter of {1000 * readout_s:.0f} ms from the first row to the last, corrected"
-    )
-    return Shutter(readout_s, frames.quarter_turns, observations.camera, times_s, motion, np.array(depth))
-
-
-def _least_cost(model: Reconstruction, frames: FrameSet, folder: Path) -> tuple[float, float]:
-    """Return the readout time with the least cost, by a parabola, and what it gains relative to none."""
-    import pycolmap
-
-    thin = thinned(model, folder)
-    thin.write(folder)
-    costs: dict[int, float] = {}
-
-    def cost(step: int) -> float:
-        if step not in costs:
-            trial = pycolmap.Reconstruction(folder)
-            observations = ShutterObservations(trial, frames.times_s, frames.quarter_turns)
-            observations.move(step * _STEP_S)
-            bundle_adjust(trial)
-            observations.move(step * _STEP_S)
-            costs[step] = observations.cost()
-        return costs[step]
-
-    best = 0
-    while (best + 1) * _STEP_S <= _LONGEST_S and cost(best + 1) < cost(best):
-        best += 1
-    low, middle, high = (cost(best + k) for k in (-1, 0, 1))
-    offset = 0.5 * (low - high) / max(low - 2 * middle + high, 1e-12)
-    readout_s = _STEP_S * (best + float(np.clip(offset, -0.5, 0.5)))
-    # The parabola's minimum; between the steps it is not tried.
-    least = middle - 0.25 * (low - high) * float(np.clip(offset, -0.5, 0.5))
-    return readout_s, 1 - least / cost(0)

@@ -1,4 +1,4 @@
-"""Cameras of phones that are not one pinhole camera with one pose a frame: rolling shutter, zoom."""
+"""Cameras of phones that are not one pinhole camera with one pose a frame: rolling shutter, resection, zoom."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from reconstruction.frames import FRAMES_PRESETS, load_frames
 from reconstruction.poses import POSES_PRESETS, estimate_poses
 from reconstruction.poses.lens import Lens
-from reconstruction.poses.moving_crop import resect
+from reconstruction.poses.resection import resect
 from reconstruction.poses.rolling_shutter import Motion, Shutter, moved, row_times
 from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import _scale_changes, longest_run

@@ -11,7 +11,6 @@ from reconstruction.core.types import FrameSet, PosedFrames
 from reconstruction.poses import POSES_PRESETS, PosesConfig, estimate_poses
 from reconstruction.poses.diagnose import check_model, is_collapsed
 from reconstruction.poses.lens import Lens
-from reconstruction.poses.observations import Observations
 from reconstruction.poses.undistort import undistort
 from registry.errors import InputError
 from registry.geometry import split_similarity, umeyama
@@ -276,10 +275,3 @@ def test_a_model_with_a_part_that_shrank_to_a_point_is_refused():
     assert is_collapsed(model)
     with pytest.raises(InputError, match="shrank to a point"):
         check_model(model, 12, np.arange(12), 0.5)
-
-
-def test_points_that_have_no_pixel_are_no_perfect_fit():
-    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions())
-    observations = Observations(model)
-    observations.place(dict.fromkeys(observations.rows, np.full(2, np.nan)))
-    assert observations.cost() == np.inf
