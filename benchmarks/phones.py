@@ -135,7 +135,8 @@ def _verdict(out: Outcome, notes: Sequence[str]) -> str:
     )
     if not good:
         return "wrong"
-    return "right" if out.used_s > _REGISTERED else "part" if any("zoom" in n for n in notes) else "wrong"
+    told = any("zoom" in n or "not registered" in n for n in notes)
+    return "right" if out.used_s > _REGISTERED else "part" if told else "wrong"
 
 
 def table(outcomes: Sequence[Outcome]) -> str:

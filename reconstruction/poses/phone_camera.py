@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from reconstruction.core.progress import Progress
 from reconstruction.core.types import FrameSet
@@ -21,6 +22,7 @@ from reconstruction.poses.self_calibration import Calibration, self_calibrate
 # longer side; without a rolling shutter the readout is at most 2 ms.
 _LEAST_SPREAD_PX = 1.0
 _LEAST_READOUT_S = 0.004
+_SURELY_MOVING = 5.0  # influence of a cluster, from which a film is said to have something that moves
 _LEAST_GAIN = 0.01  # of the loss of the points that rest, by leaving out what moves
 
 
@@ -51,7 +53,8 @@ def find_phone_camera(
     Returns:
         The adjusted model; its observed points are where a camera at rest with a fixed crop sees them.
     """
-    model, bundle, calibration = _calibrated(model, frames, config, progress)
+    with threadpool_limits(1, user_api="blas"):  # the number of threads changes the last bits
+        model, bundle, calibration = _calibrated(model, frames, config, progress)
     found = calibration.unknowns
     moves = calibration.spread_px >= _LEAST_SPREAD_PX
     readout_s = found.readout_s if found.readout_s >= _LEAST_READOUT_S else 0.0
@@ -88,16 +91,20 @@ def _calibrated(
     """Return the model, without what moves where that fits better, its bundle, and what was found of the camera."""
     first = Bundle(model, frames.times_s, frames.quarter_turns)
     at_first = self_calibrate(first)
-    if max((c.influence for c in clusters(first, at_first)), default=0.0) < MOVING:
+    influence = max((c.influence for c in clusters(first, at_first)), default=0.0)
+    if influence < MOVING:
         return model, first, at_first
     rest = without_moving_things(model, frames, config)
-    if rest is None:
-        return model, first, at_first
-    second = Bundle(rest, frames.times_s, frames.quarter_turns)
-    at_second = self_calibrate(second)
+    second = Bundle(rest or model, frames.times_s, frames.quarter_turns)
+    at_second = self_calibrate(second) if rest else at_first
     before, after = first.losses_by_point(at_first.unknowns), second.losses_by_point(at_second.unknowns)
     both = sorted(before.keys() & after.keys())
-    if not both or 1 - sum(after[i] for i in both) / sum(before[i] for i in both) < _LEAST_GAIN:
+    if rest is None or sum(after[i] for i in both) > (1 - _LEAST_GAIN) * sum(before[i] for i in both):
+        if influence > _SURELY_MOVING:
+            progress.note(
+                "poses: parts of the scene do not agree with each other: something large moves before the camera, and "
+                "could not be told from what rests. Cameras may be off; film while nothing moves"
+            )
         return model, first, at_first
     lost = model.num_points3D() - rest.num_points3D()
     progress.note(
