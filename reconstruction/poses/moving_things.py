@@ -103,8 +103,8 @@ def without_moving_things(
         influence = max((c.influence for c in found), default=0.0)
         if influence < _AGREES:
             agreeing = pycolmap.Reconstruction(rest)
-        likely = [c for c in found if c.gain >= _NEAR_LARGEST * max(f.gain for f in found)]
-        likely = [c for c in likely if c.share < _MOST_SHARE]
+        likely = [c for c in found if c.share < _MOST_SHARE]
+        likely = [c for c in likely if c.gain >= _NEAR_LARGEST * max(f.gain for f in likely)]
         if influence < _DONE or not likely:
             break
         for point_id in max(likely, key=lambda c: c.influence).points_of(rest):
