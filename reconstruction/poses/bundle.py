@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from reconstruction.poses.colmap_types import Reconstruction
-from reconstruction.poses.observations import project
+from reconstruction.poses.observations import derivatives, project
 from reconstruction.poses.refine import LOSS_SCALE_PX
 from reconstruction.poses.rolling_shutter import Motion, row_times
 
@@ -161,26 +161,12 @@ class Bundle:
     def linearized(self, at: Unknowns) -> Linear:
         """Return errors and derivatives (central differences) at `at`; points behind the camera have no derivative."""
         points, velocity = self._in_camera(at)
-        far = 1e-4 * float(np.abs(points[:, 2]).mean())
-        by_place = np.stack(
-            [
-                (self._project(at.params, points + d) - self._project(at.params, points - d)) / (2 * far)
-                for d in far * np.eye(3)
-            ],
-            axis=2,
-        )
-        x, y, z = points.T
-        none = np.zeros(len(points))
-        by_turn = by_place @ np.stack([none, z, -y, -z, none, x, y, -x, none], 1).reshape(-1, 3, 3)
-        own = np.broadcast_to(np.eye(2), (len(points), 2, 2))
+        error = self._project(at.params, points) + at.offset[self.frame] - self.pixel
+        by_frame = derivatives(self._camera, points)
+        by_place = by_frame[:, :, 3:6]
         shared = [self._by_param(at.params, index, points) for index in self.free_params]
         shared.append(np.einsum("kij,kj->ki", by_place, self._row_share[:, None] * velocity))
-        parts = (
-            np.concatenate([by_turn, by_place, own], axis=2),
-            np.stack(shared, axis=2),
-            by_place @ at.turn[self.frame],
-        )
-        error = self._project(at.params, points) + at.offset[self.frame] - self.pixel
+        parts = by_frame, np.stack(shared, axis=2), by_place @ at.turn[self.frame]
         seen = np.logical_and(np.isfinite(error).all(1), np.isfinite(by_place).all(axis=(1, 2)))
         parts = [np.where(seen[:, None, None], part, 0.0) for part in parts]
         return Linear(self.frame, self.point, np.where(seen[:, None], error, _BEHIND_PX), *parts)

@@ -27,9 +27,8 @@ _AGREES, _DONE = 2.0, 1.2
 _CLUSTERS = (6, 12, 24)  # sizes of what may move are not known
 _LEAST_POINTS = 10  # of a cluster
 _MOST_SHARE = 0.4  # of the points: what rests is the larger part
-_NEAR_LARGEST = (
-    0.5  # share of the largest gain, from which the influence decides: small clusters vary by chance
-)
+# Share of the largest gain from which the influence decides: that of small clusters varies by chance.
+_NEAR_LARGEST = 0.5
 _ROUNDS = 6
 _GAUGE = 1e-6  # share of the diagonal, added: position, turn and scale of the whole are free
 

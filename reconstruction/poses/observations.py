@@ -12,6 +12,22 @@ def project(camera: ColmapCamera, points: np.ndarray) -> np.ndarray:
     return np.asarray(camera.img_from_cam(points))
 
 
+def derivatives(camera: ColmapCamera, points: np.ndarray) -> np.ndarray:
+    """Return the derivatives (k, 2, 8) of pixels by rotation, translation and principal point: central differences.
+
+    `points`: (k, 3) in camera space. NaN where a difference reaches behind the camera.
+    """
+    far = 1e-4 * float(np.abs(points[:, 2]).mean())
+    by_point = np.stack(
+        [(project(camera, points + d) - project(camera, points - d)) / (2 * far) for d in far * np.eye(3)], -1
+    )
+    x, y, z = points.T
+    none = np.zeros(len(points))
+    by_turn = np.stack([none, z, -y, -z, none, x, y, -x, none], -1).reshape(-1, 3, 3)
+    own = np.broadcast_to(np.eye(2), (len(points), 2, 2))
+    return np.concatenate([by_point @ by_turn, by_point, own], axis=2)
+
+
 class Observations:
     """The observed points of a model, by frame row."""
 

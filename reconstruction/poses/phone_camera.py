@@ -94,24 +94,24 @@ def _calibrated(
     influence = max((c.influence for c in clusters(first, at_first)), default=0.0)
     if influence < MOVING:
         return model, first, at_first
-    rest = without_moving_things(model, frames, config)
-    second = Bundle(rest or model, frames.times_s, frames.quarter_turns)
-    at_second = self_calibrate(second) if rest else at_first
-    before, after = first.losses_by_point(at_first.unknowns), second.losses_by_point(at_second.unknowns)
-    both = sorted(before.keys() & after.keys())
-    if rest is None or sum(after[i] for i in both) > (1 - _LEAST_GAIN) * sum(before[i] for i in both):
-        if influence > _SURELY_MOVING:
+    if (rest := without_moving_things(model, frames, config)) is not None:
+        second = Bundle(rest, frames.times_s, frames.quarter_turns)
+        at_second = self_calibrate(second)
+        before, after = (b.losses_by_point(c.unknowns) for b, c in ((first, at_first), (second, at_second)))
+        both = sorted(before.keys() & after.keys())
+        if sum(after[i] for i in both) < (1 - _LEAST_GAIN) * sum(before[i] for i in both):
+            lost = model.num_points3D() - rest.num_points3D()
             progress.note(
-                "poses: parts of the scene do not agree with each other: something large moves before the camera, and "
-                "could not be told from what rests. Cameras may be off; film while nothing moves"
+                f"poses: somebody or something moves before the camera; {lost} of {model.num_points3D()} points are "
+                "left out. A film in which all rests is better"
             )
-        return model, first, at_first
-    lost = model.num_points3D() - rest.num_points3D()
-    progress.note(
-        f"poses: somebody or something moves before the camera; {lost} of {model.num_points3D()} points are left out. "
-        "A film in which all rests is better"
-    )
-    return rest, second, at_second
+            return rest, second, at_second
+    if influence > _SURELY_MOVING:
+        progress.note(
+            "poses: parts of the scene do not agree with each other: something large moves before the camera, and "
+            "could not be told from what rests. Cameras may be off; film while nothing moves"
+        )
+    return model, first, at_first
 
 
 def _take_over(found: Unknowns, rows: list[int], model: Reconstruction) -> None:

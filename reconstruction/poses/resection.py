@@ -3,7 +3,7 @@
 import numpy as np
 
 from reconstruction.poses.colmap_types import ColmapCamera
-from reconstruction.poses.observations import project
+from reconstruction.poses.observations import derivatives, project
 from reconstruction.poses.refine import LOSS_SCALE_PX
 
 _STEPS = 8
@@ -29,7 +29,7 @@ def resect(camera: ColmapCamera, points: np.ndarray, pixels: np.ndarray, offset:
     for _ in range(_STEPS):
         moved = points @ turn.T + shift
         error = project(camera, moved) + offset - pixels
-        jacobian = _jacobian(camera, moved)
+        jacobian = derivatives(camera, moved)
         weight = 1 / (LOSS_SCALE_PX**2 + (error**2).sum(1))
         # Not points so near the camera's plane that a step of the derivative puts them behind it.
         used = np.isfinite(weight) & np.isfinite(jacobian).all(axis=(1, 2))
@@ -40,16 +40,3 @@ def resect(camera: ColmapCamera, points: np.ndarray, pixels: np.ndarray, offset:
         by = Rotation.from_rotvec(step[:3]).as_matrix()
         turn, shift, offset = by @ turn, by @ shift + step[3:6], offset + step[6:]
     return offset
-
-
-def _jacobian(camera: ColmapCamera, points: np.ndarray) -> np.ndarray:
-    """Return the derivative (k, 2, 8) of pixels by rotation, translation and principal point."""
-    far = 1e-4 * float(np.abs(points[:, 2]).mean())
-    by_point = np.stack(
-        [(project(camera, points + d) - project(camera, points - d)) / (2 * far) for d in far * np.eye(3)], -1
-    )
-    x, y, z = points.T
-    none = np.zeros(len(points))
-    by_turn = np.stack([none, z, -y, -z, none, x, y, -x, none], -1).reshape(-1, 3, 3)
-    own = np.broadcast_to(np.eye(2), (len(points), 2, 2))
-    return np.concatenate([by_point @ by_turn, by_point, own], axis=2)

@@ -27,7 +27,7 @@ _DAMPING, _LESS, _MORE, _TRIES = 1e-4, 1 / 6, 8.0, 8  # of Levenberg-Marquardt
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found of a film's camera."""
+    """Poses, points, lens, principal points and readout time, and the spreads of their priors."""
 
     unknowns: Unknowns
     spread_px: float  # standard deviation of the offsets
