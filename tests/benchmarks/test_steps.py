@@ -4,7 +4,8 @@ import time
 
 import pytest
 
-from benchmarks.steps import StepClock, main, table_of
+from benchmarks.steps import Step, StepClock, main, table_of
+from reconstruction.core.profiling import Usage
 
 
 def test_steps_are_measured_one_after_another():
@@ -26,8 +27,26 @@ def test_steps_are_measured_one_after_another():
     asleep, busy = clock.steps[1].usage, clock.steps[2].usage
     assert asleep.wall_s >= 0.2
     assert asleep.cpu_s < 0.15 < busy.cpu_s
-    lines = table_of([clock.steps, clock.steps, clock.steps])
-    assert [line.split("|")[2].strip() for line in lines[2:]] == ["sleeping", "working", "**all**", "**all**"]
+
+
+def test_a_table_has_medians_over_rounds_and_leaves_out_short_steps():
+    def steps(wall_s: float) -> list[Step]:
+        return [
+            Step("depth", "sleeping", Usage(wall_s, 0.1, 0.0)),
+            Step("depth", "no time", Usage(0.0, 0.0, 0.0)),
+            Step("world", "working", Usage(2.0, 4.0, 0.0)),
+        ]
+
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in table_of([steps(w) for w in (1.0, 9.0, 2.0)])
+    ]
+    assert rows[2:] == [
+        ["depth", "sleeping", "2.0", "0.1", "0.1"],
+        ["world", "working", "2.0", "4.0", "2.0"],
+        ["depth", "**all**", "2.0", "0.1", "0.1"],
+        ["world", "**all**", "2.0", "4.0", "2.0"],
+    ]
 
 
 def test_steps_end_with_an_error():
