@@ -52,6 +52,7 @@ LIGHT, WEIGHT = (
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
+_FOUR = np.float32(4.0)
 _FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
 # exp(-rho / 2) = exp(x)^64 with x = -rho / 128, by the Taylor polynomial of exp(x).
 _FALLOFF_STEP = np.float32(-1.0 / 128.0)
@@ -93,7 +94,9 @@ def blend(
     """Blend the splats of the tiles tile_order[start:stop].
 
     Splats (k, 17) and boxes (k, 4) are near to far; tile_start and entries are of `bin_to_tiles`. scalars (3,) are the
-    largest alpha, the transmittance at which a pixel is finished, and the reference depth. weights (h, w) are those of
+    largest alpha, the transmittance at which a pixel is finished, and the reference depth r. Distortion is measured by
+    the place 4 r / (r + z) of a splat along the ray: relative depth around r, bounded, so that a splat in front of the
+    lens does not outweigh the picture. weights (h, w) are those of
     the pixels in `contributions`, or (0, 0) to omit these. Fills features (h, w, 13) and contributions (e,), the sum
     over the tile's pixels of weight alpha T of each entry.
     """
@@ -137,7 +140,6 @@ def _blend_tile(
         ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
         opacity, reach2 = s[OPACITY], s[REACH2]
         red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
-        inverse_zc = _ONE / zc
         total = zero
         first_column, end_column, first_row, end_row = patches_of(box, tx, ty, x_end, y_end)
         for row in range(first_row, end_row):
@@ -152,12 +154,13 @@ def _blend_tile(
                     w, _, _, _, on_disk, rho = splat_at(dx, dy, ax, ay, bx, by, wx, wy)
                     w_flat = min(max(w, _FLAT_LOW), _FLAT_HIGH)
                     w = w if on_disk else w_flat
-                    inverse_z, z = w * inverse_zc, zc / w
+                    z = zc / w
                     alpha = min(opacity * _falloff(rho), alpha_max)
                     alpha = alpha if (rho <= reach2) & (t >= stop) else zero
                     weight = alpha * t
-                    first = inverse_z if (t == _ONE) else image[F_FIRST, i, j]
-                    m = reference * (first - inverse_z)
+                    place = _FOUR * reference / (reference + z)
+                    first = place if (t == _ONE) else image[F_FIRST, i, j]
+                    m = first - place
                     before, m1, m2 = image[F_ALPHA, i, j], image[F_MOMENT1, i, j], image[F_MOMENT2, i, j]
                     after = t * (_ONE - alpha)
                     median = image[F_MEDIAN, i, j]
@@ -218,8 +221,8 @@ def _blend_tile_backward(
     tx, ty, x_end, y_end = tile_bounds(tile, tiles_x, features)
     xs, ys = lane_offsets(features.dtype)
     finished = np.zeros(PATCHES * PATCHES, np.bool_)
-    # Planes: gradients 0..8, error 9, sum over splats not passed yet 10, opacity 11, moments 12 and 13, first inverse
-    # depth 14, transmittance 15.
+    # Planes: gradients 0..8, error 9, sum over splats not passed yet 10, opacity 11, moments 12 and 13, place of the
+    # first 14, transmittance 15.
     given = np.zeros((16, PATCHES * PATCHES, LANES), features.dtype)
     lanes = np.empty((N_SPLAT_GRADIENTS, LANES), features.dtype)
     for y in range(ty, y_end):
@@ -248,7 +251,6 @@ def _blend_tile_backward(
         ax, ay, bx, by, wx, wy = s[AX], s[AY], s[BX], s[BY], s[WX], s[WY]
         opacity, reach2 = s[OPACITY], s[REACH2]
         red, green, blue, nx, ny, nz = s[RED], s[GREEN], s[BLUE], s[NX], s[NY], s[NZ]
-        inverse_zc = _ONE / zc
         lanes[:] = 0
         first_column, end_column, first_row, end_row = patches_of(box, tx, ty, x_end, y_end)
         for row in range(first_row, end_row):
@@ -265,7 +267,7 @@ def _blend_tile_backward(
                     moves = on_disk | (w == w_flat)
                     w = w if on_disk else w_flat
                     inverse_w = _ONE / w
-                    inverse_z, z = w * inverse_zc, zc * inverse_w
+                    z = zc * inverse_w
                     falloff = _falloff(rho)
                     inside = (rho <= reach2) & (t >= stop)
                     falloff = falloff if inside else zero
@@ -277,7 +279,8 @@ def _blend_tile_backward(
                     g_d, g_x = given[3, i, j], given[8, i, j]
                     g_r, g_g, g_b = given[0, i, j], given[1, i, j], given[2, i, j]
                     g_nx, g_ny, g_nz = given[4, i, j], given[5, i, j], given[6, i, j]
-                    m = reference * (given[14, i, j] - inverse_z)
+                    place = _FOUR * reference / (reference + z)
+                    m = given[14, i, j] - place
                     spread = m * given[11, i, j] - given[12, i, j]
                     q = (
                         g_r * red + g_g * green + g_b * blue + g_d * z + g_nx * nx + g_ny * ny + g_nz * nz
@@ -285,7 +288,8 @@ def _blend_tile_backward(
                     )  # fmt: skip
                     rest = given[10, i, j] - weight * q
                     given[10, i, j] = rest
-                    d_z = weight * (g_d + _TWO * g_x * spread * reference * inverse_z * inverse_z)
+                    d_place = place * place / (_FOUR * reference)
+                    d_z = weight * (g_d + _TWO * g_x * spread * d_place)
                     d_alpha = t * q - rest / (_ONE - alpha)
                     d_alpha = d_alpha if inside & (full <= alpha_max) else zero
                     d_rho = -_HALF * d_alpha * alpha

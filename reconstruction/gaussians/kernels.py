@@ -25,7 +25,7 @@ TILE = 16  # pixels
 XC, YC, ZC, AX, AY, BX, BY, WX, WY, OPACITY, REACH2, RED, GREEN, BLUE, NX, NY, NZ = range(17)
 N_PROJECTED = 17
 # Columns of the rendered image: sums over splats of alpha T times color, depth and normal; opacity; distortion; first
-# and second moments of the relative inverse depth, inverse depth of the first splat, and the median depth.
+# and second moments of the places along the ray, relative to the first; place of the first splat; and the median depth.
 N_FEATURES = 13
 F_DEPTH, F_NORMAL, F_ALPHA, F_DISTORTION, F_MOMENT1, F_MOMENT2, F_FIRST, F_MEDIAN = 3, 4, 7, 8, 9, 10, 11, 12
 # Columns of the per-splat gradients: by XC..OPACITY, color, normal; then sums of alpha T and of alpha T error.

@@ -3,7 +3,7 @@
     L = (1 - w) mean |c - c*| + w (1 - mean SSIM)            color; c = gain * rendered + bias
       + w_d mean rho((z - z*) / z*)                          depth; rho(e) = s log(1 + |e| / s)
       + w_n mean (alpha - N . N_z)                           rendered normal against the normal of the rendered depth
-      + w_x mean sum_{i<j} w_i w_j (1/z_i - 1/z_j)^2 z_ref^2 distortion
+      + w_x mean sum_{i<j} w_i w_j (m_i - m_j)^2            distortion; m = 4 z_ref / (z_ref + z)
       + w_a mean (1 - alpha)                                 opacity, where the depth is known
 
 Means are over all pixels of the image. z is the expected depth, sum(w z) / sum(w).

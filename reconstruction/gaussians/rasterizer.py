@@ -30,7 +30,8 @@ class RasterSettings:
     """Depth of the near plane, in the units of the scene."""
 
     reference_depth: float = 1.0
-    """Unit of depth distortion, which is measured in reference_depth / z; the median depth makes it scale-free."""
+    """Unit r of depth distortion, which is measured in 4 r / (r + z): relative depth where z is near r, bounded
+    elsewhere. The median depth makes it scale-free."""
 
 
 @dataclass(frozen=True)

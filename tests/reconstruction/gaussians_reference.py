@@ -61,7 +61,7 @@ def render(parameters, xi, camera, world_from_camera, reference_depth=1.0, alpha
     passed = torch.cumprod(1 - alpha, 0)
     light = torch.cat([torch.ones_like(passed[:1]), passed[:-1]])
     weight = alpha * light
-    m = reference_depth / z
+    m = 4 * reference_depth / (reference_depth + z)
     spread = (m[:, None] - m[None]) ** 2 * weight[:, None] * weight[None]
     planes = [weight.T @ color, (weight * z).sum(0)[:, None], weight.T @ normal, weight.sum(0)[:, None]]
     planes.append(0.5 * spread.sum((0, 1))[:, None])

@@ -9,7 +9,13 @@ from notes import Notes
 from PIL import Image
 
 from reconstruction.frames import FRAMES_PRESETS, FramesConfig, load_frames
-from reconstruction.frames.keyframes import FrameStats, MotionMeter, Spacing, choose_keyframes
+from reconstruction.frames.keyframes import (
+    FrameStats,
+    MotionMeter,
+    Spacing,
+    choose_keyframes,
+    rotational_flow,
+)
 from registry.errors import InputError, UsageError
 from synthetic.videos import (
     BAD_VIDEOS,
@@ -214,17 +220,18 @@ def test_keyframes_follow_motion_not_time(tmp_path):
     assert (~resting).sum() >= 18
 
 
-def stats_of(position, sharpness):
+def stats_of(position, sharpness, parallax=None):
     n = len(position)
     return FrameStats(
-        list(range(n)),
-        [i / 30 for i in range(n)],
-        list(sharpness),
-        [100.0] * n,
-        [1.0] * n,
-        list(position),
-        [1.0] * n,
-        [9.0] * n,
+        indices=list(range(n)),
+        times_s=[i / 30 for i in range(n)],
+        sharpness=list(sharpness),
+        brightness=[100.0] * n,
+        texture=[1.0] * n,
+        position=list(position),
+        parallax=list(0.8 * position if parallax is None else parallax),
+        similarity=[1.0] * n,
+        change=[9.0] * n,
     )
 
 
@@ -234,6 +241,36 @@ def test_long_video_is_thinned_evenly_along_its_path():
     assert len(rows) == 96
     gaps = np.diff(np.array(stats.position)[rows])
     assert gaps.max() < 2 * gaps.min()
+
+
+def test_who_walks_gives_more_keyframes_than_who_turns_on_the_spot():
+    position = np.linspace(0, 3, 1200)
+    parallax = np.maximum(position - 2.0, 0) * 0.8  # turns for two thirds of the path, then walks
+    rows = choose_keyframes(
+        stats_of(position, np.ones(1200), parallax), np.ones(1200, bool), Spacing(0.045, 64, 96, 0.4, 0.22)
+    )
+    walking = rows > 800
+    assert len(rows) == pytest.approx(67, abs=3)  # their number is that of the displacement
+    assert 0.6 < walking.mean() < 0.8
+    assert np.diff(position[rows]).max() < 0.12  # neighbors still overlap
+
+
+def test_parallax_is_flow_that_no_rotation_explains():
+    rng = np.random.default_rng(0)
+    at = rng.uniform(-0.5, 0.5, (120, 2))
+    rays = np.column_stack([at / 0.9, np.ones(120)])
+
+    def flow_of(rotation, shift, depth):
+        there = (depth[:, None] * rays) @ cv2.Rodrigues(np.array(rotation))[0].T + shift
+        return 0.9 * there[:, :2] / there[:, 2:] - at
+
+    turned = flow_of([0.02, -0.04, 0.01], np.zeros(3), np.ones(120))
+    left = np.linalg.norm(turned - rotational_flow(at, turned), axis=1)
+    assert np.percentile(left, 75) < 0.05 * np.median(np.linalg.norm(turned, axis=1))
+    depth = rng.uniform(1, 4, 120)
+    walked = flow_of([0.0, 0.0, 0.0], np.array([0.0, 0.0, -0.2]), depth)
+    left = np.linalg.norm(walked - rotational_flow(at, walked), axis=1)
+    assert np.percentile(left, 75) > 0.5 * np.median(np.linalg.norm(walked, axis=1))
 
 
 def test_blurred_frame_is_kept_where_nothing_else_bridges_the_gap():

@@ -153,3 +153,18 @@ def test_ssim_is_one_only_for_equal_images():
     a = rng.uniform(size=(40, 50, 3))
     assert ssim(a, a) == pytest.approx(1.0, abs=1e-5)
     assert ssim(a, np.clip(a + 0.2 * rng.normal(size=a.shape), 0, 1)) < 0.95
+
+
+def test_a_splat_before_the_lens_does_not_outweigh_the_picture():
+    """Distortion is bounded by (4 / 2)^2, also where a disk reaches through the plane of the lens."""
+    p = np.concatenate([wall(), splats(1)])
+    p[-1, :3], p[-1, 3:7], p[-1, 7:9] = POSE[:3, 3] + 0.09 * POSE[:3, 2], [1, 1, 0, 0], np.log(0.1)
+    behind = p[:-1]
+    weights = np.zeros((CAMERA.height, CAMERA.width, 9))
+    weights[..., 8] = 1
+    image = rasterize(p, CAMERA, POSE, UNCUT)
+    assert image.features[..., 7].max() > 0.5
+    assert 0.01 < image.features[..., 8].max() <= 4
+    ours = rasterize_backward(image, weights).parameters[:-1, 9]
+    alone = rasterize_backward(rasterize(behind, CAMERA, POSE, UNCUT), weights).parameters[:, 9]
+    assert np.abs(ours).max() < 200 * np.abs(alone).max()
