@@ -169,6 +169,7 @@ class Spacing:
     most: int
     blurred_below: float  # relative sharpness of a blurred frame
     widest_gap: float  # largest gap that dropping a blurred frame may leave, share of the longer side
+    by_parallax: bool = True  # else by displacement alone
 
 
 def choose_keyframes(stats: FrameStats, usable: np.ndarray, spacing: Spacing) -> np.ndarray:
@@ -188,8 +189,10 @@ def choose_keyframes(stats: FrameStats, usable: np.ndarray, spacing: Spacing) ->
         return rows[[int(np.argmax(quality))]]
     distinct = 1 + int((np.diff(position) > _SAME).sum())
     wanted = int(np.clip(round(length / spacing.step), spacing.fewest, spacing.most))
-    path = _FLOW_SHARE * position + np.array(stats.parallax)[rows]
-    path *= length / (path[-1] - path[0])
+    path = position
+    if spacing.by_parallax:
+        path = _FLOW_SHARE * position + np.array(stats.parallax)[rows]
+        path *= length / (path[-1] - path[0])
     target = min(wanted, distinct)
     cells = wanted
     chosen = _sharpest_per_cell(path, position, quality, cells)

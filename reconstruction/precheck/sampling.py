@@ -162,9 +162,10 @@ def _choose(
     stats = meter.stats
     if folder:  # photographs need not be in order, and each is one that its owner chose
         return stats, choose_frames(len(grays), MAX_FRAMES)
-    spacing = Spacing(
-        step=0.03, fewest=min(MAX_FRAMES, 32), most=MAX_FRAMES, blurred_below=0.4, widest_gap=0.22
-    )
+    spacing = Spacing(  # as the frames that the limits were fitted to
+        step=0.03, fewest=min(MAX_FRAMES, 32), most=MAX_FRAMES, blurred_below=0.4, widest_gap=0.22,
+        by_parallax=False,
+    )  # fmt: skip
     rows = choose_keyframes(stats, np.ones(len(grays), bool), spacing)
     if len(rows) < _MIN_SAMPLED:  # a camera at rest, or one too fast to follow
         rows = choose_frames(len(grays), _MIN_SAMPLED)
