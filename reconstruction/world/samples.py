@@ -5,7 +5,7 @@ once, by box filters) gives the normal; its residual tells planes from edges, co
 are free of noise, so depth noise scatters the normals without bias.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -19,6 +19,9 @@ _MIN_WINDOW_FILL = 0.35  # smallest share of valid pixels in a window
 _GOOD_RESIDUAL = 0.006  # relative residual of plane-sweep depth on a plane; halves the weight
 _MAX_RESIDUAL = 0.03  # relative residual above which a pixel is not sampled
 _MIN_SAMPLES = 500  # in all frames together
+# Farther samples are left out, in shares of the median depth: where the camera only turns, depth goes to infinity, and
+# a level patch of noise there covers more area than the floor.
+_FARTHEST = 6.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,9 @@ def sample_surface(posed: PosedFrames, depth: DepthMaps, config: WorldConfig) ->
             "world: the depth maps are almost empty, so floor and gravity cannot be found. Film textured objects from "
             "several sides, slowly, in good light."
         )
-    return SurfaceSamples(*merged)
+    samples = SurfaceSamples(*merged)
+    near = samples.depths <= _FARTHEST * np.median(samples.depths)
+    return SurfaceSamples(*(getattr(samples, field.name)[near] for field in fields(samples)))
 
 
 def _sample_frame(

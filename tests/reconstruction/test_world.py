@@ -247,6 +247,20 @@ def test_mirror_images_below_a_glossy_floor_do_not_lower_it():
     assert abs(errors(world, true)["floor_m"]) < 0.02
 
 
+def test_a_level_patch_of_noise_far_below_is_no_floor():
+    """Where a camera only turns, depth may be many rooms away; there a patch covers more area than the floor."""
+    posed, depth = film(ROOM, walk(8))
+    rays = depth.camera.pixel_rays() @ np.swapaxes(posed.world_from_camera[:, None, :3, :3], -1, -2)
+    far = (posed.world_from_camera[:, 2, 3, None, None] + 40) / -np.minimum(rays[..., 2], -1e-3)
+    spoiled = depth.depth.copy()
+    patch = np.s_[:, 120:, 180:]
+    spoiled[patch] = np.where(rays[patch][..., 2] < -0.1, far[patch], spoiled[patch])
+    posed, depth, true = disturb(posed, replace(depth, depth=spoiled.astype(np.float32)), 8)
+    world = find_world(posed, depth, WorldConfig())
+    assert world.floor_observed
+    assert abs(errors(world, true)["floor_m"]) < 0.02
+
+
 def test_a_table_top_is_no_floor():
     # The floor itself gives no depth (it is blank); the legs and a low box beside the table do.
     boxes = [*table(0, 0), *THINGS, box((0.75, -0.6, 0.1), (1.1, -0.2, 0.45))]
