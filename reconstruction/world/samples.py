@@ -20,7 +20,7 @@ _GOOD_RESIDUAL = 0.006  # relative residual of plane-sweep depth on a plane; hal
 _MAX_RESIDUAL = 0.03  # relative residual above which a pixel is not sampled
 _MIN_SAMPLES = 500  # in all frames together
 # Farther samples are left out, in shares of the median depth: where the camera only turns, depth goes to infinity, and
-# a level patch of noise there covers more area than the floor.
+# a level patch of noise there covers more area than the floor. With 4 and 10 the same floor is found in such a film.
 _FARTHEST = 6.0
 
 
