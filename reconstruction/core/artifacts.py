@@ -73,7 +73,8 @@ def load(cls: type[T], folder: Path) -> T:
         if hint is np.ndarray:
             path = folder / f"{item['array']:05d}.npy"
             large = path.stat().st_size > _MMAP_ABOVE_BYTES
-            return np.load(path, mmap_mode="r" if large else None, allow_pickle=False)
+            # Copied on write: kernels are compiled for writable arrays, of whatever size.
+            return np.load(path, mmap_mode="c" if large else None, allow_pickle=False)
         if origin is tuple:
             inner = typing.get_args(hint)
             if len(inner) == 2 and inner[1] is Ellipsis:

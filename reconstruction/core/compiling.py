@@ -15,6 +15,8 @@ _PAUSE_NOTE = (
     "compiling kernels on their first use: tens of seconds, once on this machine (see `simrecon doctor`)"
 )
 
+_NAMED = 4  # kernels whose names a note gives; with more, the installation is new
+
 
 class CompilationShown:
     """A progress sink that forwards to a listener and replaces the current step while Numba compiles.
@@ -76,7 +78,8 @@ class CompilationShown:
         """Note how many kernels were compiled, if any, and in what time."""
         if self.kernels:
             count = len(self.kernels)
-            self._listener.note(f"compiled {count} kernel{'s'[: count > 1]} in {self.seconds:.0f} s")
+            which = f" ({', '.join(self.kernels)})" if count <= _NAMED else ""
+            self._listener.note(f"compiled {count} kernel{'s'[: count > 1]}{which} in {self.seconds:.0f} s")
 
 
 @contextmanager

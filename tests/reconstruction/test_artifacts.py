@@ -63,6 +63,11 @@ def test_arrays_keep_dtype_shape_and_bits(tmp_path):
     assert np.array_equal(again.depth, value.depth)
     assert np.array_equal(again.confidence, value.confidence)
     assert isinstance(again.depth, np.memmap), "a large array must not be read whole"
+    stored = {path: path.read_bytes() for path in (tmp_path / "d").iterdir()}
+    for array in (again.depth, again.confidence):
+        assert array.flags.writeable, "small and large arrays are of one type for compiled kernels"
+        array[:] = 0
+    assert stored == {path: path.read_bytes() for path in (tmp_path / "d").iterdir()}
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_compilation_is_a_step_of_its_own_and_the_old_step_comes_back() -> None:
     ]
     notes = [s[1] for s in watcher.said if s[0] == "note"]
     assert "first use" in notes[0]
-    assert notes[-1].startswith("compiled 1 kernel in")
+    assert notes[-1].startswith("compiled 1 kernel (")
 
 
 def test_nothing_is_said_of_what_is_compiled_already() -> None:
