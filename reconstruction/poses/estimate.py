@@ -18,18 +18,19 @@ from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.components import label_parts
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features, extract_features, match
+from reconstruction.poses.focal_length import PLAUSIBLE_FOCAL, estimate_focal_length
 from reconstruction.poses.held_out import candidates_in_time, locate_frames
 from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.phone_camera import PhoneCamera, find_phone_camera
 from reconstruction.poses.refine import refine_model
+from reconstruction.poses.tracks import with_tracks
 from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import cut_to_part, search_zoom
 
 _DATABASE = "database.db"  # of the mapper, in the work folder
-_PLAUSIBLE_FOCAL = (0.35, 4.0)  # of the longer image side; metadata beyond is ignored
-_DEFAULT_FOCAL_SHARE = 1.0  # of the longer image side, where the metadata has no focal length
+_DEFAULT_FOCAL_SHARE = 1.0  # of the longer image side, where neither metadata nor matches tell
 
 
 def estimate_poses(
@@ -98,11 +99,11 @@ def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> impo
 
 
 def initial_camera(frames: FrameSet, config: PosesConfig) -> ColmapCamera:
-    """Return the shared camera that the mapper starts from: focal length from metadata or the default."""
+    """Return the camera that all frames share, its focal length from metadata or the default."""
     import pycolmap
 
     height, width = frames.images.shape[1:3]
-    low, high = (share * max(width, height) for share in _PLAUSIBLE_FOCAL)
+    low, high = (share * max(width, height) for share in PLAUSIBLE_FOCAL)
     known = low <= frames.focal_prior_px <= high
     focal = frames.focal_prior_px if known else _DEFAULT_FOCAL_SHARE * max(width, height)
     name = "SIMPLE_RADIAL" if config.camera_model == "auto" else config.camera_model
@@ -118,8 +119,14 @@ def _reconstruct(
     camera = initial_camera(frames, config)
     pairs = consistent_pairs(frames, features, camera, config, progress)
     diagnose.check_motion(features, pairs, (camera.width, camera.height))
+    if not camera.has_prior_focal_length:
+        camera.focal_length = (
+            estimate_focal_length(pairs, camera.width, camera.height) or camera.focal_length
+        )
+    scaled = features, pairs  # tracked points have no scale, which tells of zoom
+    features, pairs = with_tracks(frames, features, pairs, camera, config, progress)
     with ThreadPoolExecutor(1) as beside:  # the mapper uses one core
-        search = beside.submit(search_zoom, frames, features, pairs, camera, config, work_dir)
+        search = beside.submit(search_zoom, frames, *scaled, camera, config, work_dir)
         models = _map(features, pairs, camera, config, work_dir, progress)
     if (part := search.result()) is not None:
         frames, features, pairs = cut_to_part(part, frames, features, pairs, progress)
@@ -171,7 +178,7 @@ def _map(
     database.unlink(missing_ok=True)
     mapping.write_database(database, camera, features, pairs)
     progress.start(len(features), "mapping")
-    return mapping.incremental_models(database, work_dir, config, len(features), progress)
+    return mapping.incremental_models(database, work_dir, features, pairs, config, progress)
 
 
 def _locate_held_out(

@@ -4,7 +4,7 @@ import contextlib
 import copy
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,13 @@ from reconstruction.poses.pairs import VerifiedPair
 
 # With more threads, Ceres sums in an order that changes from run to run, and so do the last bits of poses.
 MAPPER_THREADS = 1
+
+# Who turns on the spot with a phone at arm's length moves it by little: its points have small angles, which fix its
+# rotation. At COLMAP's own 1.5 degrees the model ends where the turn begins.
+_MIN_ANGLE_DEG = 0.5
+_START_ANGLE_DEG, _START_INLIERS = 2.0, 50
+_HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
+_MOST_TRIES = 8  # pairs to start from, of all models together
 
 
 @contextlib.contextmanager
@@ -91,9 +98,67 @@ def write_database(
 
 
 def incremental_models(
-    database: Path, work_dir: Path, config: PosesConfig, total: int, progress: Progress
+    database: Path,
+    work_dir: Path,
+    features: list[Features],
+    pairs: list[VerifiedPair],
+    config: PosesConfig,
+    progress: Progress,
 ) -> list[Reconstruction]:
-    """Run the incremental mapper; return its models, largest first."""
+    """Run the incremental mapper; return its models, largest first.
+
+    Each model starts from the pair of frames with most matches that no homography explains: only these tell the
+    relative pose of two cameras without ambiguity. The next one starts among the frames left, if they are more than the
+    largest model has.
+
+    Args:
+        database: of these features and pairs.
+        work_dir: folder for the models.
+        features: of the frames.
+        pairs: of the frames, verified.
+        config: seed and number of inliers.
+        progress: receives a step for each frame.
+    """
+    output = work_dir / "incremental"
+    output.mkdir(parents=True, exist_ok=True)
+    starts, total = _best_starts(features, pairs), len(features)
+    left, models, done, tries = set(range(total)), [], 0, 0
+    while starts and tries < _MOST_TRIES and len(left) > max((m.num_reg_images() for m in models), default=0):
+        start, tries = starts[0], tries + 1
+        model = _incremental_model(database, work_dir, output, config, start, lambda: progress.advance())
+        if model is None:
+            starts = starts[1:]
+            continue
+        models.append(model)
+        done += model.num_reg_images()
+        left -= {i - 1 for i in model.reg_image_ids()}
+        starts = [pair for pair in starts if left.issuperset(pair)]
+    progress.advance(max(total - done, 0))
+    return _by_size(models)
+
+
+def _best_starts(features: list[Features], pairs: list[VerifiedPair]) -> list[tuple[int, int]]:
+    """Return the rows of pairs, those with most matches that no homography explains first."""
+    import cv2
+
+    found = []
+    for pair in pairs:
+        i, j = pair.rows
+        a, b = features[i].keypoints[pair.matches[:, 0]], features[j].keypoints[pair.matches[:, 1]]
+        _, inliers = cv2.findHomography(a, b, cv2.RANSAC, _HOMOGRAPHY_ERROR_PX, maxIters=500)
+        found.append((0 if inliers is None else len(a) - int(inliers.sum()), pair.rows))
+    return [rows for _, rows in sorted(found, key=lambda item: (-item[0], item[1]))]
+
+
+def _incremental_model(
+    database: Path,
+    work_dir: Path,
+    output: Path,
+    config: PosesConfig,
+    start: tuple[int, int],
+    one_more: Callable[[], None],
+) -> Reconstruction | None:
+    """Run the incremental mapper from a pair of frames; return its model, None where the pair does not start one."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -101,9 +166,12 @@ def incremental_models(
     options.random_seed = config.seed
     options.min_num_matches = config.min_inliers
     options.extract_colors = False
-    options.max_num_models = 6
-    options.max_model_overlap = 20
+    options.multiple_models = False
     options.min_model_size = 5
+    options.init_image_id1, options.init_image_id2 = start[0] + 1, start[1] + 1
+    options.mapper.init_min_num_inliers = _START_INLIERS
+    options.mapper.init_min_tri_angle = _START_ANGLE_DEG
+    options.mapper.filter_min_tri_angle = options.triangulation.min_angle = _MIN_ANGLE_DEG
     # Coarse bundle adjustment while the model grows: `refine_model` follows (measured: same cameras, half the time).
     options.ba_global_frames_ratio = 2.0
     options.ba_global_points_ratio = 2.0
@@ -112,23 +180,16 @@ def incremental_models(
     options.ba_local_max_num_iterations = 8
     options.ba_local_max_refinements = 1
     options.mapper.abs_pose_max_error = 8.0
-    output = work_dir / "incremental"
-    output.mkdir(parents=True, exist_ok=True)
-    done = [0]
-
-    def one_more() -> None:
-        if done[0] < total:  # a second model may register a frame again
-            done[0] += 1
-            progress.advance()
 
     def first_two() -> None:
         one_more()
         one_more()
 
     callbacks: Any = {"initial_image_pair_callback": first_two, "next_image_callback": one_more}
-    models = pycolmap.incremental_mapping(database, work_dir, output, options, **callbacks)
-    progress.advance(total - done[0])
-    return _by_size(models)
+    models = _by_size(
+        list(pycolmap.incremental_mapping(database, work_dir, output, options, **callbacks).values())
+    )
+    return models[0] if models else None
 
 
 def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[Reconstruction]:
@@ -141,11 +202,11 @@ def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[R
     options.min_num_matches = config.min_inliers
     output = work_dir / "global"
     output.mkdir(parents=True, exist_ok=True)
-    return _by_size(pycolmap.global_mapping(database, work_dir, output, options))
+    return _by_size(list(pycolmap.global_mapping(database, work_dir, output, options).values()))
 
 
-def _by_size(models: dict[int, Reconstruction]) -> list[Reconstruction]:
-    return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+def _by_size(models: list[Reconstruction]) -> list[Reconstruction]:
+    return sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
 def poses_of(model: Reconstruction) -> dict[int, np.ndarray]:

@@ -1,6 +1,8 @@
 """Refine a model: filter outlier points, robust bundle adjustment, deregister weakly constrained frames."""
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
@@ -8,7 +10,7 @@ from reconstruction.poses.mapping import MAPPER_THREADS
 
 # of the Cauchy loss: SIFT errors in compressed video have heavy tails (measured: halves the camera error)
 LOSS_SCALE_PX = 0.5
-_MIN_OBSERVATIONS = 15  # points that a frame must observe for a reliable pose
+_MIN_OBSERVATIONS = 15  # points that a frame must observe for a reliable pose, and share with another frame
 _ITERATIONS = 40
 _TOLERANCE = 1e-5  # of the cost; 1e-6 moves cameras by up to .006 % of their path, their error by 3 %
 _ROUGH_ITERATIONS = 8  # before points with a large error are deleted
@@ -61,9 +63,30 @@ def filter_points(model: Reconstruction, max_error_px: float, min_track_length: 
 
 
 def drop_weak_frames(model: Reconstruction) -> None:
-    """Deregister frames that observe too few points."""
-    for image_id in sorted(model.reg_image_ids()):
+    """Deregister frames that observe too few points, and parts that share too few with the largest part.
+
+    The global mapper joins parts of a film over a handful of points, which do not fix how they lie to each other.
+    """
+    ids = sorted(model.reg_image_ids())
+    for image_id in ids:
         if model.image(image_id).num_points3D < _MIN_OBSERVATIONS:
+            model.deregister_frame(model.image(image_id).frame_id)
+    ids = sorted(model.reg_image_ids())
+    row_of = {image_id: row for row, image_id in enumerate(ids)}
+    seen = [
+        (row_of[element.image_id], column)
+        for column, point_id in enumerate(sorted(model.point3D_ids()))
+        for element in model.point3D(point_id).track.elements
+        if element.image_id in row_of
+    ]
+    if not seen:
+        return
+    rows, columns = np.unique(np.array(seen), axis=0).T
+    sees = coo_matrix((np.ones(len(rows), np.int32), (rows, columns)), (len(ids), columns.max() + 1)).tocsr()
+    _, parts = connected_components((sees @ sees.T) >= _MIN_OBSERVATIONS, directed=False)
+    largest = np.bincount(parts).argmax()
+    for image_id in ids:
+        if parts[row_of[image_id]] != largest:
             model.deregister_frame(model.image(image_id).frame_id)
 
 

@@ -107,8 +107,9 @@ def _longest_part(
     folder.mkdir(parents=True, exist_ok=True)
     database = folder / "database.db"
     database.unlink(missing_ok=True)
-    mapping.write_database(database, camera, [features[r] for r in rows], chosen, own_cameras=True)
-    models = mapping.incremental_models(database, folder, config, len(rows), NO_PROGRESS)
+    shown = [features[r] for r in rows]
+    mapping.write_database(database, camera, shown, chosen, own_cameras=True)
+    models = mapping.incremental_models(database, folder, shown, chosen, config, NO_PROGRESS)
     if not models or models[0].num_reg_images() < _LEAST_REGISTERED * len(rows):
         return None
     model = models[0]
