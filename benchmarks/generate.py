@@ -39,7 +39,9 @@ def build_parser() -> argparse.ArgumentParser:
     drawn.add_argument("--seed", type=int, default=0, help="of the draw")
     drawn.add_argument("--frames", type=int, help="length of the film (140)")
     drawn.add_argument("--size", help="of the frames, such as 640x480")
-    drawn.add_argument("--path", choices=WALKS, help="the camera's way; a loop comes with four walls")
+    drawn.add_argument(
+        "--path", choices=WALKS, help="the camera's way; a loop and a visit come with four walls"
+    )
     drawn.add_argument("--textureless", type=float, help="share of things of one plain color per part")
     drawn.add_argument("--gap", type=float, help="smallest distance between neighbors, meters")
     drawn.add_argument("--exposure-drift", type=float, help="relative amplitude")
@@ -69,7 +71,7 @@ def chosen_captures(options: argparse.Namespace) -> dict[str, CaptureSpec]:
     room = {
         "textureless_share": options.textureless,
         "clutter_gap_m": options.gap,
-        "walls": 4 if options.path == "loop" else None,
+        "walls": 4 if options.path in ("loop", "visit") else None,
     }
     low, high = _numbers(options.objects, "-", "--objects", "5-40")
     return drawn_captures(

@@ -41,7 +41,7 @@ class CaptureSpec:
     fps: float = 12.0
     """Frames per second."""
     path: str = "arc"
-    """The camera's way: "arc", "two_heights", or "loop" (walls=4)."""
+    """The camera's way: one of `synthetic.walks.WALKS`; "loop" and "visit" need walls=4."""
     fov_deg: float = 62.0
     """Field of view along the longer side."""
     shake: float = 1.0

@@ -12,9 +12,10 @@ from registry.errors import UsageError
 from synthetic.camera_paths import look_at
 from synthetic.layout import RoomShape
 
-WalkKind = Literal["arc", "loop", "two_heights", "near", "strafe", "pan", "sit", "handheld_wander"]
+WalkKind = Literal["arc", "loop", "two_heights", "near", "strafe", "pan", "sit", "handheld_wander", "visit"]
 WALKS: tuple[str, ...] = get_args(WalkKind)
 _TABLE_HALF_M = 0.78  # from the middle of the band to the edge of the middle group
+_ARM_M = 0.28  # from a visitor's axis to the phone
 _SWAY_OUT_M = 0.16  # stays inside the band that layout keeps free (0.36 m to each side)
 
 
@@ -28,7 +29,8 @@ def walk_path(
         kind: "arc": once around the open side; "two_heights": the same there and, lower, back; "loop": all
             around, for rooms with four walls; "near": low and close to the middle table; "strafe": sideways
             along one side; "pan": partly turning on the spot; "sit": at the height of a seated person's eyes;
-            "handheld_wander": anywhere on the band, from one thing to the next.
+            "handheld_wander": anywhere on the band, from one thing to the next; "visit": walks on, turns around once on
+            the spot with the phone at arm's length, walks on, for rooms with four walls.
         n_frames: Length of the film.
         seed: Of the hand.
         shake: Factor on sway, steps and tremor.
@@ -36,11 +38,13 @@ def walk_path(
     """
     if kind not in WALKS:
         raise UsageError(f"unknown path {kind!r}; there are {list(WALKS)}")
-    if kind == "loop" and "wall_south" not in shape.walls:
+    if kind in ("loop", "visit") and "wall_south" not in shape.walls:
         raise UsageError(
-            "a loop looks out of the open side of a room with 3 walls: set walls=4 or path='arc'"
+            f"a {kind} looks out of the open side of a room with 3 walls: set walls=4 or path='arc'"
         )
     hand = _Hand(n_frames, seed, shake)
+    if kind == "visit":
+        return _visit_path(shape, hand, np.random.default_rng([seed, 81]))
     if kind not in ("arc", "loop", "two_heights"):
         return _drawn_path(shape, kind, hand, np.random.default_rng([seed, 80]), top_m)
     t = np.linspace(0, 1, n_frames)
@@ -126,6 +130,27 @@ def _drawn_path(
     aim = aim + np.stack([hand.sway(0.05, (1.1, 2.3)) + hand.tremor(0.005) for _ in range(3)], -1)
     roll = np.radians(np.clip(hand.sway(2.0, (1.2, 3.1)) + hand.tremor(0.2), -12, 12))
     return np.stack([look_at(p, a, r) for p, a, r in zip(positions, _gentle(positions, aim, turn), roll)])
+
+
+def _visit_path(shape: RoomShape, hand: "_Hand", rng: np.random.Generator) -> np.ndarray:
+    """Return the way of a visitor: an eighth of the round, once around the visitor, an eighth of the round."""
+    from scipy.ndimage import gaussian_filter1d
+
+    t, smooth = hand.t, len(hand.t) / 40
+    side, around = rng.choice([-1.0, 1.0], 2) * [1.0, rng.uniform(220, 330)]
+    walked = gaussian_filter1d(np.interp(t, [0, 0.3, 0.72, 1], [0, 45, 45, 90]), smooth, mode="nearest")
+    turned = gaussian_filter1d(np.interp(t, [0.27, 0.75], [0, around]), smooth, mode="nearest")
+    body = _outwards(shape, np.radians(rng.uniform(-150, -30) + side * walked), np.full(len(t), 0.05))
+    inwards = np.arctan2(-body[:, 1], -body[:, 0])
+    heading = inwards + np.radians(turned + hand.sway(8, (1.3, 2.7)))
+    view = np.stack([np.cos(heading), np.sin(heading)], -1)
+    ground = body + _ARM_M * view + np.stack([hand.sway(0.03, (2.0, 5.0)), hand.sway(0.03, (2.3, 4.0))], -1)
+    ground += np.stack([hand.tremor(0.003), hand.tremor(0.003)], -1)
+    z = 1.45 + hand.sway(0.05, (0.8, 1.7)) + hand.sway(0.01, (9.0,)) + hand.tremor(0.003)
+    pitch = np.radians(-22 + hand.sway(9, (1.5, 3.3)))
+    aim = np.column_stack([ground + view, z + np.tan(pitch)])
+    roll = np.radians(hand.sway(1.5, (1.2, 3.1)))
+    return np.stack([look_at(p, a, r) for p, a, r in zip(np.column_stack([ground, z]), aim, roll)])
 
 
 def _drawn_aim(

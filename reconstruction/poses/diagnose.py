@@ -10,6 +10,7 @@ from reconstruction.poses.mapping import poses_of
 from reconstruction.poses.observations import Observations
 from reconstruction.poses.pairs import VerifiedPair
 from registry.errors import InputError
+from registry.geometry import transform_points, umeyama
 
 MIN_FRAMES = 8
 _MIN_FEATURES = 60  # in the median frame
@@ -17,9 +18,11 @@ _STILL_SHARE = 0.01  # of the image diagonal; largest image motion of a camera a
 _HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
 _ROTATION_EXPLAINED = 0.95  # inlier share of the homography under pure rotation
 _MIN_TRIANGULATION_DEG = 2.0  # median triangulation angle
+_FAR_BELOW_DEG = 1.5  # triangulation angle of points that only tell how a camera turns
 _MOST_DEPTH_RATIO = 200.0  # of the points in one frame: 10 cm to 20 m; a collapsed one has 1e3 and more
 _DEPTH_QUANTILES = (0.1, 0.9)
 _MOST_COLLAPSED_SHARE = 0.1  # of the frames
+_MOST_DISAGREEMENT = 0.1  # of two models' camera centers, relative to how far these are spread
 
 _HOW_TO_FILM = (
     "Film again: walk slowly around the objects for 10-60 s, in good light, seeing all from several places."
@@ -62,7 +65,9 @@ def check_motion(features: list[Features], pairs: list[VerifiedPair], image_size
     far = np.array(moved) > np.median(moved)
     if not far.any():
         far[:] = True
-    if np.quantile(explained[far], 0.1) > _ROTATION_EXPLAINED and np.median(modulus[far]) < 0.02:
+    # Who walks and then turns has parallax in some pairs, though not in those with the largest motion.
+    turned = min(np.quantile(explained[far], 0.1), np.quantile(explained, 0.1)) > _ROTATION_EXPLAINED
+    if turned and np.median(modulus[far]) < 0.02:
         raise InputError(
             "poses: the camera only turned on the spot: one rotation explains "
             f"{100 * np.median(explained[far]):.0f} % of the matches, so there is no parallax and no depth. "
@@ -82,6 +87,25 @@ def is_collapsed(model: Reconstruction) -> bool:
             low, high = np.quantile(np.maximum(depth, 0.0), _DEPTH_QUANTILES)
             collapsed += bool(high > _MOST_DEPTH_RATIO * low)
     return collapsed > _MOST_COLLAPSED_SHARE * len(observations.rows)
+
+
+def agrees_with(model: Reconstruction, parts: list[Reconstruction]) -> bool:
+    """Return whether a model has the cameras of each of the parts, up to a similarity each.
+
+    Two mappers that find the same cameras from the same matches, each in its own way, are hardly both wrong. A part with
+    fewer than `MIN_FRAMES` common frames tells nothing.
+    """
+    poses = poses_of(model)
+    for part in parts:
+        theirs = poses_of(part)
+        common = sorted(set(poses) & set(theirs))
+        if len(common) < MIN_FRAMES:
+            continue
+        a, b = (np.stack([of[row][:3, 3] for row in common]) for of in (poses, theirs))
+        left = transform_points(umeyama(a, b), a) - b
+        if np.sqrt((left**2).sum() / ((b - b.mean(0)) ** 2).sum()) > _MOST_DISAGREEMENT:
+            return False
+    return True
 
 
 def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, min_share: float) -> None:
@@ -166,7 +190,7 @@ def _pair_motion(features: list[Features], pair: VerifiedPair) -> tuple[float, f
 
 
 def _median_triangulation_deg(model: Reconstruction) -> float:
-    """Return the median over (sampled) points of the largest triangulation angle, degrees."""
+    """Return the median over (sampled) points of the largest triangulation angle, degrees; far points do not count."""
     centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     angles = []
     for point_id in sorted(model.point3D_ids())[:: max(1, model.num_points3D() // 2000)]:
@@ -174,7 +198,9 @@ def _median_triangulation_deg(model: Reconstruction) -> float:
         rays = np.stack([centers[e.image_id] for e in point.track.elements]) - point.xyz
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         angles.append(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
-    return float(np.degrees(np.median(angles))) if angles else 0.0
+    angles = np.degrees(angles)
+    near = angles[angles >= _FAR_BELOW_DEG]
+    return float(np.median(near)) if len(near) else 0.0
 
 
 def describe_frames(indices: np.ndarray, most: int = 6) -> str:

@@ -120,9 +120,7 @@ def _reconstruct(
     pairs = consistent_pairs(frames, features, camera, config, progress)
     diagnose.check_motion(features, pairs, (camera.width, camera.height))
     if not camera.has_prior_focal_length:
-        camera.focal_length = (
-            estimate_focal_length(pairs, camera.width, camera.height) or camera.focal_length
-        )
+        camera.focal_length = estimate_focal_length(pairs, camera.width, camera.height) or camera.focal_length
     scaled = features, pairs  # tracked points have no scale, which tells of zoom
     features, pairs = with_tracks(frames, features, pairs, camera, config, progress)
     with ThreadPoolExecutor(1) as beside:  # the mapper uses one core
@@ -133,7 +131,8 @@ def _reconstruct(
         models = _map(features, pairs, camera, config, work_dir, progress)
     chosen = len(frames.images)
     parts = label_parts(chosen, pairs)
-    models = _with_second_try(models, int((parts == 0).sum()), config, work_dir, progress)
+    least = int(np.ceil(config.min_registered_share * chosen))
+    models = _with_second_try(models, int((parts == 0).sum()), least, config, work_dir, progress)
     if models:
         refine_model(models[0], config)
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
@@ -143,13 +142,22 @@ def _reconstruct(
 
 
 def _with_second_try(
-    models: list[Reconstruction], connected: int, config: PosesConfig, work_dir: Path, progress: Progress
+    models: list[Reconstruction],
+    connected: int,
+    least: int,
+    config: PosesConfig,
+    work_dir: Path,
+    progress: Progress,
 ) -> list[Reconstruction]:
     """Return the models of the global mapper where it does better on what the incremental mapper did badly.
+
+    It registers more frames, but joins parts of a film also where nothing tells how they lie to each other. So it must
+    confirm the cameras that the incremental mapper found, unless these are too few for a scene.
 
     Args:
         models: of the incremental mapper, largest first.
         connected: number of frames in the largest component of the match graph.
+        least: number of frames that a scene needs.
         config: when to try.
         work_dir: folder with the database of the frames.
         progress: receives a note.
@@ -161,10 +169,13 @@ def _with_second_try(
     other = mapping.global_models(work_dir / _DATABASE, work_dir, config)
     second = other[0].num_reg_images() if other else 0
     better = second > (0 if collapsed else first) and not diagnose.is_collapsed(other[0])
+    differs = better and not collapsed and first >= least and not diagnose.agrees_with(other[0], models)
+    better = better and not differs
     of_them = ", a part of them at one point" if collapsed else ""
+    and_others = ", with other cameras" if differs else ""
     progress.note(
         f"poses: of {connected} connected frames the incremental mapper registered {first}{of_them}, the global mapper "
-        f"{second}; the {'global' if better else 'incremental'} model is kept"
+        f"{second}{and_others}; the {'global' if better else 'incremental'} model is kept"
     )
     return other if better else models
 

@@ -66,6 +66,7 @@ def verify_pairs(
     Pairs not near in time are matched by the stronger half of the features only: a quarter of the cost, and weak
     features rarely match across a large change of viewpoint.
     """
+
     def verify(pair: tuple[int, int, bool]) -> VerifiedPair | None:
         i, j, near = pair
         a, b = features[i], features[j]

@@ -1,7 +1,7 @@
 """Refine a model: filter outlier points, robust bundle adjustment, deregister weakly constrained frames."""
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from reconstruction.poses.colmap_types import Reconstruction
@@ -82,12 +82,19 @@ def drop_weak_frames(model: Reconstruction) -> None:
     if not seen:
         return
     rows, columns = np.unique(np.array(seen), axis=0).T
-    sees = coo_matrix((np.ones(len(rows), np.int32), (rows, columns)), (len(ids), columns.max() + 1)).tocsr()
+    sees = coo_matrix((np.ones(len(rows), np.int32), (rows, columns)), (len(ids), columns.max() + 1))
+    for row in np.flatnonzero(~largest_linked_part(sees.tocsr())):
+        model.deregister_frame(model.image(ids[row]).frame_id)
+
+
+def largest_linked_part(sees: csr_matrix) -> np.ndarray:
+    """Return which frames, bool (n,), are in the largest part whose frames are linked by enough common points.
+
+    Args:
+        sees: int32 (n, p), 1 where a frame observes a point.
+    """
     _, parts = connected_components((sees @ sees.T) >= _MIN_OBSERVATIONS, directed=False)
-    largest = np.bincount(parts).argmax()
-    for image_id in ids:
-        if parts[row_of[image_id]] != largest:
-            model.deregister_frame(model.image(image_id).frame_id)
+    return parts == np.bincount(parts).argmax()
 
 
 def _change_camera_model(model: Reconstruction, name: str) -> None:

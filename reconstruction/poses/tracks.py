@@ -41,7 +41,9 @@ class Tracks:
     """Points followed through a film: for each keyframe with any, their numbers int64 (k,) and pixels (k, 2)."""
 
     numbers: dict[int, np.ndarray] = field(default_factory=dict)
-    pixels: dict[int, np.ndarray] = field(default_factory=dict)  # float32; the first pixel's center is (0.5, 0.5)
+    pixels: dict[int, np.ndarray] = field(
+        default_factory=dict
+    )  # float32; the first pixel's center is (0.5, 0.5)
 
     def long_ones(self) -> "Tracks":
         """Return those that at least `_LEAST_KEYFRAMES` keyframes show."""
@@ -104,9 +106,7 @@ def with_tracks(
         for j in range(i + 1, i + 1 + config.sequential_overlap)
         if j in tracks.numbers
     ]
-    for rows, pair in zip(near, ordered_map(extended, near)):
-        if pair is not None:
-            found[rows] = pair
+    found |= {pair.rows: pair for pair in ordered_map(extended, near) if pair is not None}
     return joined, [found[rows] for rows in sorted(found)]
 
 
