@@ -92,8 +92,8 @@ def is_collapsed(model: Reconstruction) -> bool:
 def agrees_with(model: Reconstruction, parts: list[Reconstruction]) -> bool:
     """Return whether a model has the cameras of each of the parts, up to a similarity each.
 
-    Two mappers that find the same cameras from the same matches, each in its own way, are hardly both wrong. A part with
-    fewer than `MIN_FRAMES` common frames tells nothing.
+    Two mappers that find the same cameras from the same matches, each in its own way, are hardly both wrong. A part
+    with fewer than `MIN_FRAMES` common frames tells nothing.
     """
     poses = poses_of(model)
     for part in parts:
