@@ -132,9 +132,8 @@ def _reconstruct(
     chosen = len(frames.images)
     parts = label_parts(chosen, pairs)
     least = int(np.ceil(config.min_registered_share * chosen))
+    models = [refine_model(model, config) for model in models]
     models = _with_second_try(models, int((parts == 0).sum()), least, config, work_dir, progress)
-    if models:
-        refine_model(models[0], config)
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
     for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
         progress.note(note)
@@ -155,18 +154,21 @@ def _with_second_try(
     confirm the cameras that the incremental mapper found, unless these are too few for a scene.
 
     Args:
-        models: of the incremental mapper, largest first.
+        models: of the incremental mapper, refined.
         connected: number of frames in the largest component of the match graph.
         least: number of frames that a scene needs.
         config: when to try.
         work_dir: folder with the database of the frames.
         progress: receives a note.
     """
+    models = sorted(models, key=lambda model: -model.num_reg_images())
     first = models[0].num_reg_images() if models else 0
     collapsed = bool(models) and diagnose.is_collapsed(models[0])
     if first >= config.second_try_below_share * connected and not collapsed:
         return models
-    other = mapping.global_models(work_dir / _DATABASE, work_dir, config)
+    other = [
+        refine_model(m, config) for m in mapping.global_models(work_dir / _DATABASE, work_dir, config)[:1]
+    ]
     second = other[0].num_reg_images() if other else 0
     better = second > (0 if collapsed else first) and not diagnose.is_collapsed(other[0])
     differs = better and not collapsed and first >= least and not diagnose.agrees_with(other[0], models)

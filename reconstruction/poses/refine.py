@@ -10,7 +10,8 @@ from reconstruction.poses.mapping import MAPPER_THREADS
 
 # of the Cauchy loss: SIFT errors in compressed video have heavy tails (measured: halves the camera error)
 LOSS_SCALE_PX = 0.5
-_MIN_OBSERVATIONS = 15  # points that a frame must observe for a reliable pose, and share with another frame
+_MIN_OBSERVATIONS = 15  # points that a frame must observe for a reliable pose
+_MIN_SHARED = 30  # points that two frames share to be linked; COLMAP asks as many to register a frame
 _ITERATIONS = 40
 _TOLERANCE = 1e-5  # of the cost; 1e-6 moves cameras by up to .006 % of their path, their error by 3 %
 _ROUGH_ITERATIONS = 8  # before points with a large error are deleted
@@ -93,7 +94,7 @@ def largest_linked_part(sees: csr_matrix) -> np.ndarray:
     Args:
         sees: int32 (n, p), 1 where a frame observes a point.
     """
-    _, parts = connected_components((sees @ sees.T) >= _MIN_OBSERVATIONS, directed=False)
+    _, parts = connected_components((sees @ sees.T) >= _MIN_SHARED, directed=False)
     return parts == np.bincount(parts).argmax()
 
 
