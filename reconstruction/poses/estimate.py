@@ -132,7 +132,6 @@ def _reconstruct(
     chosen = len(frames.images)
     parts = label_parts(chosen, pairs)
     least = int(np.ceil(config.min_registered_share * chosen))
-    models = [refine_model(model, config) for model in models]
     models = _with_second_try(models, int((parts == 0).sum()), least, config, work_dir, progress)
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
     for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
@@ -148,24 +147,26 @@ def _with_second_try(
     work_dir: Path,
     progress: Progress,
 ) -> list[Reconstruction]:
-    """Return the models of the global mapper where it does better on what the incremental mapper did badly.
+    """Refine the models; return that of the global mapper where it does better on what the incremental one did badly.
 
     It registers more frames, but joins parts of a film also where nothing tells how they lie to each other. So it must
     confirm the cameras that the incremental mapper found, unless these are too few for a scene.
 
     Args:
-        models: of the incremental mapper, refined.
+        models: of the incremental mapper, largest first.
         connected: number of frames in the largest component of the match graph.
         least: number of frames that a scene needs.
         config: when to try.
         work_dir: folder with the database of the frames.
         progress: receives a note.
     """
-    models = sorted(models, key=lambda model: -model.num_reg_images())
-    first = models[0].num_reg_images() if models else 0
+    found = models[0].num_reg_images() if models else 0
     collapsed = bool(models) and diagnose.is_collapsed(models[0])
-    if first >= config.second_try_below_share * connected and not collapsed:
-        return models
+    if found >= config.second_try_below_share * connected and not collapsed:
+        return [refine_model(models[0], config)]
+    models = [refine_model(model, config) for model in models]
+    models.sort(key=lambda model: -model.num_reg_images())
+    first = models[0].num_reg_images() if models else 0
     other = [
         refine_model(m, config) for m in mapping.global_models(work_dir / _DATABASE, work_dir, config)[:1]
     ]
