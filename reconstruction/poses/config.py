@@ -35,7 +35,7 @@ class PosesConfig:
     min_inliers: int = 20
     """Inliers of the two-view geometry that a pair needs."""
 
-    tracked_below: int = 400
+    min_neighbor_matches: int = 400
     """Where neighboring keyframes of a video have fewer matches than this, points are followed through all its frames
     too; 0: nowhere."""
 

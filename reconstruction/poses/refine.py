@@ -1,7 +1,7 @@
 """Refine a model: filter outlier points, robust bundle adjustment, deregister weakly constrained frames."""
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from reconstruction.poses.colmap_types import Reconstruction
@@ -83,12 +83,12 @@ def drop_weak_frames(model: Reconstruction) -> None:
     if not seen:
         return
     rows, columns = np.unique(np.array(seen), axis=0).T
-    sees = coo_matrix((np.ones(len(rows), np.int32), (rows, columns)), (len(ids), columns.max() + 1))
+    sees = coo_array((np.ones(len(rows), np.int32), (rows, columns)), (len(ids), columns.max() + 1))
     for row in np.flatnonzero(~largest_linked_part(sees.tocsr())):
         model.deregister_frame(model.image(ids[row]).frame_id)
 
 
-def largest_linked_part(sees: csr_matrix) -> np.ndarray:
+def largest_linked_part(sees: csr_array) -> np.ndarray:
     """Return which frames, bool (n,), are in the largest part whose frames are linked by enough common points.
 
     Args:

@@ -72,10 +72,10 @@ def with_tracks(
         features: of the keyframes.
         pairs: verified ones.
         camera: shared by the frames.
-        config: `tracked_below` says what few matches are.
+        config: `min_neighbor_matches` says what few matches are.
         progress: receives steps, and a note if the film cannot be read again.
     """
-    weak = _weak_rows(len(features), pairs, config.tracked_below)
+    weak = _weak_rows(len(features), pairs, config.min_neighbor_matches)
     source = Path(frames.source.file)
     if not frames.ordered or not weak.any():
         return features, pairs

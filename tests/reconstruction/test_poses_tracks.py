@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_array
 from test_poses import camera_errors_m
 
 from reconstruction.core.progress import NO_PROGRESS
@@ -80,7 +80,7 @@ def test_parts_joined_by_few_points_are_two():
     sees[:4, :40] = 1
     sees[4:, 50:] = 1
     sees[2:6, 40:49] = 1  # nine points that both parts see
-    assert largest_linked_part(csr_matrix(sees)).tolist() == [True] * 4 + [False] * 3
+    assert largest_linked_part(csr_array(sees)).tolist() == [True] * 4 + [False] * 3
 
 
 @pytest.fixture(scope="module")
