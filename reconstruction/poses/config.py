@@ -35,10 +35,6 @@ class PosesConfig:
     min_inliers: int = 20
     """Inliers of the two-view geometry that a pair needs."""
 
-    min_neighbor_matches: int = 400
-    """Where neighboring keyframes of a video have fewer matches than this, points are followed through all its frames
-    too; 0: nowhere."""
-
     camera_model: Literal["auto", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = "auto"
     """COLMAP camera model that all frames share. `auto`: SIMPLE_RADIAL, and RADIAL in the last bundle adjustment if
     there are enough frames for its second term."""

@@ -24,6 +24,7 @@ MAPPER_THREADS = 1
 _MIN_ANGLE_DEG = 0.5
 _START_ANGLE_DEG, _START_INLIERS = 2.0, 50
 _HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
+_START_CELLS = 12  # along the longer image side, in which a pair's matches are counted once
 _MOST_TRIES = 8  # pairs to start from, of all models together
 
 
@@ -107,8 +108,8 @@ def incremental_models(
 ) -> list[Reconstruction]:
     """Run the incremental mapper; return its models, largest first.
 
-    Each model starts from the pair of frames with most matches that no homography explains: only these tell the
-    relative pose of two cameras without ambiguity. The next one starts among the frames left, if they are more than the
+    Each model starts from a pair of frames with many matches that no homography explains: only these tell the relative
+    pose of two cameras without ambiguity. The next one starts among the frames left, if they are more than the
     largest model has.
 
     Args:
@@ -138,7 +139,10 @@ def incremental_models(
 
 
 def _best_starts(features: list[Features], pairs: list[VerifiedPair]) -> list[tuple[int, int]]:
-    """Return the rows of pairs, those with most matches that no homography explains first."""
+    """Return rows of pairs, those first whose matches that no homography explains are spread over most of the image.
+
+    Those of somebody who walks before a wall are many, too, but side by side.
+    """
     import cv2
 
     found = []
@@ -146,8 +150,10 @@ def _best_starts(features: list[Features], pairs: list[VerifiedPair]) -> list[tu
         i, j = pair.rows
         a, b = features[i].keypoints[pair.matches[:, 0]], features[j].keypoints[pair.matches[:, 1]]
         _, inliers = cv2.findHomography(a, b, cv2.RANSAC, _HOMOGRAPHY_ERROR_PX, maxIters=500)
-        found.append((0 if inliers is None else len(a) - int(inliers.sum()), pair.rows))
-    return [rows for _, rows in sorted(found, key=lambda item: (-item[0], item[1]))]
+        off = a[inliers.ravel() == 0] if inliers is not None else a[:0]
+        cell = max(1.0, np.ptp(features[i].keypoints, axis=0).max() / _START_CELLS)
+        found.append((len(np.unique((off / cell).astype(int), axis=0)), len(off), pair.rows))
+    return [rows for *_, rows in sorted(found, key=lambda item: (-item[0], -item[1], item[2]))]
 
 
 def _incremental_model(

@@ -66,6 +66,14 @@ def verify_pairs(
     Pairs not near in time are matched by the stronger half of the features only: a quarter of the cost, and weak
     features rarely match across a large change of viewpoint.
     """
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = config.min_inliers
+    options.detect_watermark = False
+    options.ransac.random_seed = config.seed
+    options.ransac.max_error = _MAX_EPIPOLAR_ERROR_PX
+    options.ransac.max_num_trials = 2000  # the matches given are inliers already
 
     def verify(pair: tuple[int, int, bool]) -> VerifiedPair | None:
         i, j, near = pair
@@ -73,41 +81,20 @@ def verify_pairs(
         limit = config.max_features if near else max(512, config.max_features // 2)
         matches = match(a.descriptors[:limit], b.descriptors[:limit])
         matches = _epipolar_inliers(a.keypoints, b.keypoints, matches, config.min_inliers)
-        return verify_matches((i, j), a, b, matches, camera, config)
+        if len(matches) < config.min_inliers:
+            return None
+        first, second = a.keypoints.astype(np.float64), b.keypoints.astype(np.float64)
+        rows = matches.astype(np.uint32)
+        geometry = pycolmap.estimate_two_view_geometry(camera, first, camera, second, rows, options)
+        if len(geometry.inlier_matches) < config.min_inliers:
+            return None
+        return VerifiedPair((i, j), np.asarray(geometry.inlier_matches), geometry)
 
     out = []
     for found in ordered_map(verify, pairs):
         out += [] if found is None else [found]
         progress.advance()
     return out
-
-
-def verify_matches(
-    rows: tuple[int, int],
-    a: Features,
-    b: Features,
-    matches: np.ndarray,
-    camera: ColmapCamera,
-    config: PosesConfig,
-) -> VerifiedPair | None:
-    """Fit a two-view geometry to matches (k, 2) of two frames; None with fewer than `config.min_inliers` inliers."""
-    import pycolmap
-
-    if len(matches) < config.min_inliers:
-        return None
-    options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = config.min_inliers
-    options.detect_watermark = False
-    options.ransac.random_seed = config.seed
-    options.ransac.max_error = _MAX_EPIPOLAR_ERROR_PX
-    options.ransac.max_num_trials = 2000  # most matches are inliers already
-    first, second = a.keypoints.astype(np.float64), b.keypoints.astype(np.float64)
-    geometry = pycolmap.estimate_two_view_geometry(
-        camera, first, camera, second, matches.astype(np.uint32), options
-    )
-    if len(geometry.inlier_matches) < config.min_inliers:
-        return None
-    return VerifiedPair(rows, np.asarray(geometry.inlier_matches), geometry)
 
 
 def _epipolar_inliers(a: np.ndarray, b: np.ndarray, matches: np.ndarray, least: int) -> np.ndarray:
