@@ -24,7 +24,7 @@ from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.phone_camera import PhoneCamera, find_phone_camera
-from reconstruction.poses.refine import refine_model
+from reconstruction.poses.refine import keep_largest_part, refine_model
 from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import cut_to_part, search_zoom
 
@@ -173,9 +173,8 @@ def _with_second_try(
     models = [refine_model(model, config) for model in models]
     models.sort(key=lambda model: -model.num_reg_images())
     first = models[0].num_reg_images() if models else 0
-    other = [
-        refine_model(m, config) for m in mapping.global_models(work_dir / _DATABASE, work_dir, config)[:1]
-    ]
+    of_all_at_once = mapping.global_models(work_dir / _DATABASE, work_dir, config)[:1]
+    other = [keep_largest_part(refine_model(model, config)) for model in of_all_at_once]
     second = other[0].num_reg_images() if other else 0
     better = second > (0 if collapsed else first) and not diagnose.is_collapsed(other[0])
     differs = better and not collapsed and first >= least and not diagnose.agrees_with(other[0], models)

@@ -64,28 +64,30 @@ def filter_points(model: Reconstruction, max_error_px: float, min_track_length: 
 
 
 def drop_weak_frames(model: Reconstruction) -> None:
-    """Deregister frames that observe too few points, and parts that share too few with the largest part.
+    """Deregister frames that observe too few points."""
+    for image_id in sorted(model.reg_image_ids()):
+        if model.image(image_id).num_points3D < _MIN_OBSERVATIONS:
+            model.deregister_frame(model.image(image_id).frame_id)
+
+
+def keep_largest_part(model: Reconstruction) -> Reconstruction:
+    """Deregister parts of a model that share too few points with the largest part, in place; return the model.
 
     The global mapper joins parts of a film over a handful of points, which do not fix how they lie to each other.
     """
-    ids = sorted(model.reg_image_ids())
-    for image_id in ids:
-        if model.image(image_id).num_points3D < _MIN_OBSERVATIONS:
-            model.deregister_frame(model.image(image_id).frame_id)
     ids = sorted(model.reg_image_ids())
     row_of = {image_id: row for row, image_id in enumerate(ids)}
     seen = [
         (row_of[element.image_id], column)
         for column, point_id in enumerate(sorted(model.point3D_ids()))
         for element in model.point3D(point_id).track.elements
-        if element.image_id in row_of
     ]
-    if not seen:
-        return
-    rows, columns = np.unique(np.array(seen), axis=0).T
-    sees = coo_array((np.ones(len(rows), np.int32), (rows, columns)), (len(ids), columns.max() + 1))
-    for row in np.flatnonzero(~largest_linked_part(sees.tocsr())):
-        model.deregister_frame(model.image(ids[row]).frame_id)
+    if seen:
+        rows, columns = np.unique(np.array(seen), axis=0).T
+        sees = coo_array((np.ones(len(rows), np.int32), (rows, columns)), (len(ids), columns.max() + 1))
+        for row in np.flatnonzero(~largest_linked_part(sees.tocsr())):
+            model.deregister_frame(model.image(ids[row]).frame_id)
+    return model
 
 
 def largest_linked_part(sees: csr_array) -> np.ndarray:
