@@ -1,6 +1,5 @@
 """Detect inputs that structure from motion cannot reconstruct, and say why and what to film instead."""
 
-import cv2
 import numpy as np
 
 from reconstruction.core.types import FrameSet
@@ -8,21 +7,18 @@ from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.features import Features
 from reconstruction.poses.mapping import poses_of
 from reconstruction.poses.observations import Observations
-from reconstruction.poses.pairs import VerifiedPair
+from reconstruction.poses.pairs import VerifiedPair, fit_homography
 from registry.errors import InputError
-from registry.geometry import transform_points, umeyama
 
 MIN_FRAMES = 8
 _MIN_FEATURES = 60  # in the median frame
 _STILL_SHARE = 0.01  # of the image diagonal; largest image motion of a camera at rest
-_HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
 _ROTATION_EXPLAINED = 0.95  # inlier share of the homography under pure rotation
 _MIN_TRIANGULATION_DEG = 2.0  # median triangulation angle
 _FAR_BELOW_DEG = 1.5  # triangulation angle of points that only tell how a camera turns
 _MOST_DEPTH_RATIO = 200.0  # of the points in one frame: 10 cm to 20 m; a collapsed one has 1e3 and more
 _DEPTH_QUANTILES = (0.1, 0.9)
 _MOST_COLLAPSED_SHARE = 0.1  # of the frames
-_MOST_DISAGREEMENT = 0.1  # of two models' camera centers, relative to how far these are spread
 
 _HOW_TO_FILM = (
     "Film again: walk slowly around the objects for 10-60 s, in good light, seeing all from several places."
@@ -65,7 +61,7 @@ def check_motion(features: list[Features], pairs: list[VerifiedPair], image_size
     far = np.array(moved) > np.median(moved)
     if not far.any():
         far[:] = True
-    # Who walks and then turns has parallax in some pairs, though not in those with the largest motion.
+    # Pairs with the largest motion may all be from a turn, in a film that has parallax elsewhere.
     turned = min(np.quantile(explained[far], 0.1), np.quantile(explained, 0.1)) > _ROTATION_EXPLAINED
     if turned and np.median(modulus[far]) < 0.02:
         raise InputError(
@@ -87,25 +83,6 @@ def is_collapsed(model: Reconstruction) -> bool:
             low, high = np.quantile(np.maximum(depth, 0.0), _DEPTH_QUANTILES)
             collapsed += bool(high > _MOST_DEPTH_RATIO * low)
     return collapsed > _MOST_COLLAPSED_SHARE * len(observations.rows)
-
-
-def agrees_with(model: Reconstruction, parts: list[Reconstruction]) -> bool:
-    """Return whether a model has the cameras of each of the parts, up to a similarity each.
-
-    Two mappers that find the same cameras from the same matches, each in its own way, are hardly both wrong. A part
-    with fewer than `MIN_FRAMES` common frames tells nothing.
-    """
-    poses = poses_of(model)
-    for part in parts:
-        theirs = poses_of(part)
-        common = sorted(set(poses) & set(theirs))
-        if len(common) < MIN_FRAMES:
-            continue
-        a, b = (np.stack([of[row][:3, 3] for row in common]) for of in (poses, theirs))
-        left = transform_points(umeyama(a, b), a) - b
-        if np.sqrt((left**2).sum() / ((b - b.mean(0)) ** 2).sum()) > _MOST_DISAGREEMENT:
-            return False
-    return True
 
 
 def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, min_share: float) -> None:
@@ -182,7 +159,7 @@ def _pair_motion(features: list[Features], pair: VerifiedPair) -> tuple[float, f
     i, j = pair.rows
     a, b = features[i].keypoints[pair.matches[:, 0]], features[j].keypoints[pair.matches[:, 1]]
     moved = float(np.median(np.linalg.norm(a - b, axis=1)))
-    matrix, inliers = cv2.findHomography(a, b, cv2.USAC_DEFAULT, _HOMOGRAPHY_ERROR_PX)
+    matrix, inliers = fit_homography(features, pair)
     if matrix is None:
         return moved, 0.0, np.inf
     matrix = matrix / np.cbrt(np.linalg.det(matrix))

@@ -137,8 +137,7 @@ def _reconstruct(
         models = _map(features, pairs, camera, config, work_dir, progress)
     chosen = len(frames.images)
     parts = label_parts(chosen, pairs)
-    least = int(np.ceil(config.min_registered_share * chosen))
-    models = _with_second_try(models, int((parts == 0).sum()), least, config, work_dir, progress)
+    models = _with_second_try(models, int((parts == 0).sum()), config, work_dir, progress)
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
     for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
         progress.note(note)
@@ -146,22 +145,15 @@ def _reconstruct(
 
 
 def _with_second_try(
-    models: list[Reconstruction],
-    connected: int,
-    least: int,
-    config: PosesConfig,
-    work_dir: Path,
-    progress: Progress,
+    models: list[Reconstruction], connected: int, config: PosesConfig, work_dir: Path, progress: Progress
 ) -> list[Reconstruction]:
     """Refine the models; return that of the global mapper where it does better on what the incremental one did badly.
 
-    It registers more frames, but joins parts of a film also where nothing tells how they lie to each other. So it must
-    confirm the cameras that the incremental mapper found, unless these are too few for a scene.
+    Of both only the largest part whose frames share enough points is compared and returned.
 
     Args:
         models: of the incremental mapper, largest first.
         connected: number of frames in the largest component of the match graph.
-        least: number of frames that a scene needs.
         config: when to try.
         work_dir: folder with the database of the frames.
         progress: receives a note.
@@ -170,20 +162,17 @@ def _with_second_try(
     collapsed = bool(models) and diagnose.is_collapsed(models[0])
     if found >= config.second_try_below_share * connected and not collapsed:
         return [refine_model(models[0], config)]
-    models = [refine_model(model, config) for model in models]
+    models = [keep_largest_part(refine_model(model, config)) for model in models]
     models.sort(key=lambda model: -model.num_reg_images())
     first = models[0].num_reg_images() if models else 0
     of_all_at_once = mapping.global_models(work_dir / _DATABASE, work_dir, config)[:1]
     other = [keep_largest_part(refine_model(model, config)) for model in of_all_at_once]
     second = other[0].num_reg_images() if other else 0
     better = second > (0 if collapsed else first) and not diagnose.is_collapsed(other[0])
-    differs = better and not collapsed and first >= least and not diagnose.agrees_with(other[0], models)
-    better = better and not differs
     of_them = ", a part of them at one point" if collapsed else ""
-    and_others = ", with other cameras" if differs else ""
     progress.note(
         f"poses: of {connected} connected frames the incremental mapper registered {first}{of_them}, the global mapper "
-        f"{second}{and_others}; the {'global' if better else 'incremental'} model is kept"
+        f"{second}; the {'global' if better else 'incremental'} model is kept"
     )
     return other if better else models
 

@@ -14,16 +14,15 @@ from reconstruction.core.progress import Progress
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
-from reconstruction.poses.pairs import VerifiedPair
+from reconstruction.poses.pairs import VerifiedPair, fit_homography
 
 # With more threads, Ceres sums in an order that changes from run to run, and so do the last bits of poses.
 MAPPER_THREADS = 1
 
-# Who turns on the spot with a phone at arm's length moves it by little: its points have small angles, which fix its
-# rotation. At COLMAP's own 1.5 degrees the model ends where the turn begins.
+# Triangulation angle that a point needs. Points with small angles fix the rotation of a camera that hardly moves while
+# it turns; with COLMAP's default of 1.5 degrees the model ends where such a turn begins.
 _MIN_ANGLE_DEG = 0.5
 _START_ANGLE_DEG, _START_INLIERS = 2.0, 50
-_HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
 _START_CELLS = 12  # along the longer image side, in which a pair's matches are counted once
 _MOST_TRIES = 8  # pairs to start from, of all models together
 
@@ -143,15 +142,12 @@ def _best_starts(features: list[Features], pairs: list[VerifiedPair]) -> list[tu
 
     Those of somebody who walks before a wall are many, too, but side by side.
     """
-    import cv2
-
     found = []
     for pair in pairs:
-        i, j = pair.rows
-        a, b = features[i].keypoints[pair.matches[:, 0]], features[j].keypoints[pair.matches[:, 1]]
-        _, inliers = cv2.findHomography(a, b, cv2.RANSAC, _HOMOGRAPHY_ERROR_PX, maxIters=500)
-        off = a[inliers.ravel() == 0] if inliers is not None else a[:0]
-        cell = max(1.0, np.ptp(features[i].keypoints, axis=0).max() / _START_CELLS)
+        keypoints = features[pair.rows[0]].keypoints
+        matrix, inliers = fit_homography(features, pair)
+        off = keypoints[pair.matches[~inliers, 0]] if matrix is not None else keypoints[:0]
+        cell = max(1.0, np.ptp(keypoints, axis=0).max() / _START_CELLS)
         found.append((len(np.unique((off / cell).astype(int), axis=0)), len(off), pair.rows))
     return [rows for *_, rows in sorted(found, key=lambda item: (-item[0], -item[1], item[2]))]
 

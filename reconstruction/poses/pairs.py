@@ -14,6 +14,7 @@ from reconstruction.poses.parallel import ordered_map
 _MIN_OVERLAP_SCORE = 6  # mutual matches; with fewer, full matching finds next to nothing
 _EXHAUSTIVE_BELOW = 40  # frames; up to this many, nearly all pairs are candidates
 _MAX_EPIPOLAR_ERROR_PX = 3.0  # inlier threshold
+_HOMOGRAPHY_ERROR_PX = 3.0  # inlier threshold
 
 
 @dataclass(frozen=True)
@@ -108,3 +109,11 @@ def _epipolar_inliers(a: np.ndarray, b: np.ndarray, matches: np.ndarray, least: 
     except cv2.error:  # degenerate samples only, e.g. all points on one line
         return matches[:0]
     return matches[:0] if matrix is None else matches[inliers.ravel() > 0]
+
+
+def fit_homography(features: list[Features], pair: VerifiedPair) -> tuple[np.ndarray | None, np.ndarray]:
+    """Fit a homography to the matches (k, 2) of a pair; return it (3, 3) or None, and its inliers, bool (k,)."""
+    i, j = pair.rows
+    a, b = features[i].keypoints[pair.matches[:, 0]], features[j].keypoints[pair.matches[:, 1]]
+    matrix, inliers = cv2.findHomography(a, b, cv2.USAC_DEFAULT, _HOMOGRAPHY_ERROR_PX)
+    return matrix, np.zeros(len(a), bool) if matrix is None else inliers.ravel() > 0

@@ -73,7 +73,7 @@ def drop_weak_frames(model: Reconstruction) -> None:
 def keep_largest_part(model: Reconstruction) -> Reconstruction:
     """Deregister parts of a model that share too few points with the largest part, in place; return the model.
 
-    The global mapper joins parts of a film over a handful of points, which do not fix how they lie to each other.
+    A handful of points, over which the global mapper joins parts of a film, does not fix how they lie to each other.
     """
     ids = sorted(model.reg_image_ids())
     row_of = {image_id: row for row, image_id in enumerate(ids)}

@@ -11,7 +11,7 @@ from reconstruction.poses.pairs import VerifiedPair
 SIZE = (640, 480)
 
 
-def pairs_of(focal_px: float, count: int, wrong: float = 0.0, noise: float = 0.0) -> list[VerifiedPair]:
+def pairs_of(focal_px: float, count: int, wrong: float = 0.0) -> list[VerifiedPair]:
     """Return pairs of cameras that walk and turn; a share of them has a fundamental matrix of nothing."""
     rng = np.random.default_rng(int(focal_px))
     k = np.array([[focal_px, 0, SIZE[0] / 2], [0, focal_px, SIZE[1] / 2], [0, 0, 1]])
@@ -24,10 +24,9 @@ def pairs_of(focal_px: float, count: int, wrong: float = 0.0, noise: float = 0.0
         if number < wrong * count:
             u, s, v = np.linalg.svd(rng.normal(size=(3, 3)))
             matrix = u @ np.diag([s[0], s[1], 0]) @ v
-        matrix = matrix / np.linalg.norm(matrix) * (1 + noise * rng.normal(size=(3, 3)))
         geometry = pycolmap.TwoViewGeometry()
         geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED.value
-        geometry.F = matrix
+        geometry.F = matrix / np.linalg.norm(matrix)
         out.append(VerifiedPair((number, number + 1), np.zeros((0, 2), np.uint32), geometry))
     return out
 
