@@ -62,7 +62,7 @@ def estimate_poses(
         features = extract_features(frames.images, config.max_features, config.contrast_threshold, progress)
         diagnose.check_features(features, frames.indices)
         known: dict[int, np.ndarray] = {}
-        metric, voted_focal_px = False, None
+        metric = False
         export = importers.find_export(Path(frames.source.file))
         poses_from = config.import_path or (frames.source.file if export else "")
         if poses_from:
@@ -76,12 +76,10 @@ def estimate_poses(
             always = replace(config, refine_imported="always")
             model, known = use_imported(predicted, frames, features, always, work_dir, progress)
         else:
-            frames, features, model, voted_focal_px = _reconstruct(
-                frames, features, config, work_dir, progress
-            )
+            frames, features, model = _reconstruct(frames, features, config, work_dir, progress)
         phone = PhoneCamera(model)
         if not known and frames.ordered:
-            phone = find_phone_camera(model, frames, config, progress, voted_focal_px)
+            phone = find_phone_camera(model, frames, config, progress)
         registered = sorted(i - 1 for i in phone.model.reg_image_ids())
         held_out = _locate_held_out(frames, features, phone, registered, known, config, progress)
     return replace(_package(frames, phone, registered, held_out), metric=metric)
@@ -115,20 +113,13 @@ def initial_camera(frames: FrameSet, config: PosesConfig) -> ColmapCamera:
 
 def _reconstruct(
     frames: FrameSet, features: list[Features], config: PosesConfig, work_dir: Path, progress: Progress
-) -> tuple[FrameSet, list[Features], Reconstruction, float | None]:
-    """Run structure from motion.
-
-    Returns:
-        The frames with one focal length, their features, the refined model, and the focal length in pixels that the
-        fundamental matrices tell, None where metadata say it.
-    """
+) -> tuple[FrameSet, list[Features], Reconstruction]:
+    """Run structure from motion; return the frames with one focal length, their features, and the refined model."""
     camera = initial_camera(frames, config)
     pairs = consistent_pairs(frames, features, camera, config, progress)
     diagnose.check_motion(features, pairs, (camera.width, camera.height))
-    voted_focal_px = None
     if not camera.has_prior_focal_length:
-        voted_focal_px = estimate_focal_length(pairs, camera.width, camera.height)
-        camera.focal_length = voted_focal_px or camera.focal_length
+        camera.focal_length = estimate_focal_length(pairs, camera.width, camera.height) or camera.focal_length
     with ThreadPoolExecutor(1) as beside:  # the mapper uses one core
         search = beside.submit(search_zoom, frames, features, pairs, camera, config, work_dir)
         models = _map(features, pairs, camera, config, work_dir, progress)
@@ -141,7 +132,7 @@ def _reconstruct(
     diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
     for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
         progress.note(note)
-    return frames, features, models[0], voted_focal_px
+    return frames, features, models[0]
 
 
 def _with_second_try(

@@ -22,8 +22,6 @@ from reconstruction.poses.self_calibration import Calibration, self_calibrate
 # longer side; without a rolling shutter the readout is at most 2 ms.
 _LEAST_SPREAD_PX = 1.0
 _LEAST_READOUT_S = 0.004
-# Where the camera mostly turns, a shutter, a crop and things that move can explain a wrong focal length.
-_MOST_OFF_VOTE = 1.1  # ratio of the focal lengths; votes are within 1.05
 _SURELY_MOVING = 5.0  # influence of a cluster, from which a film is said to have something that moves
 _LEAST_GAIN = 0.01  # of the loss of the points that rest, by leaving out what moves
 
@@ -40,11 +38,7 @@ class PhoneCamera:
 
 
 def find_phone_camera(
-    model: Reconstruction,
-    frames: FrameSet,
-    config: PosesConfig,
-    progress: Progress,
-    voted_focal_px: float | None = None,
+    model: Reconstruction, frames: FrameSet, config: PosesConfig, progress: Progress
 ) -> PhoneCamera:
     """Estimate the moving crop and the rolling shutter of a film, and adjust its model to them.
 
@@ -55,22 +49,13 @@ def find_phone_camera(
         frames: ordered; their times and the direction in which rows are read.
         config: which points are outliers.
         progress: receives notes.
-        voted_focal_px: see `estimate_focal_length`. What leads far away from it is not believed.
 
     Returns:
         The adjusted model; its observed points are where a camera at rest with a fixed crop sees them.
     """
-    given = model
     with threadpool_limits(1, user_api="blas"):  # the number of threads changes the last bits
-        model, bundle, calibration, note = _calibrated(model, frames, config)
+        model, bundle, calibration = _calibrated(model, frames, config, progress)
     found = calibration.unknowns
-    if voted_focal_px is not None:
-        focals_px = np.array([found.params[0], given.cameras[min(given.cameras)].focal_length])
-        found_off, given_off = np.abs(np.log(focals_px / voted_focal_px))
-        if found_off > max(np.log(_MOST_OFF_VOTE), given_off):
-            return PhoneCamera(given)
-    if note:
-        progress.note(note)
     moves = calibration.spread_px >= _LEAST_SPREAD_PX
     readout_s = found.readout_s if found.readout_s >= _LEAST_READOUT_S else 0.0
     if not moves and not readout_s:
@@ -101,14 +86,14 @@ def find_phone_camera(
 
 
 def _calibrated(
-    model: Reconstruction, frames: FrameSet, config: PosesConfig
-) -> tuple[Reconstruction, Bundle, Calibration, str]:
-    """Return the model, without what moves where that fits better, its bundle, what was found of the camera, a note."""
+    model: Reconstruction, frames: FrameSet, config: PosesConfig, progress: Progress
+) -> tuple[Reconstruction, Bundle, Calibration]:
+    """Return the model, without what moves where that fits better, its bundle, and what was found of the camera."""
     first = Bundle(model, frames.times_s, frames.quarter_turns)
     at_first = self_calibrate(first)
     influence = max((c.influence for c in clusters(first, at_first)), default=0.0)
     if influence < MOVING:
-        return model, first, at_first, ""
+        return model, first, at_first
     if (rest := without_moving_things(model, frames, config)) is not None:
         second = Bundle(rest, frames.times_s, frames.quarter_turns)
         at_second = self_calibrate(second)
@@ -116,18 +101,17 @@ def _calibrated(
         both = sorted(before.keys() & after.keys())
         if sum(after[i] for i in both) < (1 - _LEAST_GAIN) * sum(before[i] for i in both):
             lost = model.num_points3D() - rest.num_points3D()
-            note = (
+            progress.note(
                 f"poses: somebody or something moves before the camera; {lost} of {model.num_points3D()} points are "
                 "left out. A film in which all rests is better"
             )
-            return rest, second, at_second, note
-    note = ""
+            return rest, second, at_second
     if influence > _SURELY_MOVING:
-        note = (
+        progress.note(
             "poses: parts of the scene do not agree with each other: something large moves before the camera, and "
             "could not be told from what rests. Cameras may be off; film while nothing moves"
         )
-    return model, first, at_first, note
+    return model, first, at_first
 
 
 def _take_over(found: Unknowns, rows: list[int], model: Reconstruction) -> None:
