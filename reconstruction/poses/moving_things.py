@@ -15,7 +15,7 @@ from reconstruction.core.types import FrameSet
 from reconstruction.poses.bundle import Bundle, Equations, Linear, Unknowns
 from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
-from reconstruction.poses.refine import bundle_adjust, drop_weak_frames, filter_points
+from reconstruction.poses.refine import bundle_adjust, drop_weak_frames, filter_points, keep_largest_part
 from reconstruction.poses.self_calibration import Calibration, self_calibrate
 
 # Largest influence of a cluster, with moving crop and rolling shutter estimated. It was .5 to 3.5 in 50 films where all
@@ -111,6 +111,7 @@ def without_moving_things(
         bundle_adjust(rest)
         filter_points(rest, config.max_point_error_px, 2)
         drop_weak_frames(rest)
+        keep_largest_part(rest)
         if rest.num_points3D() < (1 - _MOST_SHARE) * model.num_points3D():
             break
     return agreeing

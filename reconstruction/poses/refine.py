@@ -73,7 +73,8 @@ def drop_weak_frames(model: Reconstruction) -> None:
 def keep_largest_part(model: Reconstruction) -> Reconstruction:
     """Deregister parts of a model that share too few points with the largest part, in place; return the model.
 
-    A handful of points, over which the global mapper joins parts of a film, does not fix how they lie to each other.
+    A handful of points does not fix how parts of a film lie to each other. The global mapper joins parts so, and the
+    search for moving things may leave no more between them.
     """
     ids = sorted(model.reg_image_ids())
     row_of = {image_id: row for row, image_id in enumerate(ids)}
