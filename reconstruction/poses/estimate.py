@@ -24,7 +24,7 @@ from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.phone_camera import PhoneCamera, find_phone_camera
-from reconstruction.poses.refine import keep_largest_part, refine_model
+from reconstruction.poses.refine import filter_points, keep_largest_part, refine_model
 from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import cut_to_part, search_zoom
 
@@ -80,6 +80,8 @@ def estimate_poses(
         phone = PhoneCamera(model)
         if not known and frames.ordered:
             phone = find_phone_camera(model, frames, config, progress)
+            filter_points(phone.model, config.max_point_error_px, config.min_track_length)
+            diagnose.check_model(phone.model, len(frames.images), frames.indices, config.min_registered_share)
         registered = sorted(i - 1 for i in phone.model.reg_image_ids())
         held_out = _locate_held_out(frames, features, phone, registered, known, config, progress)
     return replace(_package(frames, phone, registered, held_out), metric=metric)
@@ -177,7 +179,7 @@ def _map(
     database.unlink(missing_ok=True)
     mapping.write_database(database, camera, features, pairs)
     progress.start(len(features), "mapping")
-    return mapping.incremental_models(database, work_dir, features, pairs, config, progress)
+    return mapping.incremental_models(database, work_dir, features, pairs, camera, config, progress)
 
 
 def _locate_held_out(

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from reconstruction.core.progress import Progress
+from reconstruction.poses import first_pair
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
-from reconstruction.poses.pairs import VerifiedPair, fit_homography
+from reconstruction.poses.pairs import VerifiedPair
 
 # With more threads, Ceres sums in an order that changes from run to run, and so do the last bits of poses.
 MAPPER_THREADS = 1
@@ -22,8 +23,6 @@ MAPPER_THREADS = 1
 # Triangulation angle that a point needs. Points with small angles fix the rotation of a camera that hardly moves while
 # it turns; with COLMAP's default of 1.5 degrees the model ends where such a turn begins.
 _MIN_ANGLE_DEG = 0.5
-_START_ANGLE_DEG, _START_INLIERS = 2.0, 50
-_START_CELLS = 12  # along the longer image side, in which a pair's matches are counted once
 _MOST_TRIES = 8  # pairs to start from, of all models together
 
 
@@ -102,27 +101,28 @@ def incremental_models(
     work_dir: Path,
     features: list[Features],
     pairs: list[VerifiedPair],
+    camera: ColmapCamera,
     config: PosesConfig,
     progress: Progress,
 ) -> list[Reconstruction]:
     """Run the incremental mapper; return its models, largest first.
 
-    Each model starts from a pair of frames with many matches that no homography explains: only these tell the relative
-    pose of two cameras without ambiguity. The next one starts among the frames left, if they are more than the
-    largest model has.
+    Each model starts from a pair of frames whose relative pose is sure (`rank_starts`). The next one starts among the
+    frames left, if they are more than the largest model has.
 
     Args:
         database: of these features and pairs.
         work_dir: folder for the models.
         features: of the frames.
         pairs: of the frames, verified.
+        camera: with a first focal length.
         config: seed and number of inliers.
         progress: receives a step for each frame.
     """
     output = work_dir / "incremental"
     output.mkdir(parents=True, exist_ok=True)
-    starts, total = _best_starts(features, pairs), len(features)
-    left, models, done, tries = set(range(total)), [], 0, 0
+    total, models, done, tries = len(features), [], 0, 0
+    left, starts = set(range(total)), first_pair.rank_starts(features, pairs, camera, config.seed)
     while starts and tries < _MOST_TRIES and len(left) > max((m.num_reg_images() for m in models), default=0):
         start, tries = starts[0], tries + 1
         model = _incremental_model(database, work_dir, output, config, start, lambda: progress.advance())
@@ -132,24 +132,10 @@ def incremental_models(
         models.append(model)
         done += model.num_reg_images()
         left -= {i - 1 for i in model.reg_image_ids()}
-        starts = [pair for pair in starts if left.issuperset(pair)]
+        pairs = [pair for pair in pairs if left.issuperset(pair.rows)]
+        starts = first_pair.rank_starts(features, pairs, camera, config.seed)
     progress.advance(max(total - done, 0))
     return _by_size(models)
-
-
-def _best_starts(features: list[Features], pairs: list[VerifiedPair]) -> list[tuple[int, int]]:
-    """Return rows of pairs, those first whose matches that no homography explains are spread over most of the image.
-
-    Those of somebody who walks before a wall are many, too, but side by side.
-    """
-    found = []
-    for pair in pairs:
-        keypoints = features[pair.rows[0]].keypoints
-        matrix, inliers = fit_homography(features, pair)
-        off = keypoints[pair.matches[~inliers, 0]] if matrix is not None else keypoints[:0]
-        cell = max(1.0, np.ptp(keypoints, axis=0).max() / _START_CELLS)
-        found.append((len(np.unique((off / cell).astype(int), axis=0)), len(off), pair.rows))
-    return [rows for *_, rows in sorted(found, key=lambda item: (-item[0], -item[1], item[2]))]
 
 
 def _incremental_model(
@@ -171,8 +157,8 @@ def _incremental_model(
     options.multiple_models = False
     options.min_model_size = 5
     options.init_image_id1, options.init_image_id2 = start[0] + 1, start[1] + 1
-    options.mapper.init_min_num_inliers = _START_INLIERS
-    options.mapper.init_min_tri_angle = _START_ANGLE_DEG
+    options.mapper.init_min_num_inliers = first_pair.MIN_INLIERS
+    options.mapper.init_min_tri_angle = first_pair.MIN_ANGLE_DEG
     options.mapper.filter_min_tri_angle = options.triangulation.min_angle = _MIN_ANGLE_DEG
     # Coarse bundle adjustment while the model grows: `refine_model` follows (measured: same cameras, half the time).
     options.ba_global_frames_ratio = 2.0
