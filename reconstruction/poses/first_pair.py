@@ -37,7 +37,9 @@ def rank_starts(
     off = [_off_homography(features, pair) for pair in pairs]
     most = sorted(range(len(pairs)), key=lambda k: (-off[k], pairs[k].rows))[:_CANDIDATES]
     spread = {pairs[k].rows: _rotation_spread_deg(features, pairs[k], camera, seed) for k in most}
-    return sorted((rows for rows in spread if np.isfinite(spread[rows])), key=lambda rows: (spread[rows], rows))
+    return sorted(
+        (rows for rows in spread if np.isfinite(spread[rows])), key=lambda rows: (spread[rows], rows)
+    )
 
 
 def _off_homography(features: list[Features], pair: VerifiedPair) -> int:

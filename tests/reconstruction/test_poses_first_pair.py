@@ -30,14 +30,16 @@ def pairs_of(kinds: list[str]) -> tuple[list[Features], list[VerifiedPair]]:
         points = scene(kind, rng)
         turn = cv2.Rodrigues(np.array([0.02, 0.08, 0.01]))[0]
         for rotation, shift in ((np.eye(3), np.zeros(3)), (turn, np.array([0.3, 0.02, 0.05]))):
-            walked = [0.2, 0, 0.1] if kind == "wall" and len(features) % 2 else [0, 0, 0]
+            walked = [-0.3, 0, -0.4] if kind == "wall" and len(features) % 2 else [0, 0, 0]
             moved = np.where(np.arange(len(points))[:, None] < 150, points + walked, points)
             pixels = moved @ rotation.T + shift
             pixels = FOCAL * pixels[:, :2] / pixels[:, 2:] + np.array(SIZE) / 2
             pixels += rng.normal(0, 0.7, pixels.shape)
             pixels[::10] += rng.normal(0, 30, (len(pixels[::10]), 2)) * (len(features) % 2)
             none = np.zeros(len(pixels), np.float32)
-            features.append(Features(pixels.astype(np.float32), none, np.zeros((len(pixels), 128), np.float32)))
+            features.append(
+                Features(pixels.astype(np.float32), none, np.zeros((len(pixels), 128), np.float32))
+            )
         same = np.tile(np.arange(len(points), dtype=np.uint32)[:, None], (1, 2))
         pairs.append(VerifiedPair((2 * number, 2 * number + 1), same, pycolmap.TwoViewGeometry()))
     return features, pairs
