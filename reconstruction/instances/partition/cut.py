@@ -9,6 +9,7 @@ from reconstruction.instances.config import InstancesConfig
 from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.mask_cut import mark_attached
+from reconstruction.instances.partition.base_parts import with_parts_of_base
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
 from reconstruction.instances.partition.crop_scores import estimated_iou
 from reconstruction.instances.partition.features import Shapes, Together, View, edge_features, node_features
@@ -57,16 +58,19 @@ def cut_by_partition(
 def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[np.ndarray, np.ndarray]:
     """Return the row in LABELS and the cluster of each vertex, int32 (v,) each.
 
-    Superpoints are partitioned into clusters by a multicut. Merge trees of the "thing" clusters give proposals, of
-    which boosted trees choose the likeliest. Those are scored as keyframes show them, and the disjoint ones with the
-    highest total score are objects. Clusters in none of them become artifacts.
+    Superpoints are partitioned into clusters by a multicut. Merge trees of the "thing" clusters, and of parts of the
+    base, give proposals, of which boosted trees choose the likeliest. Those are scored as keyframes show them, and the
+    disjoint ones with the highest total score are objects. "Thing" clusters in none of them become artifacts, parts of
+    the base stay base.
     """
     scores = models.superpoints.scores(*features(view, graph), graph.pairs)
     label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
-    pieces = cluster_graph(view, graph, scores, label, cluster)
+    area = np.bincount(graph.region, weights=view.mesh.areas, minlength=graph.count)
+    as_thing, parts = with_parts_of_base(graph.pairs, scores.affinity, area, label, cluster)
+    pieces = cluster_graph(view, graph, scores, as_thing, parts)
     odds = models.pairs(pieces.pair_rows())
     proposals = propose(view, pieces, odds)
-    rows = proposal_features(view, graph, scores, label, pieces, odds, proposals)
+    rows = proposal_features(view, graph, scores, as_thing, pieces, odds, proposals)
     by_trees = models.proposals(rows)
     shown, by_crops = models.crops(view, pieces.graph.region, proposals.members, by_trees)
     members, iou = proposals.members[shown], estimated_iou(by_trees[shown], by_crops)
