@@ -15,6 +15,7 @@ from priors.partition_rooms import TRIMMED, Example, cached, digest_of, example,
 from priors.rooms import Sources
 from priors.samples import Room
 from reconstruction.instances.partition.boosting import Boosted
+from reconstruction.instances.partition.base_parts import with_parts_of_base
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
 from reconstruction.instances.partition.features import View
 from reconstruction.instances.partition.graph import Scores, region_graph
@@ -165,6 +166,8 @@ def _clusters(job: tuple[Room, Example, Ensemble, Path]) -> tuple[Scores, np.nda
 def _clustered(view: View, known: Example, model: Ensemble) -> tuple[Scores, np.ndarray, ClusterGraph]:
     scores = model.scores(known.nodes, known.edges, known.pairs)
     label, cluster = partition_with_labels(known.pairs, scores.affinity, scores.label)
+    area = np.bincount(known.region, weights=known.areas, minlength=len(label))
+    label, cluster = with_parts_of_base(known.pairs, scores.affinity, area, label, cluster)
     return scores, label, cluster_graph(view, region_graph(view.mesh), scores, label, cluster)
 
 

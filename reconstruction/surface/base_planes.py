@@ -9,6 +9,7 @@ from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.surface.config import SurfaceConfig
 
 _MAX_WALLS = 8
+_MOST_CAMERAS = 24  # from which surface behind a plane is looked at
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,17 @@ def fit_floor(graph: MeshGraph, config: SurfaceConfig) -> FittedPlane | None:
     return FittedPlane("floor", plane, band, members)
 
 
-def fit_walls(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> list[FittedPlane]:
-    """Find walls: large vertical planes without surface behind them. Vertices in the mask `taken` (v,) are excluded."""
+def fit_walls(
+    graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig, centers: np.ndarray | None = None
+) -> list[FittedPlane]:
+    """Find walls: large vertical planes without surface that is seen past them.
+
+    Args:
+        graph: the surface.
+        taken: bool (v,) vertices that are excluded.
+        config: least sizes.
+        centers: float (k, 3) of the cameras; None: all surface behind a plane counts as seen past it.
+    """
     upright = (np.abs(graph.normals[:, 2]) < 0.35) & ~taken
     candidates: list[tuple[np.ndarray, np.ndarray, float]] = []
     free = upright.copy()
@@ -75,7 +85,9 @@ def fit_walls(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> lis
         candidates.append((plane, inliers, area))
     walls = []
     for plane, inliers, area in candidates:
-        if len(walls) < _MAX_WALLS and _bounds_the_room(graph, plane, inliers, area, candidates, config):
+        if len(walls) < _MAX_WALLS and _bounds_the_room(
+            graph, plane, inliers, area, candidates, config, centers
+        ):
             distance = graph.points @ plane[:3] + plane[3]
             band = _band(distance[inliers], 0.012, 0.035)
             members = ~taken & (distance < band) & (distance > -0.08)
@@ -157,8 +169,10 @@ def _within_extent(graph: MeshGraph, plane: np.ndarray, inliers: np.ndarray) -> 
     return (along > low - 0.15) & (along < high + 0.15)
 
 
-def _bounds_the_room(graph, plane, inliers, area, candidates, config: SurfaceConfig) -> bool:
-    """Tell a wall from the side of furniture by its size, the surface behind it and parallel candidates."""
+def _bounds_the_room(
+    graph, plane, inliers, area, candidates, config: SurfaceConfig, centers: np.ndarray | None
+) -> bool:
+    """Tell a wall from the side of furniture by its size, surface seen past it and parallel candidates."""
     if area < config.min_wall_area_m2:
         return False
     along = _along(graph, plane)
@@ -168,7 +182,8 @@ def _bounds_the_room(graph, plane, inliers, area, candidates, config: SurfaceCon
         return False
     distance = graph.points @ plane[:3] + plane[3]
     behind = (distance < -0.12) & (along > low) & (along < high)
-    if graph.areas[behind].sum() > 0.10 * area:
+    past = 1.0 if centers is None else _seen_past(graph.points[behind], plane, (low, high, top), centers)
+    if (past * graph.areas[behind]).sum() > 0.10 * area:
         return False
     for other, other_inliers, other_area in candidates:
         # With a wall-sized parallel plane up to 1 m behind, this one is a furniture front.
@@ -179,6 +194,35 @@ def _bounds_the_room(graph, plane, inliers, area, candidates, config: SurfaceCon
         if 0.08 < gap < 1.0 or (0.03 < gap <= 0.08 and other_area > area):
             return False
     return True
+
+
+def _seen_past(
+    points: np.ndarray, plane: np.ndarray, outline: tuple[float, float, float], centers: np.ndarray
+) -> np.ndarray | float:
+    """Return the share (n,) of the cameras before a plane that see points behind it over its top or beside its ends.
+
+    What is seen inside of the outline is another room behind a door, a view out of a window, a mirror image or noise:
+    walls have these, too. Over the front of furniture the wall behind is seen.
+
+    Args:
+        points: float (n, 3) behind the plane.
+        plane: float (4,) vertical, its normal into the room.
+        outline: where it starts and ends along the wall, and its top, metres.
+        centers: float (k, 3) of the cameras.
+    """
+    low, high, top = outline
+    before = centers @ plane[:3] + plane[3]
+    centers, before = centers[before > 0], before[before > 0]
+    if not len(centers) or not len(points):
+        return 1.0
+    ways = np.linspace(0, len(centers) - 1, min(len(centers), _MOST_CAMERAS)).astype(int)
+    past = np.zeros(len(points))
+    for center, ahead in zip(centers[ways], before[ways]):
+        share = ahead / (ahead - points @ plane[:3] - plane[3])
+        crossing = center + share[:, None] * (points - center)
+        along = crossing[:, :2] @ np.array([-plane[1], plane[0]])
+        past += (along < low) | (along > high) | (crossing[:, 2] > top)
+    return past / len(ways)
 
 
 def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> FittedPlane | None:
@@ -197,11 +241,14 @@ def fit_ceiling(graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig) -> F
     return FittedPlane("ceiling", np.array([0, 0, -1.0, height]), 0.04, members)
 
 
-def fit_base(graph: MeshGraph, config: SurfaceConfig) -> list[FittedPlane]:
-    """Fit floor, walls and ceiling, those that were seen; a plane does not claim vertices of an earlier one."""
+def fit_base(graph: MeshGraph, config: SurfaceConfig, centers: np.ndarray | None = None) -> list[FittedPlane]:
+    """Fit floor, walls and ceiling, those that were seen; a plane does not claim vertices of an earlier one.
+
+    `centers`: as of `fit_walls`.
+    """
     floor = fit_floor(graph, config)
     planes = [] if floor is None else [floor]
-    planes += fit_walls(graph, base_owner(planes, len(graph.points)) > 0, config)
+    planes += fit_walls(graph, base_owner(planes, len(graph.points)) > 0, config, centers)
     ceiling = fit_ceiling(graph, base_owner(planes, len(graph.points)) > 0, config)
     return planes if ceiling is None else [*planes, ceiling]
 

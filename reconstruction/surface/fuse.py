@@ -147,4 +147,4 @@ def fuse_surface(
     surface = Surface(
         mesh.vertices, mesh.faces, mesh.normals, mesh.colors, mesh.weights, float(voxel_size), space
     )
-    return replace(surface, planes=find_planes(surface, config))
+    return replace(surface, planes=find_planes(surface, config, posed.world_from_camera[:, :3, 3]))

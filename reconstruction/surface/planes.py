@@ -9,15 +9,18 @@ from reconstruction.surface.config import SurfaceConfig
 from reconstruction.surface.support_planes import find_support_planes
 
 
-def find_planes(surface: Surface, config: SurfaceConfig) -> tuple[SurfacePlane, ...]:
+def find_planes(
+    surface: Surface, config: SurfaceConfig, centers: np.ndarray | None = None
+) -> tuple[SurfacePlane, ...]:
     """Detect the observed floor, walls and ceiling, then support planes by ascending height.
 
     Args:
         surface: in world space, floor at z = 0; its field `planes` is ignored.
         config: thresholds.
+        centers: float (k, 3) of the cameras, if known; walls with openings and noise behind them are found by them.
     """
     graph = MeshGraph.from_surface(surface)
-    base = fit_base(graph, config)
+    base = fit_base(graph, config, centers)
     out = [
         SurfacePlane(
             plane.label,
