@@ -14,8 +14,8 @@ from scipy.sparse import csr_matrix
 from priors.partition_rooms import TRIMMED, Example, cached, digest_of, example, room_view, write_arrays
 from priors.rooms import Sources
 from priors.samples import Room
-from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.base_parts import with_parts_of_base
+from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
 from reconstruction.instances.partition.features import View
 from reconstruction.instances.partition.graph import Scores, region_graph
