@@ -93,6 +93,29 @@ def test_no_floor_in_view_gives_no_floor(capture):
     assert {"wall", "support"} <= {plane.label for plane in found}
 
 
+CENTERS = np.array([[x, -1.0, 1.4] for x in (-0.8, -0.3, 0.3, 0.8)])
+
+
+def walls_of(*parts) -> list[float]:
+    """Return how far the walls are from the origin that are found on sheets above a floor."""
+    surface = surface_from(merged(floor_sheet(GRAY), *parts))
+    planes = find_planes(surface, SurfaceConfig(), CENTERS)
+    return sorted(float(p.surface.plane[3]) for p in planes if p.label == "wall")
+
+
+def test_a_wall_stays_one_though_another_room_is_seen_through_its_door():
+    left = sheet((-1.2, 1.2, 0), (0.8, 0, 0), (0, 0, 2.0), GRAY)
+    right = sheet((0.4, 1.2, 0), (0.8, 0, 0), (0, 0, 2.0), GRAY)
+    behind = sheet((-0.4, 2.0, 0), (0.8, 0, 0), (0, 0, 1.6), BLUE)
+    assert walls_of(left, right, behind) == pytest.approx([1.2, 2.0], abs=0.01)
+
+
+def test_a_front_over_which_the_wall_is_seen_is_furniture():
+    front = sheet((-0.8, 0.6, 0), (1.6, 0, 0), (0, 0, 1.0), BROWN)
+    behind = sheet((-0.6, 1.2, 1.0), (1.2, 0, 0), (0, 0, 0.5), GRAY)
+    assert walls_of(front, behind) == pytest.approx([1.2], abs=0.01)
+
+
 def test_no_vertex_is_on_two_planes(surface):
     vertices = np.concatenate([plane.vertices for plane in surface.planes])
     assert len(np.unique(vertices)) == len(vertices)
