@@ -13,11 +13,13 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from reconstruction.core.mesh_graph import MeshGraph
 from reconstruction.core.types import Surface
 from reconstruction.depth.channels import OFFSETS_PX
+from reconstruction.instances.base import base_planes
 from reconstruction.instances.colors import LIGHTNESS_WEIGHT
 from reconstruction.instances.partition.evidence import FrameLook, VertexEvidence, gather, look
 from reconstruction.instances.partition.graph import RegionGraph
 from reconstruction.instances.sightings import Sighting
 from reconstruction.poses.parallel import ordered_map
+from reconstruction.surface.base_planes import behind_base
 
 NODE_FEATURES = (
     "log_area", "length", "width", "thickness", "flatness", "coherence", "normal_z", "height", "height_of_foot",
@@ -148,9 +150,9 @@ def node_features(view: View, graph: RegionGraph, shapes: Shapes, together: Toge
          evidence.facing, np.log1p(evidence.edge), evidence.jump_m, np.log1p(evidence.spread),
          np.log(0.1 + support / usual)], axis=1,
     )  # fmt: skip
-    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    low, high = _box_of_room(view)
     center = shapes.center
-    to_side = np.minimum(center - low, high - center)[:, :2].min(axis=1)
+    to_side = np.maximum(np.minimum(center - low, high - center)[:, :2].min(axis=1), 0.0)
     foot = np.full(graph.count, np.inf)
     np.minimum.at(foot, graph.region, mesh.points[:, 2])
     free = [view.surface.space.lookup(mesh.points + s * _FREE_REACH_M * mesh.normals) == 1 for s in (1, -1)]
@@ -165,6 +167,16 @@ def node_features(view: View, graph: RegionGraph, shapes: Shapes, together: Toge
     parts = [own, planes, views, around, np.log1p(shapes.color_spread)[:, None], together.inside[:, 1:],
              _sheets(mesh, graph, shapes)]  # fmt: skip
     return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def _box_of_room(view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounding box (3,), (3,) of the surface, without what lies behind walls or below the floor.
+
+    Noise, mirror images and views out of windows and doors are there.
+    """
+    inside = ~behind_base(view.mesh, base_planes(view.surface))
+    points = view.mesh.points[inside] if inside.any() else view.mesh.points
+    return points.min(axis=0), points.max(axis=0)
 
 
 def _sheets(mesh: MeshGraph, graph: RegionGraph, shapes: Shapes) -> np.ndarray:
