@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fused_surfaces import box, fused
-from surfaces import frames_of, with_planes
+from surfaces import floor_sheet, frames_of, merged, sheet, surface_from, with_planes
 
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.depth.channels import AFFINITIES, OFFSETS_PX
@@ -158,6 +158,22 @@ def test_the_sheet_of_a_region_is_the_whole_flat_side_that_it_is_a_part_of(toy_r
     )  # of the toy, not of the table
     assert np.median(column["sheet_length"][side]) < 0.2
     assert (column["sheet_log_area"] >= column["log_area"] - 1e-4).all()
+
+
+def test_a_shard_behind_a_wall_moves_no_region_into_the_room():
+    wall = sheet((-1.2, 1.2, 0), (2.4, 0, 0), (0, 0, 1.5), (200, 200, 190))
+    shard = sheet((-0.1, 3.0, 0.4), (0.1, 0, 0), (0, 0, 0.1), (90, 90, 90))
+    distances = []
+    for parts in ((wall,), (wall, shard)):
+        surface = surface_from(merged(floor_sheet((150, 120, 90)), *parts))
+        assert "wall" in {plane.label for plane in surface.planes}
+        posed, depth = frames_of(surface)
+        shell = Shell.of(surface, NO_PROGRESS)
+        view = View.of(shell.graph, surface, sightings(surface, posed, depth))
+        graph = region_graph(view.mesh)
+        on_wall = Shapes.of(view.mesh, graph).center[:, 1] > 1.15
+        distances.append(measured(view)[on_wall, NODE_FEATURES.index("to_side")].max())
+    assert max(distances) < 0.05
 
 
 def test_borders_are_concave_where_things_touch_and_convex_around_them(toy_room):
