@@ -65,7 +65,7 @@ def fit_floor(graph: MeshGraph, config: SurfaceConfig) -> FittedPlane | None:
 def fit_walls(
     graph: MeshGraph, taken: np.ndarray, config: SurfaceConfig, centers: np.ndarray | None = None
 ) -> list[FittedPlane]:
-    """Find walls: large vertical planes without surface that is seen past them.
+    """Find walls: large vertical planes without surface that is seen past them, and not behind a larger wall.
 
     Args:
         graph: the surface.
@@ -83,18 +83,20 @@ def fit_walls(
         plane, inliers, area = found
         free &= ~inliers
         candidates.append((plane, inliers, area))
-    walls = []
+    walls: list[FittedPlane] = []
+    behind = np.zeros(len(graph.points), bool)  # a wall, or on it
     for plane, inliers, area in candidates:
-        if len(walls) < _MAX_WALLS and _bounds_the_room(
-            graph, plane, inliers, area, candidates, config, centers
-        ):
+        if len(walls) == _MAX_WALLS or graph.areas[inliers & behind].sum() > 0.5 * area:
+            continue
+        if _bounds_the_room(graph, plane, inliers, area, candidates, config, centers):
             distance = graph.points @ plane[:3] + plane[3]
             band = _band(distance[inliers], 0.012, 0.035)
-            members = ~taken & (distance < band) & (distance > -0.08)
+            within = _within_extent(graph, plane, inliers)
+            members = ~taken & (distance < band) & (distance > -0.08) & within
             members &= (graph.normals @ plane[:3] > 0.55) | (distance < 0.5 * band)
-            members &= _within_extent(graph, plane, inliers)
             walls.append(FittedPlane("wall", plane, band, members))
             taken = taken | members
+            behind |= (distance < band) & within
     return walls
 
 
