@@ -84,7 +84,7 @@ def fit_walls(
         free &= ~inliers
         candidates.append((plane, inliers, area))
     walls: list[FittedPlane] = []
-    behind = np.zeros(len(graph.points), bool)  # a wall, or on it
+    behind = np.zeros(len(graph.points), bool)  # vertices behind or on the walls found so far
     for plane, inliers, area in candidates:
         if len(walls) == _MAX_WALLS or graph.areas[inliers & behind].sum() > 0.5 * area:
             continue
@@ -203,8 +203,8 @@ def _seen_past(
 ) -> np.ndarray | float:
     """Return the share (n,) of the cameras before a plane that see points behind it over its top or beside its ends.
 
-    What is seen inside of the outline is another room behind a door, a view out of a window, a mirror image or noise:
-    walls have these, too. Over the front of furniture the wall behind is seen.
+    Each line of sight is intersected with the plane. Crossings inside of the outline are not counted: openings of a wall
+    (doors, windows), mirror images and noise have them. The wall behind furniture is seen over the top or beside the ends.
 
     Args:
         points: float (n, 3) behind the plane.
