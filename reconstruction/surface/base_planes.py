@@ -203,8 +203,9 @@ def _seen_past(
 ) -> np.ndarray | float:
     """Return the share (n,) of the cameras before a plane that see points behind it over its top or beside its ends.
 
-    Each line of sight is intersected with the plane. Crossings inside of the outline are not counted: openings of a wall
-    (doors, windows), mirror images and noise have them. The wall behind furniture is seen over the top or beside the ends.
+    Each line of sight is intersected with the plane. Crossings inside of the outline are not counted: openings of a
+    wall (doors, windows), mirror images and noise have them. The wall behind furniture is seen over the top or beside
+    the ends.
 
     Args:
         points: float (n, 3) behind the plane.

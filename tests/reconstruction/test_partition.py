@@ -103,16 +103,14 @@ def test_labels_follow_the_unaries_unless_neighbors_outweigh_them():
 
 
 def test_what_affinities_part_from_a_plane_is_proposed_as_a_thing():
-    wall, picture, thing = LABELS.index("base"), LABELS.index("base"), LABELS.index("thing")
-    label = np.array([wall] * 4 + [picture] * 2 + [thing] * 2, np.int32)
+    base, thing = LABELS.index("base"), LABELS.index("thing")
+    label = np.array([base] * 6 + [thing] * 2, np.int32)  # four of a wall, two of a picture, two of a thing before it
     pairs = np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [5, 6], [6, 7]])
-    affinity = np.array(
-        [3.0, 3.0, 3.0, -2.0, 3.0, 5.0, 3.0]
-    )  # the thing is not parted from the picture before it
+    affinity = np.array([3.0, 3.0, 3.0, -2.0, 3.0, 5.0, 3.0])
     cluster = np.array([0, 0, 0, 0, 0, 0, 1, 1], np.int32)
     area = np.full(8, 0.1)
     out, parts = with_parts_of_base(pairs, affinity, area, label, cluster)
-    np.testing.assert_array_equal(out, [wall] * 4 + [thing] * 4)
+    np.testing.assert_array_equal(out, [base] * 4 + [thing] * 4)
     np.testing.assert_array_equal(parts[4:] == parts[4], [True, True, False, False])
     assert len(np.unique(parts)) == 3
     large, _ = with_parts_of_base(pairs, affinity, 30 * area, label, cluster)
