@@ -104,7 +104,9 @@ def test_labels_follow_the_unaries_unless_neighbors_outweigh_them():
 
 def test_what_affinities_part_from_a_plane_is_proposed_as_a_thing():
     base, thing = LABELS.index("base"), LABELS.index("thing")
-    label = np.array([base] * 6 + [thing] * 2, np.int32)  # four of a wall, two of a picture, two of a thing before it
+    label = np.array(
+        [base] * 6 + [thing] * 2, np.int32
+    )  # four of a wall, two of a picture, two of a thing before it
     pairs = np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [5, 6], [6, 7]])
     affinity = np.array([3.0, 3.0, 3.0, -2.0, 3.0, 5.0, 3.0])
     cluster = np.array([0, 0, 0, 0, 0, 0, 1, 1], np.int32)
