@@ -43,7 +43,10 @@ class PosesConfig:
     """Least share of the keyframes that must be registered; else the input is rejected."""
 
     second_try_below_share: float = 0.9
-    """Below this registered share the global mapper runs too, and the larger model is kept."""
+    """Below this registered share of the connected frames, models from other starts and the global mapper's compete."""
+
+    second_try_below_explained: float = 0.95
+    """Below this share of verified matches that fit the model, they do, too."""
 
     max_point_error_px: float = 2.0
     """Largest mean reprojection error of a sparse point, pixels."""

@@ -14,6 +14,7 @@ MIN_FRAMES = 8
 _MIN_FEATURES = 60  # in the median frame
 _STILL_SHARE = 0.01  # of the image diagonal; largest image motion of a camera at rest
 _ROTATION_EXPLAINED = 0.95  # inlier share of the homography under pure rotation
+_EXPLAINED_PX = 2.0  # error of a match to its epipolar line under which the model explains it
 _MIN_TRIANGULATION_DEG = 2.0  # median triangulation angle
 _FAR_BELOW_DEG = 1.5  # triangulation angle of points that only tell how a camera turns
 _MOST_DEPTH_RATIO = 200.0  # of the points in one frame: 10 cm to 20 m; a collapsed one has 1e3 and more
@@ -99,9 +100,13 @@ def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, 
                 f"({100 * len(registered) / chosen:.0f} %), {least} are needed"
             )
         )
+        part = ""
+        if len(registered) >= MIN_FRAMES:
+            there = describe_frames(np.asarray(indices)[registered])
+            part = f" Frames {there} fit each other: a video of these alone may do."
         raise InputError(
             f"poses: {found}; not registered: frames {describe_frames(missing)}. They are blurred, show too little "
-            f"texture, or share too little with the others. {_HOW_TO_FILM}"
+            f"texture, or share too little with the others.{part} {_HOW_TO_FILM}"
         )
     assert model is not None
     if is_collapsed(model):
@@ -116,6 +121,30 @@ def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, 
             f"poses: the camera hardly moved: points are seen under {angle:.1f} degrees of parallax, "
             f"{_MIN_TRIANGULATION_DEG:.0f} are needed. {_HOW_TO_FILM}"
         )
+
+
+def explained_share(model: Reconstruction, features: list[Features], pairs: list[VerifiedPair]) -> float:
+    """Return the share of the verified matches of registered frames whose Sampson error is at most `_EXPLAINED_PX`.
+
+    A wrong model fits the points that it kept; the matches that it dropped tell.
+    """
+    import pycolmap
+
+    camera, registered = model.cameras[min(model.cameras)], set(model.reg_image_ids())
+    focal, near, total = camera.focal_length, 0, 0
+    for pair in pairs:
+        i, j = (row + 1 for row in pair.rows)
+        if i not in registered or j not in registered:
+            continue
+        a, b = (
+            np.asarray(camera.cam_from_img(features[row].keypoints[own].astype(np.float64)))
+            for row, own in zip(pair.rows, pair.matches.T)
+        )
+        second_from_first = model.image(j).cam_from_world() * model.image(i).cam_from_world().inverse()
+        essential = pycolmap.essential_matrix_from_pose(second_from_first)
+        error_px = focal * np.sqrt(pycolmap.compute_squared_sampson_error(a, b, essential))
+        near, total = near + int((error_px <= _EXPLAINED_PX).sum()), total + len(error_px)
+    return near / max(total, 1)
 
 
 def missing_notes(frames: FrameSet, registered: list[int], parts: np.ndarray) -> list[str]:

@@ -14,6 +14,7 @@ from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.core.types import FrameSet, PosedFrames
 from reconstruction.poses import diagnose, importers, mapping
 from reconstruction.poses.backends import PoseBackend, load_pose_backend
+from reconstruction.poses.best_model import best_model
 from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.components import label_parts
 from reconstruction.poses.config import PosesConfig
@@ -24,7 +25,7 @@ from reconstruction.poses.imported import use_imported
 from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.phone_camera import PhoneCamera, find_phone_camera
-from reconstruction.poses.refine import filter_points, keep_largest_part, refine_model
+from reconstruction.poses.refine import filter_points
 from reconstruction.poses.undistort import undistort
 from reconstruction.poses.zoom import cut_to_part, search_zoom
 
@@ -130,44 +131,13 @@ def _reconstruct(
         models = _map(features, pairs, camera, config, work_dir, progress)
     chosen = len(frames.images)
     parts = label_parts(chosen, pairs)
-    models = _with_second_try(models, int((parts == 0).sum()), config, work_dir, progress)
-    diagnose.check_model(models[0] if models else None, chosen, frames.indices, config.min_registered_share)
-    for note in diagnose.missing_notes(frames, [i - 1 for i in models[0].reg_image_ids()], parts):
+    connected = int((parts == 0).sum())
+    model = best_model(models, features, pairs, camera, connected, config, work_dir / _DATABASE, progress)
+    diagnose.check_model(model, chosen, frames.indices, config.min_registered_share)
+    assert model is not None
+    for note in diagnose.missing_notes(frames, [i - 1 for i in model.reg_image_ids()], parts):
         progress.note(note)
-    return frames, features, models[0]
-
-
-def _with_second_try(
-    models: list[Reconstruction], connected: int, config: PosesConfig, work_dir: Path, progress: Progress
-) -> list[Reconstruction]:
-    """Refine the models; return that of the global mapper where it does better on what the incremental one did badly.
-
-    Of both only the largest part whose frames share enough points is compared and returned.
-
-    Args:
-        models: of the incremental mapper, largest first.
-        connected: number of frames in the largest component of the match graph.
-        config: when to try.
-        work_dir: folder with the database of the frames.
-        progress: receives a note.
-    """
-    found = models[0].num_reg_images() if models else 0
-    collapsed = bool(models) and diagnose.is_collapsed(models[0])
-    if found >= config.second_try_below_share * connected and not collapsed:
-        return [refine_model(models[0], config)]
-    models = [keep_largest_part(refine_model(model, config)) for model in models]
-    models.sort(key=lambda model: -model.num_reg_images())
-    first = models[0].num_reg_images() if models else 0
-    of_all_at_once = mapping.global_models(work_dir / _DATABASE, work_dir, config)[:1]
-    other = [keep_largest_part(refine_model(model, config)) for model in of_all_at_once]
-    second = other[0].num_reg_images() if other else 0
-    better = second > (0 if collapsed else first) and not diagnose.is_collapsed(other[0])
-    of_them = ", a part of them at one point" if collapsed else ""
-    progress.note(
-        f"poses: of {connected} connected frames the incremental mapper registered {first}{of_them}, the global mapper "
-        f"{second}; the {'global' if better else 'incremental'} model is kept"
-    )
-    return other if better else models
+    return frames, features, model
 
 
 def _map(

@@ -10,6 +10,7 @@ from reconstruction.poses.pairs import VerifiedPair, fit_homography
 
 MIN_ANGLE_DEG, MIN_INLIERS = 2.0, 50  # median triangulation angle, and inliers, of a pair that starts a model
 _CANDIDATES = 40  # pairs with most matches off any homography
+_PLACES = 12  # parts of a film that models start in, where the first model is doubtful
 _SAMPLES = 8  # random halves of the matches
 _MAX_ERROR_PX = 1.5  # inlier threshold of an essential matrix
 _CONFIDENCE = 0.999
@@ -36,7 +37,24 @@ def rank_starts(
     """
     off = [_off_homography(features, pair) for pair in pairs]
     most = sorted(range(len(pairs)), key=lambda k: (-off[k], pairs[k].rows))[:_CANDIDATES]
-    spread = {pairs[k].rows: _rotation_spread_deg(features, pairs[k], camera, seed) for k in most}
+    return _by_spread(features, [pairs[k] for k in most], camera, seed)
+
+
+def starts_along_film(
+    features: list[Features], pairs: list[VerifiedPair], camera: ColmapCamera, seed: int
+) -> list[tuple[int, int]]:
+    """Return the surest pair of each twelfth of the frames, by its first frame; see `rank_starts`."""
+    first: dict[int, tuple[int, int]] = {}
+    for rows in _by_spread(features, pairs, camera, seed):
+        first.setdefault(rows[0] * _PLACES // len(features), rows)
+    return [first[place] for place in sorted(first)]
+
+
+def _by_spread(
+    features: list[Features], pairs: list[VerifiedPair], camera: ColmapCamera, seed: int
+) -> list[tuple[int, int]]:
+    """Order the pairs that can start a model by the spread of their relative rotation, least first."""
+    spread = {pair.rows: _rotation_spread_deg(features, pair, camera, seed) for pair in pairs}
     return sorted(
         (rows for rows in spread if np.isfinite(spread[rows])), key=lambda rows: (spread[rows], rows)
     )

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from reconstruction.poses.colmap_types import ColmapCamera, Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
+from reconstruction.poses.parallel import ordered_map
 
 # With more threads, Ceres sums in an order that changes from run to run, and so do the last bits of poses.
 MAPPER_THREADS = 1
@@ -125,7 +127,7 @@ def incremental_models(
     left, starts = set(range(total)), first_pair.rank_starts(features, pairs, camera, config.seed)
     while starts and tries < _MOST_TRIES and len(left) > max((m.num_reg_images() for m in models), default=0):
         start, tries = starts[0], tries + 1
-        model = _incremental_model(database, work_dir, output, config, start, lambda: progress.advance())
+        model = _incremental_model(database, output, config, start, lambda: progress.advance())
         if model is None:
             starts = starts[1:]
             continue
@@ -138,9 +140,30 @@ def incremental_models(
     return _by_size(models)
 
 
+def models_along_film(
+    database: Path,
+    features: list[Features],
+    pairs: list[VerifiedPair],
+    camera: ColmapCamera,
+    config: PosesConfig,
+) -> list[Reconstruction]:
+    """Run the incremental mapper from pairs all along the film, each time among all frames; see `incremental_models`.
+
+    A model that starts from a wrong relative pose may register every frame.
+    """
+    starts = first_pair.starts_along_film(features, pairs, camera, config.seed)
+
+    def model_of(start: tuple[int, int]) -> Reconstruction | None:
+        output = database.parent / f"from_{start[0]}_{start[1]}"
+        output.mkdir(parents=True, exist_ok=True)
+        own = shutil.copy(database, output)  # one that others open at the same time may not open
+        return _incremental_model(Path(own), output, config, start, lambda: None)
+
+    return [model for model in ordered_map(model_of, starts) if model is not None]
+
+
 def _incremental_model(
     database: Path,
-    work_dir: Path,
     output: Path,
     config: PosesConfig,
     start: tuple[int, int],
@@ -175,12 +198,12 @@ def _incremental_model(
 
     callbacks: Any = {"initial_image_pair_callback": first_two, "next_image_callback": one_more}
     models = _by_size(
-        list(pycolmap.incremental_mapping(database, work_dir, output, options, **callbacks).values())
+        list(pycolmap.incremental_mapping(database, database.parent, output, options, **callbacks).values())
     )
     return models[0] if models else None
 
 
-def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[Reconstruction]:
+def global_models(database: Path, config: PosesConfig) -> list[Reconstruction]:
     """Run the global mapper; return its models, largest first."""
     import pycolmap
 
@@ -188,9 +211,9 @@ def global_models(database: Path, work_dir: Path, config: PosesConfig) -> list[R
     options.num_threads = MAPPER_THREADS
     options.random_seed = config.seed
     options.min_num_matches = config.min_inliers
-    output = work_dir / "global"
+    output = database.parent / "global"
     output.mkdir(parents=True, exist_ok=True)
-    return _by_size(list(pycolmap.global_mapping(database, work_dir, output, options).values()))
+    return _by_size(list(pycolmap.global_mapping(database, database.parent, output, options).values()))
 
 
 def _by_size(models: list[Reconstruction]) -> list[Reconstruction]:
