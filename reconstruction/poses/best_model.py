@@ -10,9 +10,9 @@ from reconstruction.poses.features import Features
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.refine import keep_largest_part, refine_model
 
-_DECISIVE = (
-    1.1  # times as many frames or observations; models of a flat scene that differ by less may both be right
-)
+# Models of a flat scene that differ by less may both be right.
+_DECISIVE = 1.1  # times as many frames or observations
+_REFINED = 3  # of the other models, the largest
 
 
 def best_model(
@@ -46,8 +46,9 @@ def best_model(
         first = keep_largest_part(first)
     others = mapping.models_along_film(database, features, pairs, camera, config)
     others += mapping.global_models(database, config)[:1]
-    others = [keep_largest_part(refine_model(model, config)) for model in [*models[1:], *others]]
-    best = _best(first, others)
+    others = sorted([*models[1:], *others], key=_size, reverse=True)
+    largest = [model for model in others if not diagnose.is_collapsed(model)][:_REFINED]
+    best = _best(first, [keep_largest_part(refine_model(model, config)) for model in largest])
     progress.note(
         f"poses: of {connected} connected frames the first model has {_described(first)}, and {explained:.0%} of their "
         f"matches fit it; of {len(others)} others "
