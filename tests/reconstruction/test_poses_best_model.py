@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 from reconstruction.core.progress import NO_PROGRESS
 from reconstruction.poses import PosesConfig, mapping
 from reconstruction.poses.best_model import best_model
-from reconstruction.poses.diagnose import explained_share
+from reconstruction.poses.diagnose import check_model, explained_share
 from reconstruction.poses.features import Features
 from reconstruction.poses.first_pair import starts_along_film
 from reconstruction.poses.pairs import VerifiedPair
+from registry.errors import InputError
 from registry.geometry import umeyama
 
 pytestmark = pytest.mark.stage
@@ -129,3 +130,9 @@ def test_without_any_model_there_is_none(film, tmp_path):
     database = tmp_path / "empty.db"
     mapping.write_database(database, CAMERA, features, [])
     assert best_model([], features, [], CAMERA, FRAMES, PosesConfig(), database, Notes()) is None
+
+
+def test_too_few_frames_are_refused_with_those_that_fit_each_other(film, database):
+    model = first_models(film, database)[0]
+    with pytest.raises(InputError, match=r"14 of 60 frames .* 21 are needed.* Frames 100-126 fit each other"):
+        check_model(model, 60, np.arange(100, 220, 2), 0.35)
