@@ -33,7 +33,7 @@ def best_model(
         connected: number of frames in the largest component of the match graph.
         config: when to try.
         database: of these features and pairs; models are written beside it.
-        progress: receives a note.
+        progress: receives a step for each start, and a note.
     """
     first, explained = None, 0.0
     if models:
@@ -44,7 +44,7 @@ def best_model(
         if enough and not collapsed and explained >= config.second_try_below_explained:
             return first
         first = keep_largest_part(first)
-    others = mapping.models_along_film(database, features, pairs, camera, config)
+    others = mapping.models_along_film(database, features, pairs, camera, config, progress)
     others += mapping.global_models(database, config)[:1]
     others = sorted([*models[1:], *others], key=_size, reverse=True)
     largest = [model for model in others if not diagnose.is_collapsed(model)][:_REFINED]

@@ -146,6 +146,7 @@ def models_along_film(
     pairs: list[VerifiedPair],
     camera: ColmapCamera,
     config: PosesConfig,
+    progress: Progress,
 ) -> list[Reconstruction]:
     """Run the incremental mapper from pairs all along the film, each time among all frames; see `incremental_models`.
 
@@ -159,7 +160,12 @@ def models_along_film(
         own = shutil.copy(database, output)  # one that others open at the same time may not open
         return _incremental_model(Path(own), output, config, start, lambda: None)
 
-    return [model for model in ordered_map(model_of, starts) if model is not None]
+    progress.start(len(starts), "mapping from other starts")
+    models = []
+    for model in ordered_map(model_of, starts):
+        models += [] if model is None else [model]
+        progress.advance()
+    return models
 
 
 def _incremental_model(
