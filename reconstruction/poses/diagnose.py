@@ -126,7 +126,7 @@ def check_model(model: Reconstruction | None, chosen: int, indices: np.ndarray, 
 def explained_share(model: Reconstruction, features: list[Features], pairs: list[VerifiedPair]) -> float:
     """Return the share of the verified matches of registered frames whose Sampson error is at most `_EXPLAINED_PX`.
 
-    A wrong model fits the points that it kept; the matches that it dropped tell.
+    A wrong model fits the points that it kept, but not the matches that it dropped.
     """
     import pycolmap
 

@@ -149,7 +149,7 @@ def _map(
     database.unlink(missing_ok=True)
     mapping.write_database(database, camera, features, pairs)
     progress.start(len(features), "mapping")
-    return mapping.incremental_models(database, work_dir, features, pairs, camera, config, progress)
+    return mapping.incremental_models(database, features, pairs, camera, config, progress)
 
 
 def _locate_held_out(

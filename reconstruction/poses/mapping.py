@@ -99,29 +99,23 @@ def write_database(
 
 
 def incremental_models(
-    database: Path,
-    work_dir: Path,
-    features: list[Features],
-    pairs: list[VerifiedPair],
-    camera: ColmapCamera,
-    config: PosesConfig,
+    database: Path, features: list[Features], pairs: list[VerifiedPair], camera: ColmapCamera, config: PosesConfig,
     progress: Progress,
-) -> list[Reconstruction]:
+) -> list[Reconstruction]:  # fmt: skip
     """Run the incremental mapper; return its models, largest first.
 
     Each model starts from a pair of frames whose relative pose is sure (`rank_starts`). The next one starts among the
     frames left, if they are more than the largest model has.
 
     Args:
-        database: of these features and pairs.
-        work_dir: folder for the models.
+        database: of these features and pairs; models are written beside it.
         features: of the frames.
         pairs: of the frames, verified.
         camera: with a first focal length.
         config: seed and number of inliers.
         progress: receives a step for each frame.
     """
-    output = work_dir / "incremental"
+    output = database.parent / "incremental"
     output.mkdir(parents=True, exist_ok=True)
     total, models, done, tries = len(features), [], 0, 0
     left, starts = set(range(total)), first_pair.rank_starts(features, pairs, camera, config.seed)
@@ -141,16 +135,12 @@ def incremental_models(
 
 
 def models_along_film(
-    database: Path,
-    features: list[Features],
-    pairs: list[VerifiedPair],
-    camera: ColmapCamera,
-    config: PosesConfig,
+    database: Path, features: list[Features], pairs: list[VerifiedPair], camera: ColmapCamera, config: PosesConfig,
     progress: Progress,
-) -> list[Reconstruction]:
-    """Run the incremental mapper from pairs all along the film, each time among all frames; see `incremental_models`.
+) -> list[Reconstruction]:  # fmt: skip
+    """Run the incremental mapper from pairs all along the film, each time among all frames; return one model a start.
 
-    A model that starts from a wrong relative pose may register every frame.
+    Arguments as of `incremental_models`; `progress` receives a step for each start.
     """
     starts = first_pair.starts_along_film(features, pairs, camera, config.seed)
 

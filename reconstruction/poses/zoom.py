@@ -109,7 +109,7 @@ def _longest_part(
     database.unlink(missing_ok=True)
     shown = [features[r] for r in rows]
     mapping.write_database(database, camera, shown, chosen, own_cameras=True)
-    models = mapping.incremental_models(database, folder, shown, chosen, camera, config, NO_PROGRESS)
+    models = mapping.incremental_models(database, shown, chosen, camera, config, NO_PROGRESS)
     if not models or models[0].num_reg_images() < _LEAST_REGISTERED * len(rows):
         return None
     model = models[0]

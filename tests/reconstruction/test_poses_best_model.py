@@ -68,7 +68,7 @@ def error(model: pycolmap.Reconstruction) -> float:
 
 
 def first_models(film, database) -> list[pycolmap.Reconstruction]:
-    return mapping.incremental_models(database, database.parent, *film, CAMERA, PosesConfig(), NO_PROGRESS)
+    return mapping.incremental_models(database, *film, CAMERA, PosesConfig(), NO_PROGRESS)
 
 
 class Notes(list):
