@@ -17,6 +17,7 @@ from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.refine import bundle_adjust, drop_weak_frames, filter_points, keep_largest_part
 from reconstruction.poses.self_calibration import Calibration, self_calibrate
+from registry.geometry import transform_points, umeyama
 
 # Largest influence of a cluster, with moving crop and rolling shutter estimated. It was .5 to 3.5 in 50 films where all
 # rests (kitchen, bench, generated ones), 3.1 to 19 in eight of nine where somebody stays in view, and 1.1 in the ninth,
@@ -45,6 +46,8 @@ class Cluster:
     """How much better an observation of the rest fits without one of these, over what chance gives: about 1 at rest."""
     gain: float  # of the loss of the rest without this cluster
     share: float  # of the observations
+    bend: float
+    """RMSE of the camera centers before against after that Gauss-Newton step, as a share of the extent of the path."""
 
     def points_of(self, model: Reconstruction) -> list[int]:
         """Return the ids of the points of a model that are in this cluster."""
@@ -76,10 +79,14 @@ def clusters(bundle: Bundle, calibration: Calibration) -> list[Cluster]:
                 continue
             less, pull = _system(linear, at, own)
             rest = gradient - pull
-            gain = 0.5 * float(rest @ np.linalg.solve(matrix - less + ridge, rest))
+            step = -np.linalg.solve(matrix - less + ridge, rest)
+            gain = -0.5 * float(rest @ step)
             seen = int(observations[own].sum())
             influence = gain / max(seen * chance, 1e-12)
-            out.append(Cluster(middle, unit, centers, number, influence, gain, seen / len(linear.error)))
+            bend = _bend(at.centers, bundle.stepped(at, step, np.zeros_like(at.points)).centers)
+            out.append(
+                Cluster(middle, unit, centers, number, influence, gain, seen / len(linear.error), bend)
+            )
     return out
 
 
@@ -121,6 +128,13 @@ def _spread(offsets: np.ndarray, unit: float) -> np.ndarray:
     """Return offsets (m, 3) with their lengths as logarithms, so that near and far count alike."""
     length = np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
     return offsets / length * np.log1p(length / unit)
+
+
+def _bend(centers: np.ndarray, moved: np.ndarray) -> float:
+    """Return the RMSE of moved camera centers (n, 3) after alignment by a similarity, over the extent of the path."""
+    off = transform_points(umeyama(moved, centers), moved) - centers
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    return float(np.sqrt((off**2).sum(1).mean())) / max(extent, 1e-12)
 
 
 def _system(linear: Linear, at: Unknowns, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -110,13 +110,16 @@ def test_things_that_move_are_left_out():
     model = synthetic_model()
     bundle_adjust(model)
 
-    def influence() -> float:
+    def largest_influence_and_bend() -> tuple[float, float]:
         bundle = Bundle(model, _TIMES, 0)
-        return max(c.influence for c in clusters(bundle, self_calibrate(bundle, at_rest=True)))
+        found = clusters(bundle, self_calibrate(bundle, at_rest=True))
+        return max(c.influence for c in found), max(c.bend for c in found)
 
-    at_rest = influence()
+    influence, bend = largest_influence_and_bend()
     moving = move_some_points(model)
-    assert influence() > 4 * at_rest
+    influence_now, bend_now = largest_influence_and_bend()
+    assert influence_now > 4 * influence
+    assert bend_now > 4 * bend
     before = model.num_points3D()
     rest = without_moving_things(model, frames, POSES_PRESETS["default"])
     assert rest is not None
