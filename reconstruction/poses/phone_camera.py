@@ -22,9 +22,9 @@ from reconstruction.poses.self_calibration import Calibration, self_calibrate
 # longer side; without a rolling shutter the readout is at most 2 ms.
 _LEAST_SPREAD_PX = 1.0
 _LEAST_READOUT_S = 0.004
-# Influence and bend of a cluster, from which a film is said to have something large that moves. In four films of a room
-# in which somebody stays the largest bend was .25 to .37 %; in a film of a bedroom where all rests, a near rack of
-# clothes has an influence of 6.1 and bends the path by .025 %.
+# Influence and bend of a cluster, from which a film is said to have something large that moves. In four films in
+# which somebody stays the largest bend was .25 to .37 %; in a film of a bedroom where all rests, a rack of clothes near
+# the camera has an influence of 6.1 and bends the path by .025 %.
 _SURELY_MOVING, _SURELY_BENT = 5.0, 0.001
 _LEAST_GAIN = 0.01  # of the loss of the points that rest, by leaving out what moves
 
