@@ -20,8 +20,8 @@ Draw = Callable[[Camera, np.ndarray, int], np.ndarray]
 class Sensor:
     """What a phone does to light.
 
-    The truth of a frame (`film.render_truth`) is that of its pose: the first moment of a blurred exposure, the
-    middle row of a rolling shutter. Other moments and rows differ by the little that the camera moves meanwhile.
+    The truth of a frame (`film.render_truth`) is that of its pose: the middle of a blurred exposure, the middle row of
+    a rolling shutter. Other moments and rows differ by the little that the camera moves meanwhile.
     """
 
     noise: float = 1.6
@@ -108,39 +108,26 @@ def expose(
     draw: Draw, camera: Camera, world_from_camera: np.ndarray, number: int, sensor: Sensor, supersample: int
 ) -> np.ndarray:
     """Draw a frame as the shutter sees it, moving and row by row, without noise."""
-    last = len(world_from_camera) - 1
-    pose, following = world_from_camera[number], world_from_camera[min(number + 1, last)]
     if sensor.rolling_shutter <= 0:
-        return _open_shutter(draw, camera, pose, following, 0.0, sensor, supersample)
+        return _open_shutter(draw, camera, world_from_camera, number, sensor, supersample)
     edges = np.linspace(0, camera.height, _BANDS + 1).astype(int)
     bands = []
     for top, bottom in pairwise(edges):
         lens = replace(camera, height=int(bottom - top), cy=camera.cy - int(top))
         late = sensor.rolling_shutter * ((top + bottom) / 2 / camera.height - 0.5)
-        start, end, share = pose, following, late
-        if late < 0 < number:  # before the first and after the last frame the motion goes on
-            start, end, share = world_from_camera[number - 1], pose, 1 + late
-        elif number == last and last > 0:
-            start, end, share = world_from_camera[last - 1], pose, 1 + late
-        bands.append(_open_shutter(draw, lens, start, end, share, sensor, supersample))
+        bands.append(_open_shutter(draw, lens, world_from_camera, number + late, sensor, supersample))
     return np.concatenate(bands)
 
 
 def _open_shutter(
-    draw: Draw,
-    camera: Camera,
-    start: np.ndarray,
-    end: np.ndarray,
-    share: float,
-    sensor: Sensor,
-    supersample: int,
+    draw: Draw, camera: Camera, path: np.ndarray, time: float, sensor: Sensor, supersample: int
 ) -> np.ndarray:
+    """Draw what is seen while the shutter is open; `time`, in frames, is the middle of the exposure."""
     if sensor.blur_shutter <= 0:
-        pose = start if share == 0.0 else _between(start, end, share)
-        return draw(camera, pose, supersample)
-    shares = share + np.linspace(0, sensor.blur_shutter, sensor.blur_samples)
-    shots = [(_between(start, end, s), *_shot(camera, k, sensor, supersample)) for k, s in enumerate(shares)]
-    pictures = [draw(lens, at, times) for at, lens, times in shots]
+        return draw(camera, _pose_at(path, time), supersample)
+    times = time + sensor.blur_shutter * np.linspace(-0.5, 0.5, sensor.blur_samples)
+    shots = [(_pose_at(path, t), *_shot(camera, k, sensor, supersample)) for k, t in enumerate(times)]
+    pictures = [draw(lens, pose, samples) for pose, lens, samples in shots]
     return np.mean(pictures, axis=0)
 
 
@@ -155,9 +142,14 @@ def _shot(camera: Camera, number: int, sensor: Sensor, supersample: int) -> tupl
     return replace(camera, cx=camera.cx + float(x[number]), cy=camera.cy + float(y[number])), 1
 
 
-def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+def _pose_at(path: np.ndarray, time: float) -> np.ndarray:
+    """Interpolate poses (n, 4, 4) at a time in frames; before the first and after the last the motion goes on."""
     from scipy.spatial.transform import Rotation
 
+    if len(path) == 1 or (time == round(time) and 0 <= time < len(path)):
+        return path[min(round(time), len(path) - 1)]
+    row = int(np.clip(np.floor(time), 0, len(path) - 2))
+    (a, b), share = path[row : row + 2], time - row
     step = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
     out = np.eye(4)
     out[:3, :3] = a[:3, :3] @ Rotation.from_rotvec(share * step).as_matrix()

@@ -20,7 +20,7 @@ from synthetic.walks import WALKS, draw_walk, walk_path
 pytestmark = pytest.mark.stage
 
 _BEFORE = "5c9b9e668df2deaf15d1832482c30f157a71b0c2062229699a36d56389d985bb"
-_BEFORE_BLURRED = "9f9f24897a5a8315342e16af45327b097156457f3273e9d34aa4fdff983969bf"
+_BEFORE_BLURRED = "c23ff82ecb2ad7d751715bce70f56f432ea2849adbe054aedb65c0fdadb2d8d5"
 _DRAWN = ("near", "strafe", "pan", "sit", "handheld_wander")
 
 
@@ -64,6 +64,22 @@ def test_films_are_what_they_were(film_set, camera, poses):
     assert _hash(list(iterate_film(film_set, camera, poses[:2], Sensor(), seed=1))[1]) == _BEFORE
     blurred = Sensor(blur_shutter=0.5, blur_jitter=True)
     assert _hash(next(iter(iterate_film(film_set, camera, poses[:2], blurred, seed=1)))) == _BEFORE_BLURRED
+
+
+def test_a_blurred_frame_is_centered_on_its_pose(film_set, camera, poses):
+    path = np.stack([poses[0]] * 3)
+    path[:, :3, 3] += np.linspace(-0.05, 0.05, 3)[:, None] * poses[0][:3, 0]  # to the right
+    clean = Sensor(noise=0.0, exposure_drift=0.0)
+    films = [clean, replace(clean, blur_shutter=0.6, blur_samples=5)]
+    grays = [
+        np.float32(cv2.cvtColor(list(iterate_film(film_set, camera, path, sensor, seed=1))[1], cv2.COLOR_RGB2GRAY))
+        for sensor in (films[0], films[1])
+    ]
+    beside = np.float32(cv2.cvtColor(next(iter(iterate_film(film_set, camera, path, clean, seed=1))), cv2.COLOR_RGB2GRAY))
+    window = cv2.createHanningWindow(grays[0].shape[::-1], cv2.CV_32F)
+    step = abs(cv2.phaseCorrelate(grays[0], beside, window)[0][0])
+    assert step > 3.0
+    assert abs(cv2.phaseCorrelate(grays[0], grays[1], window)[0][0]) < 0.05 * step
 
 
 def test_quick_pictures_are_nearly_the_same(film_set, camera, poses):
