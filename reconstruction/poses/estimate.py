@@ -22,6 +22,7 @@ from reconstruction.poses.features import Features, extract_features, match
 from reconstruction.poses.focal_length import PLAUSIBLE_FOCAL, estimate_focal_length
 from reconstruction.poses.held_out import candidates_in_time, locate_frames
 from reconstruction.poses.imported import use_imported
+from reconstruction.poses.keypoint_refinement import adjust_to_patches
 from reconstruction.poses.matching import consistent_pairs
 from reconstruction.poses.pairs import VerifiedPair
 from reconstruction.poses.phone_camera import PhoneCamera, find_phone_camera
@@ -137,6 +138,9 @@ def _reconstruct(
     assert model is not None
     for note in diagnose.missing_notes(frames, [i - 1 for i in model.reg_image_ids()], parts):
         progress.note(note)
+    progress.start(1, "aligning patches")
+    model = adjust_to_patches(model, frames.images, config)
+    progress.advance()
     return frames, features, model
 
 

@@ -30,13 +30,13 @@ def locate_frames(
     Args:
         queries: features of the frames to localize.
         candidates: for each query, rows of registered keyframes that probably overlap it, best first.
-        features: features of all keyframes, in the order of the model's 2D points.
+        features: features of all keyframes, in the order of the model's first 2D points.
         model: stays unchanged.
         config: seed and thresholds.
         progress: advanced by one per query.
         offsets: (queries, 2) of the principal points, roughly; None: they do not move.
     """
-    tracked = {row: _tracked_features(model, row) for row in sorted({r for rows in candidates for r in rows})}
+    tracked = {row: _tracked_features(model, row, len(features[row].keypoints)) for row in sorted({r for rows in candidates for r in rows})}
     positions = {i: model.point3D(i).xyz for i in sorted(model.point3D_ids())}
     camera = model.cameras[min(model.cameras)]
 
@@ -70,9 +70,10 @@ def candidates_in_time(times_s: np.ndarray, registered: list[int], query_time_s:
     return [registered[i] for i in np.argsort(gaps, kind="stable")[:_NEIGHBORS]]
 
 
-def _tracked_features(model: Reconstruction, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the feature rows int64 (k,) of a keyframe that have a 3D point, and the point ids (k,)."""
-    found = [(i, p.point3D_id) for i, p in enumerate(model.image(row + 1).points2D) if p.has_point3D()]
+def _tracked_features(model: Reconstruction, row: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which of the `count` features of a keyframe have a 3D point, int64 (k,), and the point ids (k,)."""
+    points = model.image(row + 1).points2D[:count]  # behind these, keypoints without a feature
+    found = [(i, p.point3D_id) for i, p in enumerate(points) if p.has_point3D()]
     return np.array([f[0] for f in found], np.int64), np.array([f[1] for f in found], np.int64)
 
 

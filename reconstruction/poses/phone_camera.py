@@ -10,6 +10,7 @@ from reconstruction.core.types import FrameSet
 from reconstruction.poses.bundle import Bundle, Unknowns
 from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
+from reconstruction.poses.keypoint_refinement import LOSS_SCALE_PX
 from reconstruction.poses.mapping import poses_of
 from reconstruction.poses.moving_things import MOVING, clusters, without_moving_things
 from reconstruction.poses.observations import Observations, project
@@ -67,7 +68,7 @@ def find_phone_camera(
     _take_over(found, bundle.rows, model)
     offsets = _offsets(found, bundle.rows, observations) if moves else None
     _place(observations, frames, offsets, readout_s)
-    bundle_adjust(model)
+    bundle_adjust(model, LOSS_SCALE_PX)
     motion = _place(observations, frames, offsets, readout_s)
     model.update_point_3d_errors()
     if offsets is not None:
