@@ -36,7 +36,10 @@ def locate_frames(
         progress: advanced by one per query.
         offsets: (queries, 2) of the principal points, roughly; None: they do not move.
     """
-    tracked = {row: _tracked_features(model, row, len(features[row].keypoints)) for row in sorted({r for rows in candidates for r in rows})}
+    tracked = {
+        row: _tracked_features(model, row, len(features[row].keypoints))
+        for row in sorted({r for rows in candidates for r in rows})
+    }
     positions = {i: model.point3D(i).xyz for i in sorted(model.point3D_ids())}
     camera = model.cameras[min(model.cameras)]
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
@@ -59,7 +59,9 @@ class _Patches:
 
     def taken(self, rows: np.ndarray) -> "_Patches":
         """Return some of the observations."""
-        return _Patches(self.point[rows], self.frame[rows], self.index[rows], self.pixel[rows], self.depth[rows])
+        return _Patches(
+            self.point[rows], self.frame[rows], self.index[rows], self.pixel[rows], self.depth[rows]
+        )
 
     def joined(self, other: "_Patches") -> "_Patches":
         """Return these and other observations, ordered."""
@@ -69,8 +71,7 @@ class _Patches:
     def references(self) -> np.ndarray:
         """Return the row of each observation's reference, int64 (k,): of the point's keypoints, the median depth's."""
         order = np.lexsort((self.depth, self.index < 0, self.point))
-        starts = np.flatnonzero(np.diff(self.point, prepend=-1))
-        counts = np.diff([*starts, len(self.point)])
+        starts, counts = _groups(self.point)
         keypoints = np.add.reduceat((self.index >= 0).astype(np.int64), starts)
         return np.repeat(order[starts + (keypoints - 1) // 2], counts)
 
@@ -158,7 +159,7 @@ def _unmatched(scene: _Scene, keypoints: _Patches, size: tuple[int, int]) -> _Pa
     """Return unmatched observations that frames of `size` (height, width) should have of the points, some of each."""
     height, width = size
     margin = _MOST_ZOOM * _RADIUS_PX + 2
-    row_of = keypoints.references()[np.flatnonzero(np.diff(keypoints.point, prepend=-1))]
+    row_of = keypoints.references()[_groups(keypoints.point)[0]]
     reference, near = keypoints.frame[row_of], keypoints.depth[row_of]
     ray = _unit(scene.points - scene.world_from_camera[reference, :3, 3])
     matched = np.zeros((len(scene.points), len(scene.rows)), bool)
@@ -176,8 +177,8 @@ def _unmatched(scene: _Scene, keypoints: _Patches, size: tuple[int, int]) -> _Pa
         found.append(_Patches(point, np.full(len(point), frame), none, pixel[point], depth[point]))
     whole = _Patches(*(np.concatenate(values) for values in zip(*(vars(part).values() for part in found))))
     order = np.lexsort((np.random.default_rng(0).random(len(whole.point)), whole.point))
-    starts = np.flatnonzero(np.diff(whole.point[order], prepend=-1))
-    rank = np.arange(len(order)) - np.repeat(starts, np.diff([*starts, len(order)]))
+    starts, counts = _groups(whole.point[order])
+    rank = np.arange(len(order)) - np.repeat(starts, counts)
     return whole.taken(order[rank < _MOST_ADDED])
 
 
@@ -191,7 +192,7 @@ def _aligned(scene: _Scene, patches: _Patches, images: np.ndarray) -> tuple[np.n
     axis = np.exp(-0.5 * (np.arange(-_RADIUS_PX, _RADIUS_PX + 1) / (0.5 * _RADIUS_PX)) ** 2)
     weight = np.outer(axis, axis) / axis.sum() ** 2
     pixel, correlation = patches.pixel.copy(), np.zeros(len(patches.point))
-    starts = np.flatnonzero(np.diff(patches.point, prepend=-1))
+    starts, _ = _groups(patches.point)
     pieces = [*starts[np.linspace(0, len(starts), 33).astype(int)[:-1]], len(patches.point)]
 
     def align(piece: tuple[int, int]) -> None:
@@ -229,7 +230,7 @@ def _warps(scene: _Scene, patches: _Patches, reference: np.ndarray) -> np.ndarra
 def _normals(scene: _Scene) -> np.ndarray:
     """Return the normals (m, 3) of the planes through each point's neighbors; zeros where these lie on none."""
     count = min(_NEIGHBORS, len(scene.points))
-    near = scene.points[cKDTree(scene.points).query(scene.points, count)[1].reshape(-1, count)]
+    near = scene.points[KDTree(scene.points).query(scene.points, count)[1].reshape(-1, count)]
     near = near - near.mean(axis=1, keepdims=True)
     spread, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", near, near))
     flat = spread[:, 0] < _MOST_THICK**2 * spread[:, 1]
@@ -254,15 +255,20 @@ def _with_keypoints(scene: _Scene, patches: _Patches, pixel: np.ndarray, kept: n
             pycolmap.Image(image.name, np.concatenate([places, pixel[new]]), image.camera_id, row + 1),
             image.cam_from_world(),
         )
-    starts = [*np.flatnonzero(np.diff(patches.point, prepend=-1)), len(patches.point)]
-    for point_id, (start, end) in zip(scene.point_ids, pairwise(starts)):
-        rows = start + np.flatnonzero(kept[start:end])
+    for point_id, start, count in zip(scene.point_ids, *_groups(patches.point)):
+        rows = start + np.flatnonzero(kept[start : start + count])
         elements = [pycolmap.TrackElement(scene.rows[patches.frame[k]] + 1, int(index[k])) for k in rows]
         point = old.point3D(point_id)
         out.add_point3D_with_id(
             point_id, pycolmap.Point3D(xyz=point.xyz, color=point.color, track=pycolmap.Track(elements))
         )
     return out
+
+
+def _groups(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first row of each point in sorted numbers (k,), and how many rows it has."""
+    _, starts, counts = np.unique(point, return_index=True, return_counts=True)
+    return starts, counts
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -311,7 +317,7 @@ def _slopes(image, x, y, norm, own, weight, gx, gy):  # pragma: no cover - compi
 
     Zeros: the patch does not fix a place.
     """
-    side, radius = len(weight), len(weight) // 2
+    side = len(weight)
     level, scratch = np.eye(2), np.empty_like(own)
     for axis in range(2):
         g = gx if axis == 0 else gy

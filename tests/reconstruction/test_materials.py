@@ -72,10 +72,14 @@ def test_a_blurred_frame_is_centered_on_its_pose(film_set, camera, poses):
     clean = Sensor(noise=0.0, exposure_drift=0.0)
     films = [clean, replace(clean, blur_shutter=0.6, blur_samples=5)]
     grays = [
-        np.float32(cv2.cvtColor(list(iterate_film(film_set, camera, path, sensor, seed=1))[1], cv2.COLOR_RGB2GRAY))
+        np.float32(
+            cv2.cvtColor(list(iterate_film(film_set, camera, path, sensor, seed=1))[1], cv2.COLOR_RGB2GRAY)
+        )
         for sensor in (films[0], films[1])
     ]
-    beside = np.float32(cv2.cvtColor(next(iter(iterate_film(film_set, camera, path, clean, seed=1))), cv2.COLOR_RGB2GRAY))
+    beside = np.float32(
+        cv2.cvtColor(next(iter(iterate_film(film_set, camera, path, clean, seed=1))), cv2.COLOR_RGB2GRAY)
+    )
     window = cv2.createHanningWindow(grays[0].shape[::-1], cv2.CV_32F)
     step = abs(cv2.phaseCorrelate(grays[0], beside, window)[0][0])
     assert step > 3.0

@@ -26,16 +26,16 @@ def test_parts_joined_by_few_points_are_two():
 
 @pytest.mark.stage
 def test_cameras_of_a_film_that_turns_on_the_spot(tmp_path):
-    """Before the focal length was voted and the first pair chosen, they were 32 cm off (RMSE)."""
+    """Without the alignment of patches they are 1.1 cm off (RMSE)."""
     room = RoomSpec(seed=2, objects=8, walls=4, step_m=0.04, textureless_share=0.3)
     spec = CaptureSpec(
-        room, frames=120, width=320, height=240, path="visit", fov_deg=66, seed=2, motion_blur_s=0.02
+        room, frames=120, width=320, height=240, path="visit", fov_deg=66, seed=3, motion_blur_s=0.02
     )
     scene = stage(spec)
-    film = iterate_film(scene.film_set, scene.camera, scene.world_from_camera, spec.sensor(), seed=2)
+    film = iterate_film(scene.film_set, scene.camera, scene.world_from_camera, spec.sensor(), seed=3)
     write_video(tmp_path / "visit.mp4", film, spec.fps, crf=23)
     frames = load_frames(tmp_path / "visit.mp4", FramesConfig())
     posed = estimate_poses(frames, PosesConfig(), work_dir=tmp_path)
     found = dict(zip(posed.indices.tolist(), posed.world_from_camera))
     assert len(found) >= 0.9 * len(frames.images)
-    assert align(found, dict(enumerate(scene.world_from_camera))).ate_cm < 3
+    assert align(found, dict(enumerate(scene.world_from_camera))).ate_cm < 0.7
