@@ -80,7 +80,7 @@ def scene(request):
 
 
 def _offsets(model, pixels):
-    """Return how far observations are from the truth, less the mean of their point: its place on the surface is free."""
+    """Return how far observations are from the truth; the mean of each point's is free."""
     out = []
     for point_id in sorted(model.point3D_ids()):
         seen = [(e.image_id, e.point2D_idx) for e in model.point3D(point_id).track.elements]
