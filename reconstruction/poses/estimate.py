@@ -84,6 +84,8 @@ def estimate_poses(
             phone = find_phone_camera(model, frames, config, progress)
             filter_points(phone.model, config.max_point_error_px, config.min_track_length)
             diagnose.check_model(phone.model, len(frames.images), frames.indices, config.min_registered_share)
+        elif not known:
+            phone = PhoneCamera(adjust_to_patches(model, frames.images, config))
         registered = sorted(i - 1 for i in phone.model.reg_image_ids())
         held_out = _locate_held_out(frames, features, phone, registered, known, config, progress)
     return replace(_package(frames, phone, registered, held_out), metric=metric)
@@ -138,9 +140,6 @@ def _reconstruct(
     assert model is not None
     for note in diagnose.missing_notes(frames, [i - 1 for i in model.reg_image_ids()], parts):
         progress.note(note)
-    progress.start(1, "aligning patches")
-    model = adjust_to_patches(model, frames.images, config)
-    progress.advance()
     return frames, features, model
 
 

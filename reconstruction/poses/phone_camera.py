@@ -10,7 +10,7 @@ from reconstruction.core.types import FrameSet
 from reconstruction.poses.bundle import Bundle, Unknowns
 from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
-from reconstruction.poses.keypoint_refinement import LOSS_SCALE_PX
+from reconstruction.poses.keypoint_refinement import LOSS_SCALE_PX, adjust_to_patches
 from reconstruction.poses.mapping import poses_of
 from reconstruction.poses.moving_things import MOVING, clusters, without_moving_things
 from reconstruction.poses.observations import Observations, project
@@ -46,7 +46,8 @@ def find_phone_camera(
 ) -> PhoneCamera:
     """Estimate the moving crop and the rolling shutter of a film, and adjust its model to them.
 
-    Where they do not explain the film, what moves before the camera is looked for, and left out of the model.
+    Where they do not explain the film, what moves before the camera is looked for, and left out of the model. Then
+    keypoints are aligned by patches (`keypoint_refinement`), and all is adjusted to them.
 
     Args:
         model: all frames share one camera; may be changed.
@@ -58,12 +59,18 @@ def find_phone_camera(
         The adjusted model; its observed points are where a camera at rest with a fixed crop sees them.
     """
     with threadpool_limits(1, user_api="blas"):  # the number of threads changes the last bits
-        model, bundle, calibration = _calibrated(model, frames, config, progress)
-    found = calibration.unknowns
+        model, calibration = _calibrated(model, frames, config, progress)
     moves = calibration.spread_px >= _LEAST_SPREAD_PX
-    readout_s = found.readout_s if found.readout_s >= _LEAST_READOUT_S else 0.0
-    if not moves and not readout_s:
+    rolls = calibration.unknowns.readout_s >= _LEAST_READOUT_S
+    progress.start(1, "aligning patches")  # only now: patches of what moves would bear each other out
+    model = adjust_to_patches(model, frames.images, config)
+    progress.advance()
+    if not moves and not rolls:
         return PhoneCamera(model)
+    bundle = Bundle(model, frames.times_s, frames.quarter_turns)
+    with threadpool_limits(1, user_api="blas"):
+        found = self_calibrate(bundle).unknowns
+    readout_s = found.readout_s if rolls else 0.0
     observations = Observations(model)
     _take_over(found, bundle.rows, model)
     offsets = _offsets(found, bundle.rows, observations) if moves else None
@@ -91,13 +98,13 @@ def find_phone_camera(
 
 def _calibrated(
     model: Reconstruction, frames: FrameSet, config: PosesConfig, progress: Progress
-) -> tuple[Reconstruction, Bundle, Calibration]:
-    """Return the model, without what moves where that fits better, its bundle, and what was found of the camera."""
+) -> tuple[Reconstruction, Calibration]:
+    """Return the model, without what moves where that fits better, and what was found of the camera."""
     first = Bundle(model, frames.times_s, frames.quarter_turns)
     at_first = self_calibrate(first)
     found = clusters(first, at_first)
     if max((c.influence for c in found), default=0.0) < MOVING:
-        return model, first, at_first
+        return model, at_first
     if (rest := without_moving_things(model, frames, config)) is not None:
         second = Bundle(rest, frames.times_s, frames.quarter_turns)
         at_second = self_calibrate(second)
@@ -109,13 +116,13 @@ def _calibrated(
                 f"poses: somebody or something moves before the camera; {lost} of {model.num_points3D()} points are "
                 "left out. A film in which all rests is better"
             )
-            return rest, second, at_second
+            return rest, at_second
     if any(c.influence > _SURELY_MOVING and c.bend > _SURELY_BENT for c in found):
         progress.note(
             "poses: parts of the scene do not agree with each other: something large moves before the camera, and "
             "could not be told from what rests. Cameras may be off; film while nothing moves"
         )
-    return model, first, at_first
+    return model, at_first
 
 
 def _take_over(found: Unknowns, rows: list[int], model: Reconstruction) -> None:
