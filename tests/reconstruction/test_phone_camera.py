@@ -133,15 +133,15 @@ def test_a_film_at_rest_keeps_its_model():
     model, notes = synthetic_model(), Notes()
     bundle_adjust(model)
     poses = [model.image(row + 1).cam_from_world().matrix() for row in range(_FRAMES)]
-    frames = SimpleNamespace(times_s=_TIMES, quarter_turns=0)
+    camera = model.cameras[1]
+    blank = np.zeros((_FRAMES, camera.height, camera.width, 3), np.uint8)  # no patch aligns
+    frames = SimpleNamespace(images=blank, times_s=_TIMES, quarter_turns=0)
     phone = find_phone_camera(model, frames, POSES_PRESETS["default"], notes)
     assert phone.offsets is None
     assert phone.shutter is None
     assert not notes.notes
-    assert all(
-        np.array_equal(phone.model.image(row + 1).cam_from_world().matrix(), poses[row])
-        for row in range(_FRAMES)
-    )
+    now = [phone.model.image(row + 1).cam_from_world().matrix() for row in range(_FRAMES)]
+    assert np.abs(np.array(now) - poses).max() < 2e-3  # another scale of the loss
 
 
 @pytest.mark.end_to_end
