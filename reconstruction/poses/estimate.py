@@ -88,7 +88,8 @@ def estimate_poses(
             phone = PhoneCamera(adjust_to_patches(model, frames.images, config))
         registered = sorted(i - 1 for i in phone.model.reg_image_ids())
         held_out = _locate_held_out(frames, features, phone, registered, known, config, progress)
-    return replace(_package(frames, phone, registered, held_out), metric=metric)
+    matched = [len(of_frame.keypoints) for of_frame in features]
+    return replace(_package(frames, phone, registered, held_out, matched), metric=metric)
 
 
 def _predict(backend: PoseBackend, frames: FrameSet, progress: Progress) -> importers.ImportedPoses:
@@ -210,8 +211,13 @@ def _package(
     phone: PhoneCamera,
     registered: list[int],
     held_out: list[tuple[int, np.ndarray, np.ndarray]],
+    matched: list[int],
 ) -> PosedFrames:
-    """Undo rolling shutter, moving crop and distortion of the images; collect poses, points and observations."""
+    """Undo rolling shutter, moving crop and distortion of the images; collect poses, points and observations.
+
+    Of each row's keypoints the first `matched` are features. Observations of others, which aligned patches added, are
+    left out: later stages choose frames by what these share, and not every frame was asked.
+    """
     model, offsets, shutter = phone.model, phone.offsets, phone.shutter
     poses = mapping.poses_of(model)
     point_ids = sorted(model.point3D_ids())
@@ -220,7 +226,7 @@ def _package(
         (frame_row[element.image_id], point_row)
         for point_row, point_id in enumerate(point_ids)
         for element in model.point3D(point_id).track.elements
-        if element.image_id in frame_row
+        if element.image_id in frame_row and element.point2D_idx < matched[element.image_id - 1]
     ]
     observations = np.array(sorted(set(observations)), np.int32).reshape(-1, 2)
     points = np.array([model.point3D(i).xyz for i in point_ids], np.float64).reshape(-1, 3)
