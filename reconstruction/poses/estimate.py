@@ -85,7 +85,7 @@ def estimate_poses(
             filter_points(phone.model, config.max_point_error_px, config.min_track_length)
             diagnose.check_model(phone.model, len(frames.images), frames.indices, config.min_registered_share)
         elif not known:
-            phone = PhoneCamera(adjust_to_patches(model, frames.images, config))
+            phone = PhoneCamera(adjust_to_patches(model, frames.images, config, progress))
         registered = sorted(i - 1 for i in phone.model.reg_image_ids())
         held_out = _locate_held_out(frames, features, phone, registered, known, config, progress)
     matched = [len(of_frame.keypoints) for of_frame in features]

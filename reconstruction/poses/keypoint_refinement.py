@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import KDTree
 
+from reconstruction.core.progress import Progress
 from reconstruction.poses.colmap_types import Reconstruction
 from reconstruction.poses.config import PosesConfig
 from reconstruction.poses.mapping import poses_of
@@ -22,6 +23,8 @@ from reconstruction.poses.observations import project
 from reconstruction.poses.parallel import ordered_map
 from reconstruction.poses.refine import bundle_adjust, filter_points
 
+# The scale of the loss and the size of a patch were chosen on six films of visitors (docs/poses.md); the others are not
+# fitted: usual values, tried as they are.
 LOSS_SCALE_PX = 0.3
 """Of the Cauchy loss of an adjustment to refined keypoints."""
 _ITERATIONS = 20  # of that adjustment
@@ -100,16 +103,18 @@ class _Scene:
         """Return the pixels (m, 2) of all points in a frame, NaN behind the camera, and their depth (m,)."""
         m = self.camera_from_world[frame]
         local = self.points @ m[:3, :3].T + m[:3, 3]
-        with np.errstate(invalid="ignore"):
-            pixel = project(self.model.cameras[min(self.model.cameras)], local)
-        return np.where(local[:, 2:] > 0, pixel, np.nan), local[:, 2]
+        return project(self.model.cameras[min(self.model.cameras)], local), local[:, 2]
 
 
-def adjust_to_patches(model: Reconstruction, images: np.ndarray, config: PosesConfig) -> Reconstruction:
+def adjust_to_patches(
+    model: Reconstruction, images: np.ndarray, config: PosesConfig, progress: Progress
+) -> Reconstruction:
     """Refine the keypoints of a model and adjust it to them; arguments and result as of `refine_keypoints`."""
+    progress.start(1, "aligning patches")
     model = refine_keypoints(model, images)
     filter_points(model, config.max_point_error_px, config.min_track_length)
     bundle_adjust(model, LOSS_SCALE_PX, _ITERATIONS)
+    progress.advance()
     return model
 
 

@@ -62,9 +62,8 @@ def find_phone_camera(
         model, calibration = _calibrated(model, frames, config, progress)
     moves = calibration.spread_px >= _LEAST_SPREAD_PX
     rolls = calibration.unknowns.readout_s >= _LEAST_READOUT_S
-    progress.start(1, "aligning patches")  # only now: patches of what moves would bear each other out
-    model = adjust_to_patches(model, frames.images, config)
-    progress.advance()
+    # Only now: patches of what moves would bear each other out.
+    model = adjust_to_patches(model, frames.images, config, progress)
     if not moves and not rolls:
         return PhoneCamera(model)
     bundle = Bundle(model, frames.times_s, frames.quarter_turns)
