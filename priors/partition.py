@@ -347,7 +347,8 @@ def losses(network: Network, room: Example, targets: Targets) -> tuple[torch.Ten
 def export(superpoints: Ensemble, trees: dict[str, Boosted], file: Path) -> None:
     """Write the weights as `reconstruction.instances.partition.model.load_models` reads them, layers as float16.
 
-    The networks of crops are those that ship; `priors.crops` trains them.
+    The networks of crops and the trees of duplicates are those that ship; `priors.crops` and `priors.duplicates` train
+    them, in this order.
     """
     load_models.cache_clear()
     arrays = {
@@ -357,8 +358,8 @@ def export(superpoints: Ensemble, trees: dict[str, Boosted], file: Path) -> None
     }
     for kind, boosted in trees.items():
         arrays |= {f"{kind}.{name}": value for name, value in boosted.arrays().items()}
-    crops = {name: value for name, value in load_file(WEIGHTS).items() if name.startswith("crops.")}
-    save_file({name: torch.from_numpy(value.copy()) for name, value in arrays.items()} | crops, file)
+    others = {k: v for k, v in load_file(WEIGHTS).items() if k.startswith(("crops.", "duplicates."))}
+    save_file({name: torch.from_numpy(value.copy()) for name, value in arrays.items()} | others, file)
 
 
 if __name__ == "__main__":

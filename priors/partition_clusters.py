@@ -22,7 +22,7 @@ from reconstruction.instances.partition.graph import Scores, region_graph
 from reconstruction.instances.partition.model import Ensemble, load_models
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposal_features import proposal_features
-from reconstruction.instances.partition.proposals import propose
+from reconstruction.instances.partition.proposals import Proposals, propose
 from reconstruction.measure.matching import box_iou
 
 _PURE = 0.6  # of a cluster's known surface must be of one entity
@@ -65,13 +65,21 @@ class Clusters:
 class RoomProposals:
     """One room's proposals and how well they are true things."""
 
-    members: csr_matrix  # (m, n)
+    proposals: Proposals
     rows: np.ndarray  # float32 (m, F)
     best_iou: (
         np.ndarray
     )  # float (m,) mean IoU of surface and of boxes with the true thing that each is most like
+    best_thing: np.ndarray  # int (m,) that thing
+    links: np.ndarray  # int (e, 2) pairs of clusters
+    odds: np.ndarray  # float32 (e,) log-odds that both are of one thing
     region: np.ndarray  # int (v,) cluster of each vertex
     example: Example
+
+    @property
+    def members(self) -> csr_matrix:
+        """Return the clusters (m, n) of each proposal."""
+        return self.proposals.members
 
 
 def examples_of(rooms: Sequence[Room], cache: Path, sources: Sources, processes: int) -> list[Example]:
@@ -110,8 +118,7 @@ def proposals_of(
     found: Sequence[Clusters], trees: Sequence[Boosted], cache: Path, processes: int
 ) -> list[RoomProposals]:
     """Return the proposals of each room by trees for pairs that were not fitted to it."""
-    rows = in_processes(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
-    return [RoomProposals(*values, c.pieces.graph.region, c.example) for values, c in zip(rows, found)]
+    return in_processes(_proposals, [(*job, cache) for job in zip(found, trees, strict=True)], processes)
 
 
 def shipped_proposals(
@@ -129,15 +136,16 @@ def _shipped_proposals_of(job: tuple[Room, Path, Path | None]) -> RoomProposals:
     if not file.is_file():
         view = room_view(room, cache)
         found = Clusters(room, known, *_clustered(view, known, models.superpoints))
-        members, rows, best = _proposed(view, found, models.pairs)
+        made = _proposed(view, found, models.pairs)
+        kept = {name: value for name, value in vars(made).items() if isinstance(value, np.ndarray)}
+        members, low, high = made.members, made.proposals.low, made.proposals.high
         parts = {"indices": members.indices, "indptr": members.indptr, "count": np.array(members.shape[1])}
-        write_arrays(file, rows=rows, best_iou=best, region=found.pieces.graph.region, **parts)
+        write_arrays(file, **kept, **parts, low=low, high=high)
     with np.load(file) as stored:
-        shape = len(stored["indptr"]) - 1, int(stored["count"])
-        members = csr_matrix(
-            (np.ones(len(stored["indices"])), stored["indices"], stored["indptr"]), shape=shape
-        )
-        return RoomProposals(members, stored["rows"], stored["best_iou"], stored["region"], known)
+        arrays = dict(stored)
+    indices, indptr, count = (arrays.pop(name) for name in ("indices", "indptr", "count"))
+    members = csr_matrix((np.ones(len(indices)), indices, indptr), shape=(len(indptr) - 1, int(count)))
+    return RoomProposals(Proposals(members, arrays.pop("low"), arrays.pop("high")), **arrays, example=known)
 
 
 def in_processes(work: Callable[[J], T], jobs: list[J], processes: int) -> list[T]:
@@ -171,13 +179,13 @@ def _clustered(view: View, known: Example, model: Ensemble) -> tuple[Scores, np.
     return scores, label, cluster_graph(view, region_graph(view.mesh), scores, label, cluster)
 
 
-def _proposals(job: tuple[Clusters, Boosted, Path]) -> tuple[csr_matrix, np.ndarray, np.ndarray]:
+def _proposals(job: tuple[Clusters, Boosted, Path]) -> RoomProposals:
     found, trees, cache = job
     return _proposed(room_view(found.room, cache), found, trees)
 
 
-def _proposed(view: View, found: Clusters, trees: Boosted) -> tuple[csr_matrix, np.ndarray, np.ndarray]:
-    """Return the members (m, n), features (m, F) and true IoUs (m,) of a room's proposals."""
+def _proposed(view: View, found: Clusters, trees: Boosted) -> RoomProposals:
+    """Return a room's proposals by trees for pairs."""
     odds = trees(found.pieces.pair_rows())
     proposals = propose(view, found.pieces, odds)
     rows = proposal_features(
@@ -188,8 +196,11 @@ def _proposed(view: View, found: Clusters, trees: Boosted) -> tuple[csr_matrix, 
     iou = inside / np.maximum(inside.sum(axis=1)[:, None] + whole - inside, _TINY)
     boxes = _boxes(view.mesh.points, found.pieces.graph.region, proposals.members)
     iou = 0.5 * (iou + np.nan_to_num(box_iou(boxes, e.boxes)))
-    best = iou[:, int(e.base_entities) + 1 :].max(axis=1, initial=0.0)
-    return proposals.members, rows, best
+    of_things = iou[:, int(e.base_entities) + 1 :]
+    best = of_things.max(axis=1, initial=0.0)
+    thing = of_things.argmax(axis=1) if of_things.size else np.zeros(len(best), np.int64)
+    graph = found.pieces.graph
+    return RoomProposals(proposals, rows, best, thing, graph.pairs, odds, graph.region, e)
 
 
 def _boxes(points: np.ndarray, region: np.ndarray, members: csr_matrix) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Figures of the learned cut on whole rooms."""
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.stats import rankdata
 
 from priors.partition_clusters import RoomProposals
@@ -8,11 +9,11 @@ from priors.partition_rooms import Example
 from priors.partition_ruler import NOTHING, compare
 from priors.partition_targets import Targets
 from reconstruction.instances import InstancesConfig
+from reconstruction.instances.partition.choice import best_disjoint, likeliest_things
 from reconstruction.instances.partition.cut import clusters_of_things
 from reconstruction.instances.partition.graph import LABELS, Scores
 from reconstruction.instances.partition.model import Ensemble
 from reconstruction.instances.partition.multicut import partition_with_labels
-from reconstruction.instances.partition.proposals import best_disjoint, likeliest_things
 
 _HITS = (0.25, 0.5)
 
@@ -37,11 +38,20 @@ def partitioned(room: Example, scores: Scores) -> np.ndarray:
     return number[cluster]
 
 
-def proposal_figures(rooms: list[RoomProposals], said: list[np.ndarray]) -> dict[str, float]:
-    """Return figures of the things chosen from proposals by their estimated IoU, and of the best choice there is."""
+def proposal_figures(
+    rooms: list[RoomProposals], said: list[np.ndarray], twice: list[csr_array] | None = None
+) -> dict[str, float]:
+    """Return figures of the things chosen from proposals by their estimated IoU, and of the best choice there is.
+
+    Args:
+        rooms: proposals with truth.
+        said: float (m,) estimated IoU of each room's proposals.
+        twice: float (m, m) what pairs of them count twice; None: nothing.
+    """
+    costs = twice or [None] * len(rooms)
     out = things_figures(
         [r.example for r in rooms],
-        [chosen(r, likeliest_things(r.members, iou)) for r, iou in zip(rooms, said)],
+        [chosen(r, likeliest_things(r.members, iou, cost)) for r, iou, cost in zip(rooms, said, costs)],
     )
     best = things_figures(
         [r.example for r in rooms], [chosen(r, best_disjoint(r.members, _worth(r.best_iou))) for r in rooms]

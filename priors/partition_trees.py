@@ -22,6 +22,10 @@ PROPOSALS = _COMMON | {
     "objective": "cross_entropy", "learning_rate": 0.04, "min_data_in_leaf": 60, "feature_fraction": 0.4,
     "bagging_fraction": 0.6, "lambda_l2": 225.0,
 }  # fmt: skip
+DUPLICATES = _COMMON | {
+    "objective": "cross_entropy", "learning_rate": 0.05, "min_data_in_leaf": 200, "feature_fraction": 0.5,
+    "bagging_fraction": 0.6, "lambda_l2": 50.0,
+}  # fmt: skip
 _LEAVES_OF_FEW_ROWS = 20  # at the most, where there are too few rows for leaves of the usual size
 
 

@@ -6,8 +6,9 @@ import lightgbm
 import numpy as np
 import pytest
 import torch
+from scipy.special import expit
 
-from priors import crops, partition
+from priors import crops, duplicates, partition
 from priors.partition_figures import area_under_curve, by_truth
 from priors.partition_network import Network
 from priors.partition_rooms import NEEDED, example, film_of
@@ -200,3 +201,20 @@ def test_heads_learn_from_crops_and_are_written_beside_what_ships(data, tmp_path
     assert len(models.crops.heads) == 1
     np.testing.assert_array_equal(models.proposals.value, shipped.proposals.value)
     assert {"shapes, things", "train, things"} <= set(json.loads((tmp_path / "figures.json").read_text()))
+
+
+def test_trees_of_duplicates_learn_and_are_written_beside_what_ships(data, tmp_path):
+    arguments = [str(data), "--out", str(tmp_path), "--cache", str(data / "cache"), "--rounds", "60"]
+    assert duplicates.main(arguments) == 0
+    models, shipped = load_models(tmp_path / "partition.safetensors"), load_models()
+    assert len(models.duplicates.first_leaf) == duplicates._SEEDS * 60
+    np.testing.assert_array_equal(models.proposals.value, shipped.proposals.value)
+    assert set(models.crops.weights) == set(shipped.crops.weights)
+    assert {"train, alone", "shapes, counted once"} <= set(
+        json.loads((tmp_path / "figures.json").read_text())
+    )
+    rooms = open_rooms(data / "train", NEEDED)
+    found = duplicates.shipped_proposals(rooms, data / "cache", None, 1)
+    for room in duplicates.pairs_of(rooms, found, data / "cache", 1):
+        said, true = expit(models.duplicates(room.pairs.rows)), room.truth()
+        assert ((said - true) ** 2).mean() < 0.95 * true.var()

@@ -6,13 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array, csr_array
 from test_partition_clusters import BASE, LEFT, RIGHT, THING, boards, pieces_of  # noqa: F401
 
 from reconstruction.instances.partition import proposals as trees
+from reconstruction.instances.partition.choice import (
+    best_choice,
+    best_disjoint,
+    disjoint_by_gain,
+    likeliest_things,
+)
 from reconstruction.instances.partition.cut import labels_of, things_of
+from reconstruction.instances.partition.duplicates import DUPLICATE_FEATURES, proposal_pairs
 from reconstruction.instances.partition.graph import LABELS, Scores
+from reconstruction.instances.partition.model import load_models
 from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES, proposal_features
-from reconstruction.instances.partition.proposals import best_disjoint, likeliest_things, members_of, propose
+from reconstruction.instances.partition.proposals import members_of, propose
 
 pytestmark = pytest.mark.stage
 
@@ -37,7 +46,7 @@ def test_the_choice_is_as_good_as_trying_all():
 def test_without_time_the_best_are_taken_one_by_one():
     regions = [[0], [1], [0, 1], [2]]
     gain = np.array([0.5, 0.1, 0.4, 0.2])
-    chosen = trees.disjoint_by_gain(members_of(regions, 3), gain, np.arange(4))
+    chosen = disjoint_by_gain(members_of(regions, 3), gain, np.arange(4))
     np.testing.assert_array_equal(chosen, [0, 1, 3])
     assert len(best_disjoint(members_of(regions, 3), -gain)) == 0
 
@@ -61,6 +70,79 @@ def test_the_choice_of_things_agrees_with_its_own_mean():
         assert (iou[chosen] > half - 1e-9).all()
         again = best_disjoint(members, iou - half)
         assert (iou[again] - half).sum() == pytest.approx((iou[chosen] - half).sum())
+
+
+def test_pieces_of_one_thing_do_not_outvote_it():
+    members, iou = members_of([[0], [1], [0, 1], [2]], 3), np.array([0.55, 0.45, 0.7, 0.8])
+    np.testing.assert_array_equal(likeliest_things(members, iou), [0, 1, 3])
+    twice = coo_array(([0.4, 0.4], ([0, 1], [1, 0])), (4, 4)).tocsr()
+    np.testing.assert_array_equal(likeliest_things(members, iou, twice), [2, 3])
+    np.testing.assert_array_equal(
+        likeliest_things(members[[0, 1, 3]], iou[[0, 1, 3]], twice[:3][:, :3]), [0, 2]
+    )
+
+
+def total(rows, gain, twice):
+    rows = list(rows)
+    return gain[rows].sum() - 0.5 * twice[np.ix_(rows, rows)].sum()
+
+
+def test_no_exchange_betters_the_choice_and_few_choices_do():
+    rng, shortfall = np.random.default_rng(2), []
+    for _ in range(40):
+        regions = [sorted(rng.choice(8, rng.integers(1, 4), replace=False).tolist()) for _ in range(11)]
+        gain, twice = rng.beta(1, 2, 11) - 0.1, np.triu(rng.beta(0.3, 2, (11, 11)), 1)
+        twice = twice + twice.T
+        members = members_of(regions, 8)
+        chosen = set(best_choice(members, gain, csr_array(twice)).tolist())
+        overlap = (members @ members.T).toarray() > 0
+        every = [
+            rows for size in range(9) for rows in itertools.combinations(range(11), size)
+            if not np.triu(overlap[np.ix_(rows, rows)], 1).any()
+        ]  # fmt: skip
+        assert tuple(sorted(chosen)) in every
+        found = total(chosen, gain, twice)
+        for new in range(11):
+            kept = {k for k in chosen if not overlap[new, k]}
+            assert total(kept | {new}, gain, twice) < found + 1e-9
+            assert total(chosen - {new}, gain, twice) < found + 1e-9
+        shortfall.append(max(total(rows, gain, twice) for rows in every) - found)
+    assert np.mean(np.array(shortfall) < 1e-9) > 0.8
+    assert max(shortfall) < 0.2
+
+
+def test_pairs_of_proposals_are_disjoint_and_linked_and_the_larger_one_comes_first():
+    low = np.array([[0, 0, 0], [0, 0, 1], [5, 0, 0], [0, 0, 0], [0, 0, 0]], float)
+    high = np.array([[1, 1, 0.9], [1, 1, 1.1], [6, 1, 1], [1, 1, 1.1], [1, 1, 1]], float)
+    members = members_of([[0], [1], [2], [0, 1], [3]], 4)
+    iou, area = np.array([0.5, 0.4, 0.6, 0.7, 0.05]), np.array([2.0, 3.0, 1.0, 4.0])
+    links, odds = np.array([[0, 1], [0, 3]]), np.array([1.5, 4.0])
+    pairs = proposal_pairs(trees.Proposals(members, low, high), iou, area, links, odds)
+    # not those that share a cluster, have no link, or are nothing by themselves
+    assert list(zip(pairs.first, pairs.second)) == [(1, 0)]
+    said = dict(zip(DUPLICATE_FEATURES, pairs.rows[0].tolist()))
+    wanted = {
+        "iou": 0.4,
+        "other_iou": 0.5,
+        "area_ratio": 2 / 3,
+        "links": 1,
+        "odds_mean": 1.5,
+        "odds_by_area": 1.5,
+    }
+    wanted |= {
+        "gap": 0.1,
+        "gap_up": 0.1,
+        "plan_overlap": 1,
+        "height_overlap": 0,
+        "foot_step": -1,
+        "top_step": -0.2,
+    }
+    assert {name: said[name] for name in wanted} == pytest.approx(wanted, abs=1e-6)
+    twice = pairs.counted_twice(load_models().duplicates).toarray()
+    assert twice.shape == (5, 5)
+    assert (twice == twice.T).all()
+    assert 0 < twice[0, 1] < 1
+    assert (twice > 0).sum() == 2
 
 
 def test_a_merge_tree_joins_what_belongs_together_first():

@@ -10,14 +10,16 @@ from reconstruction.instances.contacts import carriers
 from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.mask_cut import mark_attached
 from reconstruction.instances.partition.base_parts import with_parts_of_base
+from reconstruction.instances.partition.choice import likeliest_things
 from reconstruction.instances.partition.clusters import ClusterGraph, cluster_graph
-from reconstruction.instances.partition.crop_scores import estimated_iou
+from reconstruction.instances.partition.crop_scores import cluster_areas, estimated_iou
+from reconstruction.instances.partition.duplicates import proposal_pairs
 from reconstruction.instances.partition.features import Shapes, Together, View, edge_features, node_features
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, region_graph
 from reconstruction.instances.partition.model import Models, load_models
 from reconstruction.instances.partition.multicut import partition_with_labels
 from reconstruction.instances.partition.proposal_features import proposal_features
-from reconstruction.instances.partition.proposals import likeliest_things, propose
+from reconstruction.instances.partition.proposals import propose
 from reconstruction.instances.sightings import Sighting
 
 _THING, _BASE = LABELS.index("thing"), LABELS.index("base")
@@ -60,8 +62,8 @@ def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[n
 
     Superpoints are partitioned into clusters by a multicut. Merge trees of the "thing" clusters, and of parts of the
     base, give proposals, of which boosted trees choose the likeliest. Those are scored as keyframes show them, and the
-    disjoint ones with the highest total score are objects. "Thing" clusters in none of them become artifacts, parts of
-    the base stay base.
+    disjoint ones with the highest total score, less what pairs of them count twice, are objects. "Thing" clusters in
+    none of them become artifacts, parts of the base stay base.
     """
     scores = models.superpoints.scores(*features(view, graph), graph.pairs)
     label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
@@ -73,8 +75,10 @@ def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[n
     rows = proposal_features(view, graph, scores, as_thing, pieces, odds, proposals)
     by_trees = models.proposals(rows)
     shown, by_crops = models.crops(view, pieces.graph.region, proposals.members, by_trees)
-    members, iou = proposals.members[shown], estimated_iou(by_trees[shown], by_crops)
-    thing = things_of(members[likeliest_things(members, iou)], pieces)
+    likely, iou = proposals.taken(shown), estimated_iou(by_trees[shown], by_crops)
+    areas = cluster_areas(view.mesh.areas, pieces.graph.region, likely.members)
+    twice = proposal_pairs(likely, iou, areas, pieces.graph.pairs, odds).counted_twice(models.duplicates)
+    thing = things_of(likely.members[likeliest_things(likely.members, iou, twice)], pieces)
     return labels_of(thing, label[graph.region], cluster[graph.region])
 
 

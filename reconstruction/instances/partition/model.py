@@ -14,6 +14,7 @@ import numpy as np
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.clusters import CLUSTER_FEATURES, PAIR_FEATURES
 from reconstruction.instances.partition.crop_scores import CropScorer
+from reconstruction.instances.partition.duplicates import DUPLICATE_FEATURES
 from reconstruction.instances.partition.features import EDGE_FEATURES, NODE_FEATURES
 from reconstruction.instances.partition.graph import Scores
 from reconstruction.instances.partition.proposal_features import PROPOSAL_FEATURES
@@ -21,7 +22,10 @@ from registry.errors import EnvironmentMissing
 
 WEIGHTS = Path(__file__).parent / "weights" / "partition.safetensors"
 FEATURES = (len(NODE_FEATURES), len(EDGE_FEATURES))  # of superpoints and of their borders
-TREES = {"pairs": len(PAIR_FEATURES) + 2 * len(CLUSTER_FEATURES), "proposals": len(PROPOSAL_FEATURES)}
+TREES = {
+    "pairs": len(PAIR_FEATURES) + 2 * len(CLUSTER_FEATURES), "proposals": len(PROPOSAL_FEATURES),
+    "duplicates": len(DUPLICATE_FEATURES),
+}  # fmt: skip
 CLIP = 5.0  # standard deviations at which features are clipped
 
 
@@ -116,13 +120,14 @@ class Models:
     pairs: Boosted  # log-odds that two clusters are pieces of one object
     proposals: Boosted  # logit of the estimated IoU of a proposal and its best object
     crops: CropScorer  # the same logit of the likeliest proposals, from keyframes
+    duplicates: Boosted  # logit of the IoU that two proposals of one object count twice
 
 
 @lru_cache(maxsize=2)
 def load_models(weights: Path = WEIGHTS) -> Models:
     """Read the models from a safetensors file.
 
-    Its arrays are `superpoints.<member>.<name>`, `<pairs or proposals>.<array>` and `crops.<name>`.
+    Its arrays are `superpoints.<member>.<name>`, `<pairs, proposals or duplicates>.<array>` and `crops.<name>`.
 
     Raises:
         EnvironmentMissing: the file is missing, or was made for other features.
@@ -150,7 +155,7 @@ def load_models(weights: Path = WEIGHTS) -> Models:
             f"instances: the weights {weights} cannot be read ({error}). Install the package again."
         ) from error
     superpoints = Ensemble(tuple(Model(members[k]) for k in sorted(members)))
-    return Models(superpoints, trees["pairs"], trees["proposals"], crops)
+    return Models(superpoints, trees["pairs"], trees["proposals"], crops, trees["duplicates"])
 
 
 def _under(stored: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

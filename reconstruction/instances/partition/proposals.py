@@ -1,9 +1,8 @@
-"""Object proposals: regions of merge trees of clusters, and the choice of disjoint ones by weighted set packing.
+"""Object proposals: clusters and log-odds of pairs in, regions of merge trees out.
 
 A sum of pairwise scores cannot tell a whole object from a part of it. So regions of many sizes are proposed by
-hierarchical merging, each is scored as a whole, and the disjoint ones with the largest total score are chosen
-(Arbelaez et al., Multiscale combinatorial grouping, CVPR 2014; Endres and Hoiem, Category independent object
-proposals, ECCV 2010).
+hierarchical merging, to be scored as wholes (Arbelaez et al., Multiscale combinatorial grouping, CVPR 2014; Endres and
+Hoiem, Category independent object proposals, ECCV 2010).
 """
 
 import heapq
@@ -11,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csr_matrix
 
 from reconstruction.instances.partition.clusters import ClusterGraph
@@ -19,10 +17,8 @@ from reconstruction.instances.partition.features import View
 
 LARGEST_M = 4.0  # largest diagonal of a proposal's bounding box
 LEAST_AREA_M2 = 0.002  # of a proposal
-_LEAST_COST = 0.1  # estimated IoU under which a proposal is no object in any scene
 ALIKE = 1.03  # a region is left out if its parent in the merge tree is larger by less than this factor
 _CLIP_ODDS = 20.0
-_TIME_S = 20.0  # limit of the integer program; the best solution until then is used
 
 
 @dataclass(frozen=True)
@@ -32,6 +28,10 @@ class Proposals:
     members: csr_matrix  # float64 (m, n) 1 = the cluster is in the proposal
     low: np.ndarray  # float64 (m, 3) metres
     high: np.ndarray  # float64 (m, 3)
+
+    def taken(self, rows: np.ndarray) -> "Proposals":
+        """Return some of the proposals."""
+        return Proposals(self.members[rows], self.low[rows], self.high[rows])
 
 
 def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
@@ -179,55 +179,3 @@ def distinct(members: csr_matrix, area: np.ndarray, score: np.ndarray, most: int
             out[(out < 0) & (shared > alike * (own + own[row] - shared))] = row
             out[row] = row
     return out
-
-
-def likeliest_things(members: csr_matrix, iou: np.ndarray) -> np.ndarray:
-    """Return the rows of the disjoint proposals that are objects: a choice that agrees with its own expected F1.
-
-    If as many objects are there as are chosen, the expected F1 is the mean of the chosen estimates, and proposals
-    below half of it lower it (Lipton et al., Optimal thresholding of classifiers to maximize F1 measure, ECML 2014).
-    So the cost of a proposal rises from `_LEAST_COST` to half of the mean of the choice. In a scene unlike those that
-    models were trained on, whose estimates are lower throughout, it is lower.
-
-    Args:
-        members: (m, n) 1 = the cluster is in the proposal.
-        iou: float (m,) estimated IoU of each proposal and its best object.
-    """
-    cost = _LEAST_COST
-    while True:
-        chosen = best_disjoint(members, iou - cost)
-        half = 0.5 * float(iou[chosen].mean()) if len(chosen) else 0.0
-        if half <= cost:
-            return chosen
-        cost = half
-
-
-def best_disjoint(members: csr_matrix, gain: np.ndarray) -> np.ndarray:
-    """Return the rows of the disjoint proposals with the largest total gain: weighted set packing by integer program.
-
-    Args:
-        members: (m, n) 1 = the cluster is in the proposal.
-        gain: float (m,) of each proposal; only positive ones are chosen.
-    """
-    rows = np.flatnonzero(gain > 0)
-    if not len(rows):
-        return rows
-    once = LinearConstraint(members[rows].T.tocsr(), -np.inf, 1)
-    found = milp(
-        -gain[rows], constraints=once, bounds=Bounds(0, 1), integrality=np.ones(len(rows)),
-        options={"time_limit": _TIME_S},
-    )  # fmt: skip
-    if found.x is None:  # no solution within the time limit
-        return disjoint_by_gain(members, gain, rows)
-    return rows[found.x > 0.5]
-
-
-def disjoint_by_gain(members: csr_matrix, gain: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Choose disjoint rows by falling gain; return their numbers."""
-    taken, out = np.zeros(members.shape[1], bool), []  # pyright: ignore[reportOptionalSubscript]
-    for row in rows[np.argsort(-gain[rows], kind="stable")].tolist():
-        own = members.indices[members.indptr[row] : members.indptr[row + 1]]
-        if not taken[own].any():
-            taken[own] = True
-            out.append(row)
-    return np.sort(np.array(out, np.int64))
