@@ -143,6 +143,10 @@ def test_pairs_of_proposals_are_disjoint_and_linked_and_the_larger_one_comes_fir
     assert (twice == twice.T).all()
     assert 0 < twice[0, 1] < 1
     assert (twice > 0).sum() == 2
+    alone = proposal_pairs(trees.Proposals(members, low, high), iou, area, links[:0], odds[:0])
+    assert alone.counted_twice(load_models().duplicates).nnz == 0
+    none = proposal_pairs(trees.Proposals(members[:0], low[:0], high[:0]), iou[:0], area, links, odds)
+    assert len(likeliest_things(members[:0], iou[:0], none.counted_twice(load_models().duplicates))) == 0
 
 
 def test_a_merge_tree_joins_what_belongs_together_first():

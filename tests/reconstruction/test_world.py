@@ -295,6 +295,25 @@ def test_a_wall_alone_gets_an_assumed_floor_below_everything():
     assert 0.8 < np.median(heights) < 2.5
 
 
+@pytest.mark.parametrize("elevation_deg", [-65, -58, -45])
+def test_a_table_from_above_is_level(elevation_deg):
+    top, rise = 0.74, np.tan(np.radians(-elevation_deg))
+    eyes = [(x, -0.6, top + 0.6 * rise) for x in np.linspace(-0.25, 0.25, 12)]
+    poses = np.stack([look(eye, (eye[0], 0, top), roll_deg=0.5) for eye in eyes])
+    things = [box((-0.3, -0.2, top), (-0.1, 0.1, 0.9)), box((0.1, 0.0, top), (0.4, 0.2, 0.78), yaw_deg=-35)]
+    posed, depth, true = disturb(*film([box((-1.2, -0.8, 0.7), (1.2, 0.8, top)), *things], poses), 12)
+    assert errors(find_world(posed, depth, WorldConfig()), true)["gravity_deg"] < 1.5
+
+
+@pytest.mark.parametrize("elevation_deg", [-10, 5, 15])
+def test_a_wall_from_below_is_upright(elevation_deg):
+    eyes = [(x, 0.6, 1.5 - 1.3 * np.tan(np.radians(elevation_deg))) for x in np.linspace(-0.4, 0.4, 12)]
+    poses = np.stack([look(eye, (eye[0], 1.9, 1.5), roll_deg=0.5) for eye in eyes])
+    things = [box((-0.3, 1.7, 1.2), (0.1, 1.9, 1.6)), box((0.6, 1.85, 1.3), (0.9, 1.9, 1.7))]
+    posed, depth, true = disturb(*film([box((-2, 1.9, 0), (2, 2.0, 3)), *things], poses), 13)
+    assert errors(find_world(posed, depth, WorldConfig()), true)["gravity_deg"] < 3
+
+
 def test_empty_depth_is_an_input_error(room):
     posed, depth = room
     empty = replace(depth, depth=np.zeros_like(depth.depth), confidence=np.zeros_like(depth.confidence))

@@ -1,4 +1,4 @@
-"""Duplicate proposals: pairs of disjoint proposals in, the part of their estimated IoU that both of a pair count out.
+"""Duplicate proposals: disjoint pairs in, the estimated IoU that a choice of both of a pair counts twice out.
 
 Each proposal is estimated by itself. Two halves of one object have an IoU of .5 with it each; a choice of both would
 count 1, though only one of them can be matched with the object. Boosted trees estimate the smaller IoU of the two
