@@ -1,10 +1,10 @@
 """Estimate the up direction from camera orientations, surface normals and fitted planes.
 
 Hand-held cameras have little roll but any pitch: each camera's x axis is orthogonal to up within a few degrees, while
-its -y axis is only roughly up. They look down rather than up: a plane that fills the view is a table seen from above, or
-a wall seen from below, and films of tables from above are usual. Candidate directions near that prior are scored by the
-share of surface that they make horizontal or vertical. The best is refined by iteratively reweighted least squares on the normals, then on planes
-fitted to whole floors, tables and walls.
+its -y axis is only roughly up. They look down rather than up: a plane that fills the view is a table from above or a
+wall from below, and the first is usual. Candidate directions near that prior are scored by the share of surface that
+they make horizontal or vertical. The best is refined by iteratively reweighted least squares on the normals, then on
+planes fitted to whole floors, tables and walls.
 """
 
 from dataclasses import dataclass
