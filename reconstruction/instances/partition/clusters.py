@@ -40,7 +40,7 @@ PAIR_FEATURES = (
 _SAMPLES = 160  # vertices of a cluster from which hulls and boxes are computed
 _PAD_M = 0.004  # padding of the points of convex hulls, so that sheets have a volume
 _INSIDE_M = 0.01  # tolerance of tests whether points are inside a box or a hull
-_CLIP_ODDS = 20.0
+CLIP_ODDS = 20.0
 _STEPS = (0.2, 0.35, 0.5, 0.65, 0.8)  # sample positions between the nearest points of two clusters
 _AGREES = 0.015  # of the depth: measured depth within this of a sample is surface
 _BINS = 8  # of the color histogram, per channel
@@ -268,7 +268,7 @@ def _summed_odds(
     keys, asked = ends[:, 0] * (rest + 1) + ends[:, 1], a * (rest + 1) + b
     row = np.searchsorted(asked, keys)
     there = (row < len(asked)) & (asked[np.minimum(row, len(asked) - 1)] == keys) if len(asked) else keys < 0
-    odds, row = np.clip(scores.affinity[there].astype(np.float64), -_CLIP_ODDS, _CLIP_ODDS), row[there]
+    odds, row = np.clip(scores.affinity[there].astype(np.float64), -CLIP_ODDS, CLIP_ODDS), row[there]
     count = np.bincount(row, minlength=len(asked))
     total = np.bincount(row, weights=odds, minlength=len(asked))
     most = np.full(len(asked), -np.inf)

@@ -1,4 +1,4 @@
-"""Duplicate proposals: disjoint pairs in, the estimated IoU that a choice of both of a pair counts twice out.
+"""Duplicate proposals: pairs of disjoint proposals in, out the estimated IoU that a choice of both counts twice.
 
 Each proposal is estimated by itself. Two halves of one object have an IoU of .5 with it each; a choice of both would
 count 1, though only one of them can be matched with the object. Boosted trees estimate the smaller IoU of the two
@@ -13,13 +13,13 @@ from scipy.special import expit
 
 from reconstruction.instances.partition.boosting import Boosted
 from reconstruction.instances.partition.choice import LEAST_COST
+from reconstruction.instances.partition.clusters import CLIP_ODDS
 from reconstruction.instances.partition.proposals import Proposals
 
 DUPLICATE_FEATURES = (
     "iou", "other_iou", "log_area", "area_ratio", "diagonal", "links", "odds_mean", "odds_by_area", "gap", "gap_up",
     "plan_overlap", "height_overlap", "foot_step", "top_step",
 )  # fmt: skip
-_CLIP_ODDS = 20.0
 _TINY = 1e-9
 
 
@@ -54,7 +54,7 @@ def proposal_pairs(
     likely = np.flatnonzero(iou > LEAST_COST)
     members, own_area = proposals.members[likely], proposals.members[likely] @ area
     own = np.minimum(area[links[:, 0]], area[links[:, 1]])
-    odds = np.clip(odds.astype(np.float64), -_CLIP_ODDS, _CLIP_ODDS)
+    odds = np.clip(odds.astype(np.float64), -CLIP_ODDS, CLIP_ODDS)
     number, total, weight, weighted = (
         _between(members, links, values) for values in (np.ones(len(odds)), odds, own, own * odds)
     )

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, QhullError
 
-from reconstruction.instances.partition.clusters import CLUSTER_FEATURES, PAIR_FEATURES, ClusterGraph
+from reconstruction.instances.partition.clusters import CLIP_ODDS, CLUSTER_FEATURES, PAIR_FEATURES, ClusterGraph
 from reconstruction.instances.partition.features import View
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, Scores
 from reconstruction.instances.partition.proposals import Proposals
@@ -41,7 +41,7 @@ _NEAR_M = 0.02  # largest gap of a "near" pair
 _LARGE = 0.15  # of a proposal's area: least area of a large neighbor
 _LEVEL = 0.03  # of the depth: least step at an occlusion boundary
 _SHOWN_PX = 20  # least size in a keyframe that shows the proposal
-_CLIP_ODDS, _CLIP_BORDER, _CLIP_COLOR = 20.0, 10.0, 40.0
+_CLIP_BORDER, _CLIP_COLOR = 10.0, 40.0
 _TINY = 1e-9
 
 
@@ -179,7 +179,7 @@ def _pairs(sums: _Sums, pieces: ClusterGraph, odds: np.ndarray) -> np.ndarray:
     """Return statistics of log-odds and features over pairs inside a proposal, and over those with one end inside."""
     members = sums.members
     a, b = pieces.graph.pairs.astype(np.int64).T
-    odds = np.clip(odds.astype(np.float64), -_CLIP_ODDS, _CLIP_ODDS)
+    odds = np.clip(odds.astype(np.float64), -CLIP_ODDS, CLIP_ODDS)
     columns = members.tocsc()
     first, second = columns[:, a].tocsr(), columns[:, b].tocsr()
     inside = first.multiply(second).tocsr()
@@ -191,7 +191,7 @@ def _pairs(sums: _Sums, pieces: ClusterGraph, odds: np.ndarray) -> np.ndarray:
     near_in, near_out = np.maximum(inside @ near, 1), np.maximum(across @ near, 1)
     in_sum, out_sum = inside @ odds, across @ odds
     out = [
-        in_sum / ins, np.sign(in_sum) * np.log1p(np.abs(in_sum)), -_row_most(inside, -odds, -_CLIP_ODDS),
+        in_sum / ins, np.sign(in_sum) * np.log1p(np.abs(in_sum)), -_row_most(inside, -odds, -CLIP_ODDS),
         (inside @ (odds * near)) / near_in, np.log1p(inside @ np.maximum(-odds, 0)),
         out_sum / outs, np.sign(out_sum) * np.log1p(np.abs(out_sum)), _row_most(across, odds, -8.0),
         (across @ (odds * near)) / near_out, np.log1p(across @ np.maximum(odds, 0)), np.log1p(across @ near),

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from reconstruction.instances.partition.clusters import ClusterGraph
+from reconstruction.instances.partition.clusters import CLIP_ODDS, ClusterGraph
 from reconstruction.instances.partition.features import View
 
 LARGEST_M = 4.0  # largest diagonal of a proposal's bounding box
 LEAST_AREA_M2 = 0.002  # of a proposal
 ALIKE = 1.03  # a region is left out if its parent in the merge tree is larger by less than this factor
-_CLIP_ODDS = 20.0
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ def propose(view: View, pieces: ClusterGraph, odds: np.ndarray) -> Proposals:
     count, region = pieces.things, pieces.graph.region
     area = np.bincount(region, weights=view.mesh.areas, minlength=count + 1)[:count]
     pairs = pieces.graph.pairs.astype(np.int64)
-    odds = np.clip(odds.astype(np.float64), -_CLIP_ODDS, _CLIP_ODDS)
+    odds = np.clip(odds.astype(np.float64), -CLIP_ODDS, CLIP_ODDS)
     found = {frozenset([k]) for k in range(count)}
     for linkage in (total_odds, _mean):
         found |= set(regions_of_tree(area, pairs, odds, linkage))
