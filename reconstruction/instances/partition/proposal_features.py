@@ -12,7 +12,12 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, QhullError
 
-from reconstruction.instances.partition.clusters import CLIP_ODDS, CLUSTER_FEATURES, PAIR_FEATURES, ClusterGraph
+from reconstruction.instances.partition.clusters import (
+    CLIP_ODDS,
+    CLUSTER_FEATURES,
+    PAIR_FEATURES,
+    ClusterGraph,
+)
 from reconstruction.instances.partition.features import View
 from reconstruction.instances.partition.graph import LABELS, RegionGraph, Scores
 from reconstruction.instances.partition.proposals import Proposals
