@@ -15,7 +15,7 @@ from benchmarks.perf.ratios import TOLERANCE, compare
 ROOT = Path(__file__).resolve().parents[2]
 BASE = Path(__file__).with_name("base.txt")  # the commit that CI compares with
 _TURNS = 2
-_ATTEMPTS = 3  # the kernels that look slower are measured again, since other programs only make them slower
+_ATTEMPTS = 3  # the kernels that look slower are measured again: a median of six is surer than one of two
 
 
 def compare_with(commit: str, rounds: int, names: str | None, root: Path = ROOT) -> int:

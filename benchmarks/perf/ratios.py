@@ -23,10 +23,11 @@ def compare(before: list[dict[str, float]], now: list[dict[str, float]]) -> tupl
     """Return a line for each kernel, and the names of those that take more than `TOLERANCE` times as long as before.
 
     Args:
-        before: ratios by kernel, one entry for each time that they were measured; the least of each kernel counts.
+        before: ratios by kernel, one entry for each time that they were measured. The median of each kernel counts:
+            a process in which the reference was slow has a low ratio, one with a slow kernel a high one.
         now: the same of the present code.
     """
-    first, after = _least(before), _least(now)
+    first, after = _medians(before), _medians(now)
     out, slower = [], []
     for name, value in after.items():
         if name not in first:
@@ -39,8 +40,8 @@ def compare(before: list[dict[str, float]], now: list[dict[str, float]]) -> tupl
     return out, slower
 
 
-def _least(found: list[dict[str, float]]) -> dict[str, float]:
-    return {name: min(ratios.get(name, np.inf) for ratios in found) for name in found[0]}
+def _medians(found: list[dict[str, float]]) -> dict[str, float]:
+    return {name: float(np.median([ratios[name] for ratios in found if name in ratios])) for name in found[0]}
 
 
 def ratio(kernel_s: np.ndarray, reference_s: np.ndarray) -> Ratio:
