@@ -55,13 +55,13 @@ class BundleCameras:
 
 @dataclass(frozen=True)
 class BundleBase:
-    """A floor, wall or ceiling; meshes in world space."""
+    """A floor, wall or ceiling, or the structure; meshes in world space."""
 
     id: int
     label: str
     mesh: str  # path in the bundle
     collision: tuple[str, ...]  # paths in the bundle; may be empty
-    plane: np.ndarray  # float64 (4,) n . x + d = 0; the unit normal n points into the room
+    plane: np.ndarray | None  # float64 (4,) n . x + d = 0, unit normal n into the room; None: the structure
     observed: bool
 
 
@@ -187,14 +187,14 @@ class SceneBundle:
 
     @cached_property
     def base(self) -> tuple[BundleBase, ...]:
-        """Floors, walls and ceilings."""
+        """Floors, walls, ceilings, and the structure."""
         return tuple(
             BundleBase(
                 id=b["id"],
                 label=b["label"],
                 mesh=b["mesh"],
                 collision=tuple(b.get("collision", ())),
-                plane=np.array(b["plane"], np.float64),
+                plane=np.array(b["plane"], np.float64) if "plane" in b else None,
                 observed=b["observed"],
             )
             for b in self.scene["base"]

@@ -12,6 +12,7 @@ import numpy as np
 
 from registry import values
 from registry.errors import BundleError, UsageError
+from registry.labels import STRUCTURE
 from registry.primitives import SIZES
 from registry.report_schema import check_report
 from registry.values import JsonObject, as_object, check_relative_path
@@ -31,7 +32,7 @@ SCHEMA = "simrecon.scene/1"
 _SCHEMA_PATTERN = re.compile(r"simrecon\.scene/(\d+)(\.\d+)?")
 _SCENE_ID = re.compile(r"[a-z0-9_]{1,64}")
 _RELATIONS = ("supported_by", "attached_to")
-_BASE_LABELS = ("floor", "wall", "ceiling")
+_BASE_LABELS = ("floor", "wall", "ceiling", STRUCTURE)
 MAX_OBJECTS, MAX_BASE, MAX_PARTS = 2000, 500, 1000  # MAX_PARTS: collision parts of one object
 MAX_FRAMES, MAX_STEPS, MAX_VIEWS = 200_000, 20_000, 10_000
 MAX_GRAPH_DEPTH = 100  # edges between an object and the base
@@ -196,8 +197,10 @@ def _base(items: list[Any]) -> set[int]:
         if item.get("label") not in _BASE_LABELS:
             values.fail(f"{where}.label", " or ".join(f'"{x}"' for x in _BASE_LABELS), item.get("label"))
         values.path(item, "mesh", where, ".glb")
-        plane = values.vector(item, "plane", where, 4)
-        if abs(np.linalg.norm(plane[:3]) - 1) > 1e-3:
+        if item["label"] == STRUCTURE:  # it is no plane
+            if not item.get("collision"):
+                values.fail(f"{where}.collision", "convex parts of the structure", item.get("collision"))
+        elif abs(np.linalg.norm(values.vector(item, "plane", where, 4)[:3]) - 1) > 1e-3:
             values.fail(f"{where}.plane", "a unit normal in the first three places", item["plane"])
         values.boolean(item, "observed", where)
         if "observed_fraction" in item:  # absent from older bundles

@@ -105,6 +105,7 @@ def base_parts(bundle: SceneBundle, base: BundleBase) -> list[np.ndarray]:
     """Return the convex parts (v, 3) of a base entity in world space, or a box behind its plane."""
     if base.collision:
         return [read_obj_vertices(bundle.resolve(path)) for path in base.collision]
+    assert base.plane is not None  # the structure has collision parts
     return [slab_corners(base_slab(base.plane, glb_vertices(bundle.resolve(base.mesh))))]
 
 

@@ -15,6 +15,7 @@ from reconstruction.assembly.baselines import in_situ, mcmc
 from reconstruction.assembly.config import ASSEMBLY_PRESETS, AssemblyConfig
 from reconstruction.assembly.place import Placer
 from reconstruction.assembly.placement import Placement, base_specs
+from reconstruction.assembly.structure import clear_structure
 from reconstruction.assembly.workbench import object_spec
 from reconstruction.core.progress import NO_PROGRESS, Progress
 from reconstruction.core.types import AssembledScene, AssetSet, Edge, PlacedObject, SceneGraph
@@ -45,7 +46,7 @@ def assemble(
     """Assemble a scene at rest.
 
     Args:
-        assets: base surfaces and objects.
+        assets: base surfaces, the structure, and objects.
         graph: one parent for every object.
         config: method and bounds.
         movable: by object id, whether it is dynamic, where the user says so.
@@ -56,7 +57,8 @@ def assemble(
     """
     movable = movable or {}
     by_id = {o.id: o for o in assets.objects}
-    edges = breadth_first(graph.edges, [b.id for b in assets.base])
+    assets = clear_structure(assets, config)
+    edges = breadth_first(graph.edges, list(assets.static_labels))
     missing = sorted(set(by_id) - {e.child for e in edges})
     if missing:
         raise SimReconError(
@@ -74,7 +76,10 @@ def assemble(
         report = _report(assets, found, base)
     stable = {entry["id"]: entry["stable"] for entry in report["objects"]}
     placed = tuple(_finish(found[o.id], stable.get(o.id, True)) for o in assets.objects)
-    return AssembledScene(placed, SceneGraph(tuple(found[e.child].edge for e in graph.edges)), report)
+    structure = () if assets.structure is None else assets.structure.collision
+    return AssembledScene(
+        placed, SceneGraph(tuple(found[e.child].edge for e in graph.edges)), report, structure
+    )
 
 
 def _build_up(

@@ -90,8 +90,12 @@ def cut_out(
     second_pose: np.ndarray,
     tolerance_m: float,
     clearance_m: float = 0.0,
+    *,
+    sideways: bool = False,
 ) -> tuple[tuple[ConvexPart, ...], float]:
     """Cut the first object's parts where they overlap the second's; arguments as in `give_way`.
+
+    With `sideways` only parts whose axis of least penetration is rather horizontal are cut.
 
     Returns:
         The parts left, and the largest depth; with a clearance, parts nearer than that overlap too.
@@ -103,7 +107,7 @@ def cut_out(
         for their in theirs:
             our = in_world(kept, first_pose)
             found = overlap_of(our, their, sideways_only=False, clearance_m=clearance_m)
-            if found is None or found.depth <= tolerance_m:
+            if found is None or found.depth <= tolerance_m or (sideways and not found.sideways):
                 continue
             deepest = max(deepest, found.depth)
             kept = _behind(kept, first_pose, found.normal, found.high + _GAP_M)

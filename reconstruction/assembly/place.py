@@ -113,6 +113,8 @@ class Placer(Settler):
 
     def _hang(self, item: Placement) -> Placement:
         """Place an attached object without simulation, moved along the normal of its wall to touch it."""
+        if item.edge.parent == self.structure:
+            return self._hung_on(self.keep_clear(replace(item, dynamic=False), shift_m=0.0))
         parent = self.base.get(item.edge.parent)
         if parent is None:
             carrier = self.placed[item.edge.parent]

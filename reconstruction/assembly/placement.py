@@ -12,7 +12,8 @@ from reconstruction.assembly.depenetration import shifted
 from reconstruction.assets.gltf import written_corners
 from reconstruction.core.types import AssetSet, BaseAsset, ConvexPart, Edge, ObjectAsset
 from registry.geometry import rigid, transform_points
-from registry.simulation import BASE_FRICTION, BASE_RESTITUTION, BodySpec
+from registry.labels import STRUCTURE
+from registry.simulation import BodySpec, base_spec
 
 _FURNITURE = {"table", "desk", "shelf", "bookshelf", "cabinet", "sofa", "bed", "chair", "counter", "wardrobe"}
 TOUCH_GAP_M = 2e-4  # gap between a static object and the surface that it touches
@@ -39,13 +40,11 @@ class Placement:
 
 
 def base_specs(assets: AssetSet) -> list[BodySpec]:
-    """Return the bodies of floor, walls and ceiling."""
-    out = []
-    for b in assets.base:
-        name, slabs = f"{b.label}_{b.id}", tuple(written_corners(p) for p in base_slabs(b))
-        surface = (BASE_FRICTION, BASE_RESTITUTION)
-        out += [BodySpec(b.id, name, slabs, 0.0, np.zeros(3), None, *surface, np.eye(4), False, base=True)]
-    return out
+    """Return the bodies of floor, walls, ceiling and structure."""
+    shapes = [(b.id, b.label, base_slabs(b)) for b in assets.base]
+    if assets.structure is not None and assets.structure.collision:
+        shapes.append((assets.structure.id, STRUCTURE, assets.structure.collision))
+    return [base_spec(i, label, (written_corners(p) for p in parts)) for i, label, parts in shapes]
 
 
 def world_points(parts: tuple[ConvexPart, ...], pose: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from reconstruction.assembly.placement import (
     normal_of,
     world_points,
 )
+from reconstruction.assembly.structure import cut_by_structure
 from reconstruction.assembly.workbench import STANDING, Workbench, object_spec
 from reconstruction.core.types import AssetSet, BaseAsset
 from registry.simulation import pose_change
@@ -39,6 +40,8 @@ class Surroundings:
         self.config = config
         self.assets = assets
         self.base = {b.id: b for b in assets.base}
+        self.structure = 0 if assets.structure is None else assets.structure.id
+        self._plates = () if assets.structure is None else assets.structure.collision
         self.bench = Workbench(base_specs(assets))
         self.placed: dict[int, Placement] = {}
         self.tolerance_m = config.penetration_mm * 1e-3  # penetration that counts as contact
@@ -158,6 +161,10 @@ class Surroundings:
                 if i in self.base:
                     opened = self.cut_behind(opened, self.base[i], clearance_m)
                     continue
+                if i == self.structure:
+                    opened, depth_m = self._off_structure(opened, whole_m3, clearance_m)
+                    removed_m = max(removed_m, depth_m)
+                    continue
                 opened, depth_m = self._apart(opened, self.placed[i], whole_m3, clearance_m, at_any_cost)
                 removed_m = max(removed_m, depth_m)
             # PhysX merges nearly coplanar faces, so that its hulls are up to millimetres larger.
@@ -189,6 +196,13 @@ class Surroundings:
             return item, 0.0
         return replace(item, parts=parts, unflattened=parts), depth
 
+    def _off_structure(self, item: Placement, whole_m3: float, clearance_m: float) -> tuple[Placement, float]:
+        """Cut an object by the plates of the structure, unless little would be left: the object, and the depth."""
+        parts, depth = cut_by_structure(item, self._plates, 0.5 * self.tolerance_m, clearance_m)
+        if volume(parts) < _LEAST_LEFT * whole_m3:
+            return item, 0.0
+        return replace(item, parts=parts, unflattened=parts), depth
+
     def clear_air(self, item: Placement) -> bool:
         """Hollow out neighbors whose parts fill air where an object was seen; tell whether there was one."""
         self.put(item)
@@ -213,4 +227,5 @@ class Surroundings:
                 self.commit(placement)
 
     def _name_of(self, i: int) -> str:
-        return f"{self.base[i].label if i in self.base else self.placed[i].asset.label} {i}"
+        labels = self.assets.static_labels
+        return f"{labels[i] if i in labels else self.placed[i].asset.label} {i}"

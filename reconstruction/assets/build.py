@@ -26,6 +26,7 @@ from reconstruction.assets.physics.materials import MaterialChoice
 from reconstruction.assets.room import build_room
 from reconstruction.assets.solid import Solid
 from reconstruction.assets.standing import Stands, find_stands, within_walls, without_children
+from reconstruction.assets.structure import build_structure
 from reconstruction.assets.views import MOST_AT_ONCE, ScenePixels, object_noise, prepare_pixels
 from reconstruction.assets.volume import ObjectFrame, ObjectVolume, confirmed, frame_object, fuse_volume
 from reconstruction.core.progress import NO_PROGRESS, NoProgress, Progress
@@ -97,7 +98,7 @@ def build_assets(
     posed: PosedFrames, depth: DepthMaps, surface: Surface, instances: InstanceSet, config: AssetsConfig, *,
     views: SceneViews | None = None, keep: Path | None = None, progress: Progress = NO_PROGRESS,
 ) -> AssetSet:  # fmt: skip
-    """Build a complete asset for every object, textured rectangles for floor and walls, and the backdrop around them.
+    """Build a complete asset for every object, the structure, rectangles for floor and walls, and the backdrop.
 
     An object that cannot be completed becomes a box, with a note and in its provenance; the others go on.
 
@@ -126,18 +127,19 @@ def build_assets(
             pending.append((draft, worker.submit(collider, draft)))
             while pending and pending[0][1].done():
                 objects.append(_finished(*pending.popleft(), scene, progress))
+        structure = build_structure(posed, depth, surface, instances, scene.pixels, config)
         room = build_room(
-            posed, depth, instances, [d.asset for d in drafts], scene.pixels, surface.space, config
+            posed, depth, instances, [d.asset for d in drafts], scene.pixels, surface.space, config, structure
         )
         objects += [_finished(*item, scene, progress) for item in pending]
     finally:
         worker.shutdown(cancel_futures=True)
         end_decomposer()
     if any(made.visual is not draft.asset.visual for made, draft in zip(objects, drafts)):  # one became a box
-        room = build_room(posed, depth, instances, objects, scene.pixels, surface.space, config)
+        room = build_room(posed, depth, instances, objects, scene.pixels, surface.space, config, structure)
     progress.advance(len(instances.base))
     base, backdrop = room
-    return AssetSet(base, tuple(objects), backdrop)
+    return AssetSet(base, tuple(objects), backdrop, structure)
 
 
 def gather_evidence(

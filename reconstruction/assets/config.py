@@ -32,6 +32,8 @@ class AssetsConfig:
     """Face budget of a larger object."""
     furniture_m: float = 0.5
     """Longest side from which an object counts as furniture: unseen space below overhangs stays empty."""
+    faces_structure: int = 24_000
+    """Face budget of the structure."""
     texture_min_px: int = 128
     """Smallest side of an object's square texture."""
     texture_max_px: int = 1024
@@ -48,6 +50,8 @@ class AssetsConfig:
     """Most convex pieces of the walls of a container, which are cut by vertical and horizontal planes."""
     hulls_scene: int = 800
     """Convex pieces of all objects together; when they run out, the last objects get fewer, but 6 each."""
+    hulls_structure: int = 500
+    """Most convex plates of the structure's collision shape."""
     convex_enough: float = 0.93
     """Solids that fill this share of their convex hull collide as that hull."""
     dent_share: float = 0.12
@@ -108,8 +112,10 @@ class AssetsConfig:
 
 ASSETS_PRESETS = {
     "fast": AssetsConfig(
-        cells_along_longest=56, max_voxels=500_000, faces_small=2500, faces_furniture=6000, texture_max_px=512,
-        texture_frames=8, base_texel_m=0.015, hulls_small=12, hulls_furniture=20, hulls_ring=16,
+        cells_along_longest=56, max_voxels=500_000, faces_small=2500, faces_furniture=6000,
+        faces_structure=12_000, texture_max_px=512,
+        texture_frames=8, base_texel_m=0.015, hulls_small=12,
+        hulls_furniture=20, hulls_ring=16, hulls_structure=200,
     ),
     "default": AssetsConfig(),
     "quality": AssetsConfig(

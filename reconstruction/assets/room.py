@@ -18,13 +18,14 @@ from reconstruction.core.types import (
     ObjectAsset,
     PosedFrames,
     SpaceGrid,
+    StructureAsset,
 )
 from registry.geometry import transform_points
 
 
 def build_room(
     posed: PosedFrames, depth: DepthMaps, found: InstanceSet, objects: Sequence[ObjectAsset], pixels: ScenePixels,
-    space: SpaceGrid | None, config: AssetsConfig,
+    space: SpaceGrid | None, config: AssetsConfig, structure: StructureAsset | None = None,
 ) -> tuple[tuple[BaseAsset, ...], Backdrop | None]:  # fmt: skip
     """Build every base entity, and the backdrop that closes the view where neither it nor an object is.
 
@@ -36,12 +37,15 @@ def build_room(
         pixels: ids and depth of the keyframes' pixels.
         space: occupancy grid; None: nothing is known to be free.
         config: texel sizes and budgets.
+        structure: the structure, None where there is none.
     """
     rectangles = base_rectangles(found, objects, posed, space)
     meshes = [(r.entity.id, *rectangle_mesh(r)[:2]) for r in rectangles]
     meshes += [
         (o.id, transform_points(o.world_from_object, o.visual.vertices), o.visual.faces) for o in objects
     ]
+    if structure is not None:
+        meshes.append((structure.id, structure.visual.vertices, structure.visual.faces))
     if not meshes:
         return (), None
     hits = nearest_meshes(meshes, depth.camera, posed.world_from_camera)

@@ -15,6 +15,7 @@ import numpy as np
 from reconstruction.core.checked_arrays import CheckedArrays
 from reconstruction.core.reflections import without_reflections
 from registry.geometry import split_similarity, transform_points
+from registry.labels import STRUCTURE
 
 
 @dataclass(frozen=True)
@@ -290,6 +291,14 @@ class InstanceSet(CheckedArrays):
     base: tuple[BaseEntity, ...]
     objects: tuple[Instance, ...]
     id_maps: Annotated[np.ndarray, "uint16 n h w"]  # id seen at each pixel, per keyframe at depth resolution
+    structure: int = (
+        0  # id of the structure: static surface of no object and no base entity; 0 = there is none
+    )
+
+    @property
+    def last_id(self) -> int:
+        """Return the largest id in use, 0 without any."""
+        return max(0, self.structure, *(b.id for b in self.base), *(o.id for o in self.objects))
 
 
 @dataclass(frozen=True)
@@ -375,6 +384,16 @@ class BaseAsset(CheckedArrays):
 
 
 @dataclass(frozen=True)
+class StructureAsset(CheckedArrays):
+    """Stage 7: the structure, measured surface of no object and no base entity, as one static body."""
+
+    id: int
+    visual: TexturedMesh  # the open surface as seen, world space
+    collision: tuple[ConvexPart, ...]  # thin plates behind the surface, world space
+    observed_fraction: float  # of its texels that a keyframe shows
+
+
+@dataclass(frozen=True)
 class Backdrop:
     """Stage 7: a shell around the scene that shows what was filmed beyond its meshes; drawn, never in contact."""
 
@@ -389,6 +408,13 @@ class AssetSet:
     base: tuple[BaseAsset, ...]
     objects: tuple[ObjectAsset, ...]
     backdrop: Backdrop | None = None  # None: the scene has no mesh, or was not made from a video
+    structure: StructureAsset | None = None  # None: all surface is of objects and base entities
+
+    @property
+    def static_labels(self) -> dict[int, str]:
+        """Return the labels of what is no object, by id: base entities, and the structure."""
+        structure = {} if self.structure is None else {self.structure.id: STRUCTURE}
+        return {b.id: b.label for b in self.base} | structure
 
 
 @dataclass(frozen=True)
@@ -430,3 +456,6 @@ class AssembledScene:
     placed: tuple[PlacedObject, ...]
     graph: SceneGraph  # differs from stage 8 where a repair changed a parent
     physics_report: dict = field(default_factory=dict)  # JSON values only
+    structure: tuple[
+        ConvexPart, ...
+    ] = ()  # its collision shape, cut clear of the objects beside it; world space

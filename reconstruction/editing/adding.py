@@ -80,7 +80,7 @@ def add_thing(found: InstanceSet, surface: Surface, footage: Footage, added: Add
     graph = MeshGraph.from_surface(surface)
     views = [_view(outline, surface, footage, graph) for outline in added.outlines]
     chosen = _own_surface(graph, views)
-    number = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
+    number = found.last_id + 1
     shown = _share_shown(chosen, views, surface, footage)
     if shown < _COVERED:
         wall = wall_around(found, [view.ring for view in views])

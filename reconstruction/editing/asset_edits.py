@@ -14,7 +14,7 @@ from reconstruction.editing.anchors import Pointer
 from reconstruction.editing.moves import carried_by, moved, parse_move
 from reconstruction.editing.resting import rest_of
 from reconstruction.editing.sizes import parse_size, resized
-from reconstruction.scene_graph.surfaces import sample_base, sample_object
+from reconstruction.scene_graph.surfaces import sample_base, sample_object, sample_structure
 from registry.errors import UsageError
 from registry.geometry import invert_rigid, rigid
 
@@ -82,6 +82,7 @@ def _drop(
     item = objects[number]
     above = {number, *carried_by(number, objects.values())}
     others = [sample_object(o) for o in objects.values() if o.id not in above]
+    others += [] if assets.structure is None else [sample_structure(assets.structure)]
     floors = [sample_base(b) for b in assets.base if b.label == "floor"]
     rest = rest_of(sample_object(item), others, floors)
     if rest is None:
@@ -91,7 +92,7 @@ def _drop(
     pose = shift @ item.world_from_object
     objects[number] = replace(item, world_from_object=pose, support_hint=rest.carrier, attached_hint=False)
     _take_along(objects, taken, shift)
-    names = {b.id: f"{b.label} {b.id}" for b in assets.base}
+    names = {i: f"{label} {i}" for i, label in assets.static_labels.items()}
     names |= {o.id: f"{o.label} {o.id}" for o in objects.values()}
     if abs(rest.shift_m) > _WORTH_SAYING_M:
         way = "lowered" if rest.shift_m < 0 else "lifted"

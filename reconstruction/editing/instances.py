@@ -151,7 +151,7 @@ def _split(pointer: Pointer, item: Instance, how: object) -> InstanceSet:
                 f"overrides: split of {item.label} {item.id}: two points are the same spot of it; move one of them"
             )
         part = clicked_parts(surface, footage.affinities, chosen, seeds)
-    first = max([0, *(b.id for b in found.base), *(o.id for o in found.objects)]) + 1
+    first = found.last_id + 1
     numbers = np.array([item.id, *range(first, first + int(part.max()))])
     labels = np.array(found.vertex_instance)
     labels[chosen] = numbers[part]

@@ -113,7 +113,7 @@ class Overrides:
         from reconstruction.editing.asset_edits import addressed
 
         objects = {item.id: item for item in assets.objects}
-        known = set(objects) | {item.id for item in assets.base}
+        known = set(objects) | set(assets.static_labels)
         edges = {edge.child: edge for edge in graph.edges}
         for entry in self.of_stage("scene_graph"):
             item = addressed(entry, objects, pointer)

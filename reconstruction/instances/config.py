@@ -48,6 +48,12 @@ class InstancesConfig:
     min_object_image_share: float = 4e-4
     """Least share of the pixels that an object must cover in at least one keyframe."""
 
+    structure: bool = True
+    """Keep the measured surface of no object and no base plane as one static body that carries objects."""
+
+    min_structure_area_m2: float = 0.02
+    """Least area of a connected component of that surface: a small book's."""
+
     min_picture_m: float = 0.10
     """Least length of the shorter side of a picture on a wall that is found by its masks alone."""
 

@@ -5,7 +5,10 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree  # pyright: ignore[rep
 
 from reconstruction.core.mesh_graph import MeshGraph
 
-_REACH_M, _FAR_REACH_M = 0.05, 0.3  # around the foot, in plan; the second where the first finds no support
+NEAR_REACH_M, _FAR_REACH_M = (
+    0.05,
+    0.3,
+)  # around the foot, in plan; the second where the first finds no support
 _RISE_M, _DROP_M = 0.03, 0.06  # the support's surface may lie this far above and below the foot
 _UP = 0.5  # least z of the normals of a support surface
 _ON_FLOOR_M = 0.05  # a foot below this height stands on the floor
@@ -14,7 +17,9 @@ _TOP_BELOW_M, _TOP_ABOVE_M = 0.03, 0.02  # the support's top may lie this far be
 _COMMON_PLAN, _PLAN_STEPS = 0.5, 24  # overlap over the smaller footprint; grid points a side that measure it
 
 
-def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
+def carriers(
+    graph: MeshGraph, things: list[np.ndarray], reaches: tuple[float, ...] = (NEAR_REACH_M, _FAR_REACH_M)
+) -> list[int]:
     """Return the row of the object that supports each object, -1 for none (it stands on the floor, or hangs).
 
     The support is the object with the most up-facing area around and below the foot, whose own foot is lower. An object
@@ -24,6 +29,7 @@ def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
     Args:
         graph: the surface.
         things: int (n,) vertices of each object.
+        reaches: distances from the foot in plan, metres, to search for a support, one after another.
     """
     bottoms = [float(np.percentile(graph.points[v, 2], 2)) for v in things]
     owner = np.full(len(graph.points), -1, np.int64)
@@ -39,7 +45,7 @@ def carriers(graph: MeshGraph, things: list[np.ndarray]) -> list[int]:
             other == row or bottoms[other] > bottoms[row] - 0.002 or _stands_on(out, other, row)
             for other in range(len(things))
         ]
-        for reach in (_REACH_M, _FAR_REACH_M):  # the support's surface may have a hole around the foot
+        for reach in reaches:  # the support's surface may have a hole around the foot
             area = _area_below(graph, things[row], bottoms[row], tree, up, owner, len(things), reach)
             area[barred] = 0.0
             if area.max(initial=0.0) > 0:

@@ -42,6 +42,7 @@ class Thing:
     vertices: np.ndarray  # int (n,) sorted
     rests_on: "Thing | None" = None  # the supporting object; None: on the floor, or attached
     attached: bool = False  # to a wall
+    is_object: bool = True  # False: the structure, which is many things
 
 
 @dataclass(frozen=True)

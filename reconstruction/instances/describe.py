@@ -19,12 +19,19 @@ _COVERED, _RIM_M = 0.7, 0.02  # share of the support's area under a box, and the
 
 
 def describe(
-    graph: MeshGraph, things: list[Thing], base: tuple[BaseEntity, ...], vertex_instance: np.ndarray
-) -> tuple[Instance, ...]:
-    """Return the objects as instances, numbered by box volume; their ids are written into `vertex_instance` (v,)."""
+    graph: MeshGraph, things: list[Thing], base: tuple[BaseEntity, ...], vertex_instance: np.ndarray,
+    structure: Thing | None = None,
+) -> tuple[Instance, ...]:  # fmt: skip
+    """Return the objects as instances, numbered by box volume; their ids are written into `vertex_instance` (v,).
+
+    So is that of the structure, the largest. It carries objects and contains none.
+    """
     boxes = {id(t): upright_box(graph.points[t.vertices], graph.areas[t.vertices]) for t in things}
     order = sorted(things, key=lambda t: (-float(np.prod(boxes[id(t)].extents_m)), int(t.vertices[0])))
     number = {id(t): len(base) + 1 + i for i, t in enumerate(order)}
+    if structure is not None:
+        number[id(structure)] = len(base) + 1 + len(order)
+        vertex_instance[structure.vertices] = number[id(structure)]
     out = []
     for thing in order:
         vertex_instance[thing.vertices] = number[id(thing)]
@@ -71,12 +78,15 @@ def _box_on_support(
     bottom = box.center[2] - 0.5 * box.extents_m[2]
     if thing.rests_on is None:
         return with_bottom(box, 0.0) if base[0].observed and _stands_on_floor(graph, box) else box
-    if is_inside(graph, thing.rests_on.vertices, thing.vertices, bottom):
+    one = thing.rests_on.is_object
+    if one and is_inside(graph, thing.rests_on.vertices, thing.vertices, bottom):
         floor = _bottom_of(graph, thing.rests_on, base) + _CONTAINER_FLOOR_M
         return with_bottom(box, float(np.clip(floor, bottom - box.extents_m[2], bottom)))
     under = thing.rests_on.vertices
     flat = box.extents_m[2] < _FLAT * box.extents_m[:2].min()
-    if flat and _covers(box, graph.points[under], graph.areas[under]):  # it hides the top that it lies on
+    if (
+        one and flat and _covers(box, graph.points[under], graph.areas[under])
+    ):  # it hides the top that it lies on
         top = quantiles(graph.points[under, 2], graph.areas[under], (0.95,))[0]
         return with_bottom(box, float(np.clip(top, bottom - _HIDDEN_M, bottom)))
     radius = 0.5 * np.linalg.norm(box.extents_m[:2]) + 0.03

@@ -19,6 +19,7 @@ from reconstruction.instances.naming import load_namer, name_instances
 from reconstruction.instances.outlined import add_outlined
 from reconstruction.instances.partition import cut_by_partition
 from reconstruction.instances.sightings import sightings
+from reconstruction.instances.structure import find_structure
 
 
 def make_instances(
@@ -65,14 +66,16 @@ def find_instances(
     else:
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     progress.advance()
+    structure = find_structure(shell, cut, config.min_structure_area_m2) if config.structure else None
     vertex_instance = cut.owner.copy()
-    objects = describe(shell.graph, cut.things, shell.base, vertex_instance)
+    objects = describe(shell.graph, cut.things, shell.base, vertex_instance, structure)
+    number = 0 if structure is None else int(vertex_instance[structure.vertices[0]])
     progress.advance()
     if not objects:
         progress.note("No separate objects were found: the scene is an empty room.")
     labeled = _with_instance_ids(cut, len(shell.base), vertex_instance)
     id_maps = render_id_maps(posed, depth, surface, vertex_instance, config, labeled, progress=progress)
-    found = InstanceSet(vertex_instance, shell.base, objects, id_maps)
+    found = InstanceSet(vertex_instance, shell.base, objects, id_maps, number)
     if masks is not None and labeled is not None:
         masks = masks.resized(labeled.camera.width, labeled.camera.height)
         found = add_outlined(found, masks, labeled, posed, depth, surface, config, progress)

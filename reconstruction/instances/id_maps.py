@@ -110,4 +110,5 @@ def without_unseen(found: InstanceSet, config: InstancesConfig, progress: Progre
         found.base,
         tuple(replace(o, support_hint=support(o.support_hint)) for o in found.objects if o.id not in gone),
         np.where(np.isin(found.id_maps, erased), 0, found.id_maps).astype(np.uint16),
+        found.structure,
     )

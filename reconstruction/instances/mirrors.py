@@ -78,7 +78,7 @@ def _hung(
         low, high = np.minimum(low, edges[0]), np.maximum(high, edges[1])
         front = max(front, float(np.percentile(away[framed], 90)))
     box = WallBox(low, high, front)
-    number = names[0] if names else max(o.id for o in (*found.base, *found.objects)) + 1
+    number = names[0] if names else found.last_id + 1
     inside = flat & ((along >= low) & (along <= high)).all(axis=1)
     owner[inside & np.isin(owner, [0, wall.id, *names])] = number
     owner[np.isin(owner, names)] = number

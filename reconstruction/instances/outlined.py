@@ -70,7 +70,7 @@ def add_outlined(
         names = {c.name for c in group}
         own = next((k for k, o in enumerate(objects) if o.id in names), len(objects))
         old = objects[own] if own < len(objects) else None
-        number = max([*(o.id for o in objects), len(found.base)]) + 1 if old is None else old.id
+        number = max([*(o.id for o in objects), found.last_id]) + 1 if old is None else old.id
         objects[own : own + 1] = [_instance_on_wall(number, box, wall, old)]
         draw_box(maps, number, box, wall, posed, depth)
         count += 1

@@ -44,10 +44,11 @@ def render_textured(
 
 
 def scene_meshes(assets: AssetSet, assembled: AssembledScene) -> list[tuple[TexturedMesh, np.ndarray]]:
-    """Return all visual meshes of the assembled scene with their `world_from_mesh`: backdrop, base, objects."""
+    """Return all visual meshes of the scene with their `world_from_mesh`: backdrop, base, structure, objects."""
     pose = {item.id: item.world_from_object for item in assembled.placed}
     behind = [] if assets.backdrop is None else [assets.backdrop.visual]
     still = [*behind, *(item.visual for item in assets.base)]
+    still += [] if assets.structure is None else [assets.structure.visual]
     return [(visual, np.eye(4)) for visual in still] + [(o.visual, pose[o.id]) for o in assets.objects]
 
 

@@ -22,9 +22,11 @@ from reconstruction.core.types import (
     AssembledScene,
     AssetSet,
     BaseAsset,
+    ConvexPart,
     ObjectAsset,
     PlacedObject,
     PosedFrames,
+    StructureAsset,
     WorldFrame,
 )
 from reconstruction.costs import OTHER, PUBLISH
@@ -39,6 +41,7 @@ from reconstruction.scene_graph.publishing import graph_of_bundle
 from registry import SceneRecord, SceneRegistry, seal_bundle
 from registry.db import utc_text
 from registry.errors import EnvironmentMissing, SimReconError
+from registry.labels import STRUCTURE
 from registry.plain_text import plain_strings
 from registry.primitives import primitive_of
 from registry.report_card import failures
@@ -98,7 +101,7 @@ def write_bundle(run: "Run", scene_id: str, folder: Path) -> dict:
         "scale": dataclasses.asdict(world.scale),
         "world": {name: getattr(world, name) for name in _WORLD_FIELDS},
         "cameras": _cameras(posed),
-        "base": [_base(item, folder) for item in assets.base],
+        "base": _every_base(assets, assembled, folder),
         "objects": [
             object_entry(item, placed[item.id], item.id in attached, folder) for item in assets.objects
         ],
@@ -133,7 +136,7 @@ def _names(assets: AssetSet, assembled: AssembledScene) -> dict[int, str]:
     described = [
         Described.of(o.id, o.label, o.visual, np.asarray(poses[o.id]), parents[o.id]) for o in assets.objects
     ]
-    return phrases(described, {item.id: item.label for item in assets.base})
+    return phrases(described, assets.static_labels)
 
 
 def _cameras(posed: PosedFrames) -> dict:
@@ -163,27 +166,37 @@ def _cameras(posed: PosedFrames) -> dict:
 def _gaussians(run: "Run", folder: Path) -> dict:
     gaussians = run.results["gaussians"].in_world(run.results["world"])
     found, kept = run.results["instances"], run.results["assets"]
-    published = [item.id for item in (*kept.base, *kept.objects)]
+    published = [*kept.static_labels, *(item.id for item in kept.objects)]
     labels = np.where(np.isin(found.vertex_instance, published), found.vertex_instance, 0)
     instances = gaussian_instances(gaussians.means, run.results["surface"].vertices, labels)
     write_ply(gaussians, folder / "gaussians.ply", instances)
     return {"file": "gaussians.ply", "count": len(gaussians)}
 
 
-def _base(item: BaseAsset, folder: Path) -> dict:
+def _every_base(assets: AssetSet, assembled: AssembledScene, folder: Path) -> list[dict]:
+    """Write floor, walls, ceiling and structure; return their entries of `base`."""
+    entries = []
+    for item in assets.base:
+        plane = {"plane": [float(x) for x in item.plane], "observed": item.observed}
+        entries.append(_base(item, item.label, base_slabs(item), folder) | plane)
+    if assets.structure is not None and assembled.structure:
+        entry = _base(assets.structure, STRUCTURE, assembled.structure, folder)
+        entries.append(entry | {"observed": True})
+    return entries
+
+
+def _base(item: BaseAsset | StructureAsset, label: str, parts: tuple[ConvexPart, ...], folder: Path) -> dict:
     (folder / "base").mkdir(exist_ok=True)
-    mesh = f"base/{item.id:03d}_{item.label}.glb"
+    mesh = f"base/{item.id:03d}_{label}.glb"
     write_glb(item.visual, folder / mesh)
     collision = []
-    for number, part in enumerate(base_slabs(item)):
+    for number, part in enumerate(parts):
         collision.append(f"base/{item.id:03d}_collision_{number:03d}.obj")
         write_obj(part, folder / collision[-1])
     return {
         "id": item.id,
-        "label": item.label,
+        "label": label,
         "mesh": mesh,
-        "plane": [float(x) for x in item.plane],
-        "observed": item.observed,
         "observed_fraction": float(item.observed_fraction),
         "collision": collision,
     }

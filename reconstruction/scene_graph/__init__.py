@@ -41,7 +41,7 @@ def infer_scene_graph(
     """Infer the parent of every object: its support, or what it is attached to.
 
     Args:
-        assets: base surfaces and objects.
+        assets: base surfaces, the structure, and objects.
         config: settings.
         backend: overrides the one that the config names.
         make_scene: makes the Gaussians to render; called only by backends that use views.
@@ -52,7 +52,7 @@ def infer_scene_graph(
         InputError: there is no floor, so the graph has no root.
         EnvironmentMissing: something that the backend needs is missing.
     """
-    base_ids = [b.id for b in sorted(assets.base, key=lambda b: (b.label != "floor", b.id))]
+    base_ids = sorted(assets.static_labels, key=lambda i: (assets.static_labels[i] != "floor", i))
     if not any(b.label == "floor" for b in assets.base):
         raise InputError(
             f"scene graph: none of the {len(base_ids)} base surfaces is a floor, so nothing can stand; "

@@ -65,7 +65,7 @@ class PictureRelations:
             reach_m: largest distance between an object and its parent.
         """
         self._model, self._viewer, self._geometry, self._reach_m = model, viewer, geometry, reach_m
-        self._labels = {item.id: item.label for item in (*assets.base, *assets.objects)}
+        self._labels = assets.static_labels | {item.id: item.label for item in assets.objects}
         self._base = tuple(item.id for item in assets.base)
         self._walls = tuple(item.id for item in assets.base if item.label != "floor")
         self._prompt = (Path(__file__).parent / "prompt.txt").read_text()

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from reconstruction.core.types import AssetSet
 from reconstruction.scene_graph.base import LocalGraph, Question, SaidEdge
 from reconstruction.scene_graph.checking import find_cycles
-from reconstruction.scene_graph.surfaces import SampledBase, SampledObject, sample_assets
+from reconstruction.scene_graph.surfaces import SampledBase, SampledObject, sample_assets, sample_structure
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class GeometryRelations:
         """Sample the surfaces of all assets."""
         self.config = config
         self._base, self._objects = sample_assets(assets)
+        self._structure = None if assets.structure is None else sample_structure(assets.structure)
         self._floors = [b for b in self._base.values() if b.label == "floor"]
         self._trees: dict[int, cKDTree] = {}
         self._gaps: dict[tuple[int, int, bool], np.ndarray] = {}
@@ -72,13 +73,15 @@ class GeometryRelations:
         own = self._objects[child]
         if parent in self._base:
             return max(0.0, float(np.abs(self._base[parent].distance(own.points)).min()))
-        other = self._objects[parent]
+        other = self._objects.get(parent) or self._structure
+        assert other is not None  # parents are base entities, objects, or the structure
         return float(np.linalg.norm(np.maximum(0.0, np.maximum(own.low - other.high, other.low - own.high))))
 
     def candidates(self, child_id: int, present: Iterable[int]) -> list[_Candidate]:
         """Rank the possible parents of an object among those present and the base, best first; never empty."""
         child = self._objects[child_id]
         others = [self._objects[i] for i in sorted(present) if i != child_id]
+        others += [] if self._structure is None else [self._structure]
         supports = self._supports(child, others, deep=False) or self._supports(child, others, deep=True)
         hanging = self._hanging(child)
         floating = self._floating(child, others)
@@ -172,7 +175,9 @@ class GeometryRelations:
         return self.config.contact_sink_m
 
     def _is_above(self, child: SampledObject, parent: SampledObject) -> bool:
-        """Vote whether `child` is the upper one of two objects that touch; antisymmetric."""
+        """Vote whether `child` is the upper one of two that touch; antisymmetric. The structure is the lower."""
+        if self._structure is not None and self._structure.id in (child.id, parent.id):
+            return parent is self._structure
 
         def clip(x: float, bound: float) -> float:
             return float(np.clip(x, -bound, bound))

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reconstruction.core.types import AssetSet, BaseAsset, ObjectAsset
+from reconstruction.core.types import AssetSet, BaseAsset, ObjectAsset, StructureAsset
+from registry.labels import STRUCTURE
 
 _SPACING_M = 0.005  # target distance of samples
 _MIN_SAMPLES, _MAX_SAMPLES = 2_000, 25_000  # per object
@@ -46,12 +47,14 @@ class SampledBase:
         return points @ self.normal + self.offset
 
 
-def sample_surface(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, *, closed: bool = True
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Sample a mesh uniformly and deterministically: points (n, 3), unit normals (n, 3), spacing."""
     corners = vertices[faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     # Outward for a closed mesh: flip all normals if the enclosed volume is negative.
-    if np.einsum("ij,ij->", corners[:, 0] - corners[:, 0].mean(0), cross) < 0:
+    if closed and np.einsum("ij,ij->", corners[:, 0] - corners[:, 0].mean(0), cross) < 0:
         cross = -cross
     double_area = np.linalg.norm(cross, axis=1)
     total = 0.5 * double_area.sum()
@@ -104,6 +107,28 @@ def sample_object(asset: ObjectAsset, world_from_object: np.ndarray | None = Non
         underside=np.column_stack([cells[lowest], heights[lowest]]),
         support_hint=asset.support_hint,
         attached_hint=asset.attached_hint,
+    )
+
+
+def sample_structure(asset: StructureAsset) -> SampledObject:
+    """Sample the structure, an open surface, as an object without underside: it carries, and stands on nothing."""
+    mesh = asset.visual
+    points, normals, spacing = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), closed=False)
+    low = np.percentile(points, _BOTTOM_PERCENTILE, axis=0)
+    high = np.percentile(points, 100 - _BOTTOM_PERCENTILE, axis=0)
+    return SampledObject(
+        id=asset.id,
+        name=f"{STRUCTURE} {asset.id}",
+        points=points,
+        up=points[normals[:, 2] > _UP_FACING],
+        spacing_m=spacing,
+        low=low,
+        high=high,
+        center=points.mean(axis=0),
+        footprint_m2=float(np.prod((high - low)[:2])),
+        underside=np.zeros((0, 3)),
+        support_hint=0,
+        attached_hint=False,
     )
 
 

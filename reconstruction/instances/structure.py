@@ -1,0 +1,62 @@
+"""The structure of a room: measured surface of no object and no base plane, as one static body.
+
+Most surface of a furnished room may be of no object that was found: a counter in pieces, a shelf that is cut off, a
+wall that no plane fits. It stays in the scene, and carries objects.
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+from reconstruction.core.mesh_graph import MeshGraph, pieces
+from reconstruction.instances.contacts import NEAR_REACH_M, carriers
+from reconstruction.instances.cut import Cut, Shell, Thing
+
+# Narrower strips are rims of the objects beside them, which depth smears over their outlines: half of a superpoint.
+_RIM_M = 0.03
+_FLOOR_M = 0.05  # surface below this height is the floor's: rugs, and its noise
+
+
+def find_structure(shell: Shell, cut: Cut, least_area_m2: float) -> Thing | None:
+    """Return the surface of no object and no base plane as a thing that carries objects; None where there is none.
+
+    A morphological opening by 3 cm removes strips between and around what was found. `rests_on` of the objects that
+    stand on the rest is set to it, in place.
+
+    Args:
+        shell: the surface graph and its base planes.
+        cut: the objects, and the base entity of each vertex.
+        least_area_m2: connected components with less area are dropped.
+    """
+    taken = (cut.owner > 0) | (shell.owner > 0) | (shell.graph.points[:, 2] < _FLOOR_M)
+    for thing in cut.things:
+        taken[thing.vertices] = True
+    vertices = _wide_surface(shell.graph, taken, shell.behind, least_area_m2)
+    if not len(vertices):
+        return None
+    structure = Thing(vertices, is_object=False)
+    _stand_on(shell.graph, cut.things, structure)
+    return structure
+
+
+def _wide_surface(
+    graph: MeshGraph, taken: np.ndarray, behind: np.ndarray, least_area_m2: float
+) -> np.ndarray:
+    """Return the vertices (k,) of wide connected surface that is not `taken` (v,) and not `behind` (v,) the base."""
+    free = np.flatnonzero(~taken & ~behind)
+    points = graph.points[free]
+    core = np.ones(len(free), bool)
+    if taken.any() and len(free):
+        core = cKDTree(graph.points[taken]).query(points, distance_upper_bound=_RIM_M)[0] > _RIM_M
+    if not core.any():
+        return free[:0]
+    wide = free[cKDTree(points[core]).query(points, distance_upper_bound=_RIM_M)[0] <= _RIM_M]
+    large = [part for part in pieces(graph, np.sort(wide)) if graph.areas[part].sum() >= least_area_m2]
+    return np.sort(np.concatenate(large)) if large else free[:0]
+
+
+def _stand_on(graph: MeshGraph, things: list[Thing], structure: Thing) -> None:
+    """Put the objects without support that stand on the structure on it, in place; none of them hangs on a wall."""
+    found = carriers(graph, [*(t.vertices for t in things), structure.vertices], (NEAR_REACH_M,))
+    for thing, carrier in zip(things, found):
+        if thing.rests_on is None and carrier == len(things):
+            thing.rests_on, thing.attached = structure, False
