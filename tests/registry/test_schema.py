@@ -135,6 +135,16 @@ def test_unknown_extra_keys_are_allowed(scene):
     validate_scene(scene)
 
 
+def test_a_structure_has_collision_parts_and_no_plane(scene):
+    entry = {"id": 99, "label": "structure", "mesh": "base/099_structure.glb", "observed": True}
+    scene["base"].append(entry)
+    with pytest.raises(BundleError, match="convex parts of the structure"):
+        validate_scene(scene)
+    entry["collision"] = ["base/099_collision_000.obj"]
+    validate_scene(scene)
+    assert referenced_files(scene)["base/099_collision_000.obj"] == "base[1].collision[0]"
+
+
 def test_unknown_scale_may_have_no_uncertainty(scene):
     scene["scale"] = {"method": "unknown", "uncertainty": None}
     validate_scene(scene)

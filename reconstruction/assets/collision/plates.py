@@ -105,20 +105,44 @@ class _Patches:
 
 
 def _split(centers: np.ndarray, cross: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the patch (f,) of each face, connected faces of a cell and a main axis, and pairs (k, 2) that touch."""
+    """Return the patch (f,) of each face, connected faces of a cell and a main axis, and pairs (k, 2) that touch.
+
+    Small patches, at the border of a cell, join the largest that they touch of the same direction.
+    """
     axis = np.abs(cross).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(cross, axis[:, None], axis=1)[:, 0] > 0)
     key = np.column_stack([np.floor(centers / _CELL_M).astype(np.int64), side])
     key = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    first, second = _adjacent(faces)
+    label = _components(len(faces), first, second, key[first] == key[second])
+    area = np.bincount(label, weights=0.5 * np.linalg.norm(cross, axis=1))
+    own = np.concatenate([first, second])
+    other = np.concatenate([second, first])
+    joins = (label[own] != label[other]) & (side[own] == side[other]) & (area[label[own]] < _LEAST_AREA_M2)
+    small, large = label[own[joins]], label[other[joins]]
+    order = np.lexsort((large, -area[large], small))
+    small, chosen = np.unique(small[order], return_index=True)
+    label = _components(len(area), small, large[order][chosen])[label]
+    links = np.sort(np.column_stack([label[first], label[second]]), axis=1)
+    return label, np.unique(links[links[:, 0] != links[:, 1]], axis=0)
+
+
+def _adjacent(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows (k,) and (k,) of faces that share an edge."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     owner = np.tile(np.arange(len(faces)), 3)
     order = np.lexsort((edges[:, 1], edges[:, 0]))
     same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-    first, second = owner[order][:-1][same], owner[order][1:][same]
-    inside = key[first] == key[second]
-    links = (np.ones(int(inside.sum())), (first[inside], second[inside]))
-    label = connected_components(coo_matrix(links, shape=(len(faces),) * 2), directed=False)[1]
-    return label, np.unique(np.sort(np.column_stack([label[first], label[second]])[~inside], axis=1), axis=0)
+    return owner[order][:-1][same], owner[order][1:][same]
+
+
+def _components(
+    count: int, first: np.ndarray, second: np.ndarray, linked: np.ndarray | slice = slice(None)
+) -> np.ndarray:
+    """Return the connected component (count,) of each node of a graph."""
+    rows, columns = first[linked], second[linked]
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def _hull(points: np.ndarray) -> tuple[np.ndarray, float] | None:
