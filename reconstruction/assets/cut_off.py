@@ -172,11 +172,17 @@ def stopped(item: int, frame: ObjectFrame, room: Room, axis: int, sign: int, cut
     across = [a for a in range(3) if a != axis]
     points = transform_points(grid_from_world, np.asarray(room.surface.vertices, np.float64))
     owner = room.found.vertex_instance
-    bases = [b.id for b in room.found.base]
     margin = 0.1 * (high - low)[across]
     within = ((points[:, across] > low[across] + margin) & (points[:, across] < high[across] - margin)).all(1)
     along = sign * points[:, axis]
-    other = within & (owner > 0) & (owner != item) & ~np.isin(owner, bases) & (along > cut) & (along < end)
+    other = (
+        within
+        & (owner > 0)
+        & (owner != item)
+        & ~np.isin(owner, room.found.static_ids)
+        & (along > cut)
+        & (along < end)
+    )
     if other.sum() >= _IN_THE_WAY:
         end = float(np.percentile(along[other], 5))
     for base in room.found.base:

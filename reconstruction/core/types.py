@@ -296,9 +296,14 @@ class InstanceSet(CheckedArrays):
     )
 
     @property
+    def static_ids(self) -> tuple[int, ...]:
+        """Return the ids of what is no object: base entities, and the structure."""
+        return (*(b.id for b in self.base), *([self.structure] if self.structure else []))
+
+    @property
     def last_id(self) -> int:
         """Return the largest id in use, 0 without any."""
-        return max(0, self.structure, *(b.id for b in self.base), *(o.id for o in self.objects))
+        return max([0, *self.static_ids, *(o.id for o in self.objects)])
 
 
 @dataclass(frozen=True)

@@ -262,15 +262,15 @@ def _described(found: InstanceSet, graph: MeshGraph, chosen: np.ndarray, number:
     """Return the object of these vertices with its box and its support."""
     owner = np.asarray(found.vertex_instance).copy()
     owner[chosen] = number
-    others = [o for o in found.objects if (owner == o.id).any()]
-    surfaces = [np.flatnonzero(owner == o.id) for o in others]
+    ids = [i for i in (*(o.id for o in found.objects), found.structure) if i and (owner == i).any()]
+    surfaces = [np.flatnonzero(owner == i) for i in ids]
     row = carriers(graph, [*surfaces, chosen])[-1]
-    under = Thing(surfaces[row]) if row >= 0 else None
+    under = Thing(surfaces[row], is_object=ids[row] != found.structure) if row >= 0 else None
     thing = Thing(np.sort(chosen), under, attached=under is None and _hangs(found, graph, chosen))
     numbers = np.zeros(len(owner), np.int32)
     items = describe(graph, [thing] if under is None else [under, thing], found.base, numbers)
     made = next(item for item in items if item.id == numbers[chosen[0]])
-    hint = others[row].id if row >= 0 else made.support_hint
+    hint = ids[row] if row >= 0 else made.support_hint
     return replace(made, id=number, label=label, label_confidence=1.0, support_hint=hint)
 
 

@@ -202,6 +202,8 @@ class Pointer:
     def _name(self, number: int) -> str:
         if number in self._base:
             return f"the {self._base[number].label} ({number})"
+        if number and number == self.found.structure:
+            return f"the structure ({number})"
         item = self._things.get(number)
         return f"{item.label} {item.id}" if item else "nothing that was reconstructed"
 

@@ -67,6 +67,9 @@ def find_instances(
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     progress.advance()
     structure = find_structure(shell, cut, config.min_structure_area_m2) if config.structure else None
+    if structure is not None:
+        area_m2 = float(shell.graph.areas[structure.vertices].sum())
+        progress.note(f"{area_m2:.1f} m2 of it are kept as structure: static, and carrying")
     vertex_instance = cut.owner.copy()
     objects = describe(shell.graph, cut.things, shell.base, vertex_instance, structure)
     number = 0 if structure is None else int(vertex_instance[structure.vertices[0]])

@@ -73,7 +73,7 @@ def prepare_scene(
         instance=gaussian_instances(gaussians.means, surface.vertices, instances.vertex_instance),
         points=np.asarray(surface.vertices, np.float64),
         point_instance=np.asarray(instances.vertex_instance, np.int32),
-        base=tuple(b.id for b in instances.base),
+        base=instances.static_ids,
         clearance=measure_clearance(surface.space, poses[:, :3, 3]),
         space=surface.space,
         camera=camera,

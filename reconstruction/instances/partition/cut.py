@@ -50,9 +50,9 @@ def cut_by_partition(
     for thing, carrier in zip(things, carriers(shell.graph, [t.vertices for t in things])):
         thing.rests_on = things[carrier] if carrier >= 0 else None
     mark_attached(shell, things)
-    artifact = float(shell.graph.areas[label > _BASE].sum() / max(shell.graph.areas.sum(), 1e-12))
+    neither = float(shell.graph.areas[label > _BASE].sum() / max(shell.graph.areas.sum(), 1e-12))
     progress.note(
-        f"One partition of the surface: {len(things)} things; {artifact:.0%} of it are artifacts of depth"
+        f"One partition of the surface: {len(things)} things; {neither:.0%} of it is neither thing nor base"
     )
     return Cut(things, _base_owner(shell, label))
 
