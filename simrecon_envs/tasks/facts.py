@@ -8,6 +8,7 @@ from collections import OrderedDict
 import numpy as np
 
 from registry import SceneBundle
+from registry.labels import STRUCTURE
 from registry.rigid_groups import moving_ids, welded_to
 from simrecon_envs.hovering import Hover, most_room
 from simrecon_envs.occupancy import ConvexSolid, scene_solids
@@ -154,9 +155,9 @@ def scene_facts(bundle: SceneBundle, robot: str) -> SceneFacts:
 
 
 def _names(bundle: SceneBundle) -> dict[str, int]:
-    """Return {name: id} of floors and objects: `mug` where the label is unique, `box_7`, `object_7`."""
+    """Return {name: id} of floors, structure and objects: `mug` where the label is unique, `box_7`, `object_7`."""
     names: dict[str, int] = {}
-    items = [*(b for b in bundle.base if b.label == "floor"), *bundle.objects]
+    items = [*(b for b in bundle.base if b.label in ("floor", STRUCTURE)), *bundle.objects]
     slugs = [re.sub(r"[^a-z0-9]+", "_", item.label.lower()).strip("_") for item in items]
     for item, slug in zip(items, slugs, strict=True):
         if slug and slug != "unknown" and (slugs.count(slug) == 1 or item in bundle.base):

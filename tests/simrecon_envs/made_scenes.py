@@ -15,6 +15,7 @@ ROOM_M = (4.0, 3.0, 2.4)
 TABLE_TOP_M = 0.60
 BOX, CYLINDER, PICTURE, TABLE, BOOK, KNOB = 10, 11, 12, 13, 14, 15
 CRATE, BLOCK, CUBE, SHELF = 20, 21, 22, 23
+STRUCTURE_ID = 99
 
 
 def _glb(mesh: trimesh.Trimesh, path: Path, color: tuple[int, int, int]) -> None:
@@ -58,13 +59,14 @@ class BundleWriter:
         self.backdrop: dict | None = None
 
     def add_base(
-        self, key: int, label: str, mesh: trimesh.Trimesh, plane: list, *, collision: bool = True
+        self, key: int, label: str, mesh: trimesh.Trimesh, plane: list | None, *, collision: bool = True
     ) -> None:
-        """Add a floor or wall: a slab in world space whose front lies on the plane."""
+        """Add a floor or wall, a slab in world space whose front lies on the plane, or the structure, without one."""
         _glb(
             mesh, self.folder / f"base/{key:03d}.glb", (200, 196, 188) if label == "wall" else (150, 120, 90)
         )
-        entry = {"id": key, "label": label, "mesh": f"base/{key:03d}.glb", "plane": plane, "observed": True}
+        entry = {"id": key, "label": label, "mesh": f"base/{key:03d}.glb", "observed": True}
+        entry |= {} if plane is None else {"plane": plane}
         if collision:
             _obj(mesh, self.folder / f"base/{key:03d}_collision.obj")
             entry["collision"] = [f"base/{key:03d}_collision.obj"]
@@ -280,14 +282,25 @@ def add_things_to_do(writer: BundleWriter) -> None:
     writer.add_object(CRATE, "crate", crate, _translation(0.10, 0.95, top), TABLE, mass=0.7)
 
 
+def add_counter(writer: BundleWriter) -> None:
+    """Add a counter's top that is of no object, as structure, with a cube and a cup on it."""
+    writer.add_base(STRUCTURE_ID, "structure", box((1.2, 0.6, 0.02), TABLE_TOP_M - 0.02, at=(0, 0.9)), None)
+    cube = [box((0.05, 0.05, 0.06))]
+    writer.add_object(CUBE, "cube", cube, _translation(0.25, 0.8, TABLE_TOP_M), STRUCTURE_ID)
+    cup = trimesh.creation.cylinder(0.025, 0.08, sections=24).apply_translation([0, 0, 0.04])
+    writer.add_object(CYLINDER, "cup", [cup], _translation(-0.1, 0.75, TABLE_TOP_M), STRUCTURE_ID)
+
+
 def publish(registry: SceneRegistry, scene_id: str, folder: Path) -> None:
-    """Write `room` (furniture), `bare` (nothing can move) or `things` (for every kind of task) and publish it."""
+    """Write and publish `room` (furniture), `bare` (nothing moves), `things` (all tasks) or `counter` (structure)."""
     writer = BundleWriter(folder)
     add_room(writer)
     if scene_id == "room":
         add_furniture(writer)
     elif scene_id == "things":
         add_things_to_do(writer)
+    elif scene_id == "counter":
+        add_counter(writer)
     else:
         writer.add_object(
             PICTURE,
