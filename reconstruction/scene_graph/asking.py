@@ -66,7 +66,7 @@ class PictureRelations:
         """
         self._model, self._viewer, self._geometry, self._reach_m = model, viewer, geometry, reach_m
         self._labels = assets.static_labels | {item.id: item.label for item in assets.objects}
-        self._base = tuple(item.id for item in assets.base)
+        self._base = tuple(assets.static_labels)
         self._walls = tuple(item.id for item in assets.base if item.label != "floor")
         self._prompt = (Path(__file__).parent / "prompt.txt").read_text()
         self._away = ""  # why the model cannot be used any more

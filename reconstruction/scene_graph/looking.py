@@ -42,7 +42,7 @@ class RegionViewer:
         self._assets, self._make_scene = assets, make_scene
         self._side_px, self._least = side_px, least_visible
         self._scene: ViewScene | None = None
-        self._base = {b.id: b.label for b in assets.base}
+        self._base = assets.static_labels
 
     def look(self, question: Question) -> RegionPicture | None:
         """Render the view of the objects of a question; None if no view shows any.

@@ -16,8 +16,11 @@ _SPECK = 5e-5  # share of the picture; smaller parts and holes of an object get 
 
 
 def id_map(assets: AssetSet, camera: Camera, world_from_camera: np.ndarray) -> np.ndarray:
-    """Render the ids of the visible assets, base included: int32 (h, w), 0 = none."""
+    """Render the ids of the visible assets, base and structure included: int32 (h, w), 0 = none."""
     meshes = [(b.id, np.asarray(b.visual.vertices), b.visual.faces) for b in assets.base]
+    if assets.structure is not None:
+        visual = assets.structure.visual
+        meshes += [(assets.structure.id, np.asarray(visual.vertices), visual.faces)]
     for o in assets.objects:
         meshes += [(o.id, transform_points(o.world_from_object, o.visual.vertices), o.visual.faces)]
     starts = np.cumsum([0] + [len(vertices) for _, vertices, _ in meshes])
