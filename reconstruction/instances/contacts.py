@@ -10,7 +10,7 @@ NEAR_REACH_M, _FAR_REACH_M = (
     0.3,
 )  # around the foot, in plan; the second where the first finds no support
 _RISE_M, _DROP_M = 0.03, 0.06  # the support's surface may lie this far above and below the foot
-_UP = 0.5  # least z of the normals of a support surface
+UP = 0.5  # least z of the normals of a support surface
 _ON_FLOOR_M = 0.05  # a foot below this height stands on the floor
 # An object that hides the whole top of its support: the support ends near the foot, and their footprints overlap.
 _TOP_BELOW_M, _TOP_ABOVE_M = 0.03, 0.02  # the support's top may lie this far below and above the foot
@@ -31,11 +31,11 @@ def carriers(
         things: int (n,) vertices of each object.
         reaches: distances from the foot in plan, metres, to search for a support, one after another.
     """
-    bottoms = [float(np.percentile(graph.points[v, 2], 2)) for v in things]
+    bottoms = [bottom_of(graph.points[v]) for v in things]
     owner = np.full(len(graph.points), -1, np.int64)
     for row, vertices in enumerate(things):
         owner[vertices] = row
-    up = np.flatnonzero((owner >= 0) & (graph.normals[:, 2] > _UP))
+    up = np.flatnonzero((owner >= 0) & (graph.normals[:, 2] > UP))
     tree = cKDTree(graph.points[up]) if len(up) else None
     out = [-1] * len(things)
     for row in sorted(range(len(things)), key=lambda r: (bottoms[r], -len(things[r]))):
@@ -100,20 +100,34 @@ def _stands_on(carrier: list[int], upper: int, lower: int) -> bool:
     return False
 
 
+def foot_of(points: np.ndarray, bottom: float) -> np.ndarray:
+    """Return up to about 400 points (k, 3) of the lowest band of an object's points (n, 3), at its bottom's height."""
+    foot = points[points[:, 2] < bottom + max(0.02, 0.15 * np.ptp(points[:, 2]))].copy()
+    foot[:, 2] = bottom
+    return foot[:: max(1, len(foot) // 400)]
+
+
+def bottom_of(points: np.ndarray) -> float:
+    """Return the height of an object's foot, without its lowest points (n, 3), which are noise."""
+    return float(np.percentile(points[:, 2], 2))
+
+
+def carrying(points: np.ndarray, bottom: float) -> np.ndarray:
+    """Return which points (n, 3) are at the height, bool (n,), of a support of an object that ends at `bottom`."""
+    height = points[:, 2] - bottom
+    return (height < _RISE_M) & (height > -_DROP_M)
+
+
 def _area_below(
     graph: MeshGraph, vertices: np.ndarray, bottom: float, tree: cKDTree, up: np.ndarray, owner: np.ndarray, count: int,
     reach: float,
 ) -> np.ndarray:  # fmt: skip
     """Return the up-facing area (count,) of each object around and just below the foot, less with distance in plan."""
-    points = graph.points[vertices]
-    foot = points[points[:, 2] < bottom + max(0.02, 0.15 * np.ptp(points[:, 2]))].copy()
-    foot[:, 2] = bottom
-    foot = foot[:: max(1, len(foot) // 400)]
+    foot = foot_of(graph.points[vertices], bottom)
     radius = np.hypot(reach, max(_RISE_M, _DROP_M))
     found = np.unique(np.concatenate([np.asarray(x, np.int64) for x in tree.query_ball_point(foot, radius)]))
     near = up[found.astype(np.int64)]
-    height = graph.points[near, 2] - bottom
-    near = near[(height < _RISE_M) & (height > -_DROP_M)]
+    near = near[carrying(graph.points[near], bottom)]
     gap = cKDTree(foot[:, :2]).query(graph.points[near, :2])[0]
     weight = graph.areas[near] * np.clip(1.0 - gap / reach, 0.0, 1.0)
     return np.bincount(owner[near], weights=weight, minlength=count)

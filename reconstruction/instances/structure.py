@@ -8,12 +8,15 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph, pieces
-from reconstruction.instances.contacts import NEAR_REACH_M, carriers
+from reconstruction.instances.contacts import NEAR_REACH_M, UP, bottom_of, carriers, carrying, foot_of
 from reconstruction.instances.cut import Cut, Shell, Thing
 
 # Narrower strips are rims of the objects beside them, which depth smears over their outlines: half of a superpoint.
 _RIM_M = 0.03
 _FLOOR_M = 0.05  # surface below this height is the floor's: rugs, and its noise
+_AROUND = (
+    0.25  # least share of an object's foot with structure beside it: one side of four, the others at a wall
+)
 
 
 def find_structure(shell: Shell, cut: Cut, least_area_m2: float) -> Thing | None:
@@ -58,5 +61,17 @@ def _stand_on(graph: MeshGraph, things: list[Thing], structure: Thing) -> None:
     """Put the objects without support that stand on the structure on it, in place; none of them hangs on a wall."""
     found = carriers(graph, [*(t.vertices for t in things), structure.vertices], (NEAR_REACH_M,))
     for thing, carrier in zip(things, found):
-        if thing.rests_on is None and carrier == len(things):
+        on_it = thing.rests_on is None and carrier == len(things)
+        if on_it and _beside(graph, thing, structure) >= _AROUND:
             thing.rests_on, thing.attached = structure, False
+
+
+def _beside(graph: MeshGraph, thing: Thing, structure: Thing) -> float:
+    """Return the share of a thing's foot with structure at its height within 5 cm in plan."""
+    points, around = graph.points[thing.vertices], graph.points[structure.vertices]
+    bottom = bottom_of(points)
+    around = around[carrying(around, bottom) & (graph.normals[structure.vertices, 2] > UP)]
+    if not len(around):
+        return 0.0
+    away = cKDTree(around[:, :2]).query(foot_of(points, bottom)[:, :2])[0]
+    return float((away < NEAR_REACH_M).mean())

@@ -57,6 +57,14 @@ def test_surface_of_no_object_is_structure_and_carries_what_stands_on_it():
     assert cups.center[2] - 0.5 * cups.extents_m[2] == pytest.approx(0.9, abs=0.015)
 
 
+def test_a_bed_beside_a_ledge_of_its_height_does_not_stand_on_it():
+    bed = sheet((-0.9, -0.5, 0.36), (1.6, 0, 0), (0, 0.8, 0), WHITE)  # its sides were not measured
+    ledge = sheet((0.72, -0.5, 0.36), (0.12, 0, 0), (0, 0.25, 0), RED)
+    shell, cut = cut_of(ledge, things=(bed,))
+    assert find_structure(shell, cut, 0.02) is not None
+    assert cut.things[0].rests_on is None
+
+
 def test_rims_around_objects_and_crumbs_are_no_structure():
     rim = sheet((0.1, -0.9, 0.4), (0.03, 0, 0), (0, 0.4, 0), (120, 80, 50))  # beside the table's top
     crumb = sheet((0.6, 0.6, 0.5), (0.1, 0, 0), (0, 0.1, 0), RED)
