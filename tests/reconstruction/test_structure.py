@@ -58,9 +58,9 @@ def test_surface_of_no_object_is_structure_and_carries_what_stands_on_it():
 
 
 def test_a_bed_beside_a_ledge_of_its_height_does_not_stand_on_it():
-    bed = sheet((-0.9, -0.5, 0.36), (1.6, 0, 0), (0, 0.8, 0), WHITE)  # its sides were not measured
-    ledge = sheet((0.72, -0.5, 0.36), (0.12, 0, 0), (0, 0.25, 0), RED)
-    shell, cut = cut_of(ledge, things=(bed,))
+    bed = sheet((-0.9, -0.9, 0.36), (1.6, 0, 0), (0, 0.8, 0), WHITE)  # its sides were not measured
+    ledge = sheet((0.72, -0.9, 0.36), (0.12, 0, 0), (0, 0.25, 0), RED)
+    shell, cut = cut_of(ledge, COUNTER, things=(bed,))
     assert find_structure(shell, cut, 0.02) is not None
     assert cut.things[0].rests_on is None
 
