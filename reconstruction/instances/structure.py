@@ -14,9 +14,7 @@ from reconstruction.instances.cut import Cut, Shell, Thing
 # Narrower strips are rims of the objects beside them, which depth smears over their outlines: half of a superpoint.
 _RIM_M = 0.03
 _FLOOR_M = 0.05  # surface below this height is the floor's: rugs, and its noise
-_AROUND = (
-    0.25  # least share of an object's foot with structure beside it: one side of four, the others at a wall
-)
+_AROUND = 0.25  # least share of a foot with structure beside it: one side of four, the others at walls
 
 
 def find_structure(shell: Shell, cut: Cut, least_area_m2: float) -> Thing | None:
