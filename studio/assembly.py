@@ -44,7 +44,7 @@ def assembly_steps(
     poses = poses or {}
     parents = {edge.child: edge for edge in bundle.edges}
     labels = {item.id: item.label for item in (*bundle.base, *bundle.objects)}
-    normals = {base.id: base.plane[:3] for base in bundle.base}
+    normals = {base.id: base.plane[:3] for base in bundle.base if base.plane is not None}
     told = {item["id"]: item.get("assembly", {}) for item in bundle.scene["objects"]}
     steps = []
     for item in bundle.objects:

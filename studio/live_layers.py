@@ -125,6 +125,8 @@ class LiveLayers:
             self._server.scene.remove_by_name(name)
         for base in assets.base:
             self._add_textured(f"/live/things/{base.id}", base.visual, np.eye(4))
+        if assets.structure is not None:
+            self._add_textured(f"/live/things/{assets.structure.id}", assets.structure.visual, np.eye(4))
         for item in assets.objects:
             self._add_textured(f"/live/things/{item.id}", item.visual, item.world_from_object)
         return f"{len(assets.objects)} meshes"

@@ -14,7 +14,10 @@ _ABOVE_M = 0.05  # of the dots above their objects: lines between middles would 
 
 
 class RelationLayer(Layer):
-    """A dot above every object, a line to that of its parent; on the room the line ends where it is nearest."""
+    """A dot above every object, a line to that of its parent; on the room the line ends where it is nearest.
+
+    The structure is no plane: on it the line ends at the foot of the object.
+    """
 
     label = "Relations"
     hint = "What stands on what, and what hangs on what"
@@ -27,11 +30,12 @@ class RelationLayer(Layer):
         starts, ends, colors = [], [], []
         for edge in page.bundle.edges:
             start = tops[edge.child]
-            if edge.parent in planes:
-                normal, offset = planes[edge.parent][:3], planes[edge.parent][3]
-                end = start - (normal @ start + offset) * normal
-            else:
+            if edge.parent not in planes:
                 end = tops[edge.parent]
+            elif (plane := planes[edge.parent]) is not None:
+                end = start - (plane[:3] @ start + plane[3]) * plane[:3]
+            else:
+                end = np.array([*start[:2], self._vertices(edge.child)[:, 2].min()])
             starts.append(start)
             ends.append(end)
             colors.append(_ATTACHED if edge.relation == "attached_to" else _SUPPORT)
@@ -70,8 +74,9 @@ class RelationLayer(Layer):
         )
 
     def _top(self, object_id: int) -> np.ndarray:
-        vertices = transform_points(
-            self.page.pose_of(object_id), self.page.pickable.geometry(object_id).vertices
-        )
+        vertices = self._vertices(object_id)
         middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         return np.array([*middle[:2], vertices[:, 2].max() + _ABOVE_M])
+
+    def _vertices(self, object_id: int) -> np.ndarray:
+        return transform_points(self.page.pose_of(object_id), self.page.pickable.geometry(object_id).vertices)
