@@ -51,4 +51,5 @@ class Cut:
 
     things: list[Thing]
     owner: np.ndarray  # int32 (v,) base entity, 0 = none; vertices of things may have one, too
+    artifact: np.ndarray | None = None  # bool (v,) surface that only wrong depth made, where that is known
     labeled: FrameMasks | None = None  # its 2D masks, with ids of the base, then of `things` in their order

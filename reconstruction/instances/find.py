@@ -66,7 +66,9 @@ def find_instances(
     else:
         cut = cut_by_masks(shell, surface, posed, depth, masks, config, progress)
     progress.advance()
-    structure = find_structure(shell, cut, config.min_structure_area_m2) if config.structure else None
+    structure = None
+    if config.structure:
+        structure = find_structure(shell, cut, np.asarray(surface.weights), config.min_structure_area_m2)
     if structure is not None:
         area_m2 = float(shell.graph.areas[structure.vertices].sum())
         progress.note(f"{area_m2:.1f} m2 of it are kept as structure: static, and carrying")

@@ -56,7 +56,8 @@ def cut_by_masks(
     for thing in things:
         _drop_bleeding(graph, thing, [t for t in things if t.rests_on is thing])
     mark_attached(shell, things)
-    return Cut(things, owner, _labeled(masks.resized(depth.camera.width, depth.camera.height), lifted, names))
+    small = masks.resized(depth.camera.width, depth.camera.height)
+    return Cut(things, owner, labeled=_labeled(small, lifted, names))
 
 
 def _labeled(masks: FrameMasks, lifted: Lifted, names: np.ndarray) -> FrameMasks:

@@ -8,30 +8,38 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from reconstruction.core.mesh_graph import MeshGraph, pieces
+from reconstruction.instances.boxes import upright_box
 from reconstruction.instances.contacts import NEAR_REACH_M, UP, bottom_of, carriers, carrying, foot_of
 from reconstruction.instances.cut import Cut, Shell, Thing
 
 # Narrower strips are rims of the objects beside them, which depth smears over their outlines: half of a superpoint.
 _RIM_M = 0.03
+# Views that support a vertex. Of what is left in 21 generated rooms (numbers 70000 to 70061) this keeps 67 % of the
+# true surface and 40 % of the artifacts, the largest difference.
+_LEAST_VIEWS = 6
 _FLOOR_M = 0.05  # surface below this height is the floor's: rugs, and its noise
 _AROUND = 0.25  # least share of a foot with structure beside it: one side of four, the others at walls
 
 
-def find_structure(shell: Shell, cut: Cut, least_area_m2: float) -> Thing | None:
+def find_structure(shell: Shell, cut: Cut, weights: np.ndarray, least_area_m2: float) -> Thing | None:
     """Return the surface of no object and no base plane as a thing that carries objects; None where there is none.
 
-    A morphological opening by 3 cm removes strips between and around what was found. `rests_on` of the objects that
-    stand on the rest is set to it, in place.
+    Surface in the box of an object, and within 3 cm of it, is the object's. A morphological opening by 3 cm removes
+    strips between what was found. `rests_on` of the objects that stand on the rest is set to it, in place.
 
     Args:
         shell: the surface graph and its base planes.
-        cut: the objects, and the base entity of each vertex.
+        cut: the objects, the base entity of each vertex, and artifacts, which are no structure.
+        weights: float (v,) number of views that support each vertex.
         least_area_m2: connected components with less area are dropped.
     """
     taken = (cut.owner > 0) | (shell.owner > 0) | (shell.graph.points[:, 2] < _FLOOR_M)
     for thing in cut.things:
+        taken |= _in_box_of(shell.graph, thing)
         taken[thing.vertices] = True
-    vertices = _wide_surface(shell.graph, taken, shell.behind, least_area_m2)
+    unfit = shell.behind | (weights < _LEAST_VIEWS)
+    unfit |= False if cut.artifact is None else cut.artifact
+    vertices = _wide_surface(shell.graph, taken, unfit, least_area_m2)
     if not len(vertices):
         return None
     structure = Thing(vertices, is_object=False)
@@ -39,11 +47,17 @@ def find_structure(shell: Shell, cut: Cut, least_area_m2: float) -> Thing | None
     return structure
 
 
-def _wide_surface(
-    graph: MeshGraph, taken: np.ndarray, behind: np.ndarray, least_area_m2: float
-) -> np.ndarray:
-    """Return the vertices (k,) of wide connected surface that is not `taken` (v,) and not `behind` (v,) the base."""
-    free = np.flatnonzero(~taken & ~behind)
+def _in_box_of(graph: MeshGraph, thing: Thing) -> np.ndarray:
+    """Return the vertices, bool (v,), in the upright box of an object: surface of its own that the cut has missed."""
+    box = upright_box(graph.points[thing.vertices], graph.areas[thing.vertices])
+    inside = (np.abs(box.plan_offsets(graph.points)) < 0.5 * box.extents_m[:2]).all(axis=1)
+    above = graph.points[:, 2] - box.center[2] + 0.5 * box.extents_m[2]
+    return inside & (above > _RIM_M) & (above < box.extents_m[2])
+
+
+def _wide_surface(graph: MeshGraph, taken: np.ndarray, unfit: np.ndarray, least_area_m2: float) -> np.ndarray:
+    """Return the vertices (k,) of wide connected surface that is not `taken` (v,), and not `unfit` (v,)."""
+    free = np.flatnonzero(~taken & ~unfit)
     points = graph.points[free]
     core = np.ones(len(free), bool)
     if taken.any() and len(free):

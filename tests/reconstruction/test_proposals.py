@@ -16,7 +16,7 @@ from reconstruction.instances.partition.choice import (
     disjoint_by_gain,
     likeliest_things,
 )
-from reconstruction.instances.partition.cut import labels_of, things_of
+from reconstruction.instances.partition.cut import UNCLAIMED, labels_of, things_of
 from reconstruction.instances.partition.duplicates import DUPLICATE_FEATURES, proposal_pairs
 from reconstruction.instances.partition.graph import LABELS, Scores
 from reconstruction.instances.partition.model import load_models
@@ -268,7 +268,7 @@ def test_features_follow_the_proposals_order(boards):  # noqa: F811
     np.testing.assert_allclose(again, rows[turn], atol=1e-5)
 
 
-def test_things_are_the_chosen_and_what_is_left_of_clusters_is_artifact(boards):  # noqa: F811
+def test_things_are_the_chosen_and_what_is_left_of_clusters_is_unclaimed(boards):  # noqa: F811
     _, graph, label, cluster = boards
     found, pieces, _ = rows_of(boards, np.array([2.0]))
     union = [k for k in range(4) if len(found.members[k].indices) == 2]
@@ -280,4 +280,4 @@ def test_things_are_the_chosen_and_what_is_left_of_clusters_is_artifact(boards):
     assert (own[label[graph.region] == BASE] == BASE).all()
     far = (thing == 0) & (label[graph.region] == THING)
     assert far.any()
-    assert (own[far] == LABELS.index("artifact")).all()
+    assert (own[far] == UNCLAIMED).all()

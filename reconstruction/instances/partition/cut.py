@@ -22,7 +22,9 @@ from reconstruction.instances.partition.proposal_features import proposal_featur
 from reconstruction.instances.partition.proposals import propose
 from reconstruction.instances.sightings import Sighting
 
-_THING, _BASE = LABELS.index("thing"), LABELS.index("base")
+_THING, _BASE, _ARTIFACT = (LABELS.index(name) for name in ("thing", "base", "artifact"))
+UNCLAIMED = len(LABELS)
+"""Row after the rows of LABELS, of surface that is of a thing, but of no object that was chosen."""
 
 
 def cut_by_partition(
@@ -54,16 +56,16 @@ def cut_by_partition(
     progress.note(
         f"One partition of the surface: {len(things)} things; {neither:.0%} of it is neither thing nor base"
     )
-    return Cut(things, _base_owner(shell, label))
+    return Cut(things, _base_owner(shell, label), artifact=label == _ARTIFACT if len(label) else None)
 
 
 def partition_surface(view: View, graph: RegionGraph, models: Models) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row in LABELS and the cluster of each vertex, int32 (v,) each.
+    """Return the row in LABELS, or UNCLAIMED, and the cluster of each vertex, int32 (v,) each.
 
     Superpoints are partitioned into clusters by a multicut. Merge trees of the "thing" clusters, and of parts of the
     base, give proposals, of which boosted trees choose the likeliest. Those are scored as keyframes show them, and the
     disjoint ones with the highest total score, less what pairs of them count twice, are objects. "Thing" clusters in
-    none of them become artifacts, parts of the base stay base.
+    none of them are unclaimed, parts of the base stay base.
     """
     scores = models.superpoints.scores(*features(view, graph), graph.pairs)
     label, cluster = partition_with_labels(graph.pairs, scores.affinity, scores.label)
@@ -97,14 +99,14 @@ def labels_of(thing: np.ndarray, label: np.ndarray, cluster: np.ndarray) -> tupl
         label: int (v,) row in LABELS after the multicut.
         cluster: int (v,) cluster after the multicut.
     """
-    own = np.where(thing > 0, _THING, np.where(label == _BASE, _BASE, LABELS.index("artifact")))
+    own = np.where(thing > 0, _THING, np.where(label == _THING, UNCLAIMED, label))
     number = np.where(thing > 0, int(cluster.max(initial=-1)) + thing, cluster)
     return own.astype(np.int32), _one_label_each(own, number)
 
 
 def _one_label_each(label: np.ndarray, cluster: np.ndarray) -> np.ndarray:
     """Return cluster numbers int32 (v,) from 0, split so that each cluster has one label."""
-    return np.unique(cluster * len(LABELS) + label, return_inverse=True)[1].astype(np.int32)
+    return np.unique(cluster * (UNCLAIMED + 1) + label, return_inverse=True)[1].astype(np.int32)
 
 
 def features(view: View, graph: RegionGraph) -> tuple[np.ndarray, np.ndarray]:
