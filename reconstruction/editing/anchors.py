@@ -11,6 +11,7 @@ from reconstruction.editing.film import Film
 from reconstruction.instances.id_maps import seen_vertices
 from reconstruction.instances.partition.seeded import Affinities
 from registry.errors import UsageError
+from registry.labels import STRUCTURE
 
 NEAR_M = 0.3  # largest distance of `near` to the object's box
 AT_M = 0.05  # largest distance of `at` to the object's surface
@@ -48,6 +49,14 @@ class Footage(Film):
 
 
 @dataclass(frozen=True)
+class Structure:
+    """The structure of a scene, which has no plane and no box."""
+
+    id: int
+    label: str = STRUCTURE
+
+
+@dataclass(frozen=True)
 class Pointer:
     """Resolves addresses in one state of the instances."""
 
@@ -68,14 +77,16 @@ class Pointer:
             raise UsageError(f"overrides: {address} shows {shown}, not a thing{self._beside(address)}")
         return item
 
-    def entity(self, address: Address) -> Instance | BaseEntity:
-        """Return the object or base entity that an address means.
+    def entity(self, address: Address) -> Instance | BaseEntity | Structure:
+        """Return the object or base entity that an address means, or the structure.
 
         Raises:
             UsageError: there is none.
         """
         number = address.id if address.kind == "id" else self._number(address, base_too=True)
         item = self._things.get(number) or self._base.get(number)
+        if number and number == self.found.structure:
+            return Structure(number)
         if item is None:
             raise UsageError(f"overrides: {address} shows {self._name(number)}")
         return item

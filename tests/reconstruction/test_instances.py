@@ -147,7 +147,7 @@ def test_generated_room(small_capture, room):
     assert found.id_maps.shape == small_capture.id_maps.shape
     assert found.id_maps.dtype == np.uint16
     assert found.vertex_instance.shape == (len(surface.vertices),)
-    known = {0, *(b.id for b in found.base), *(o.id for o in found.objects)}
+    known = {0, *found.static_ids, *(o.id for o in found.objects)}
     assert set(np.unique(found.id_maps)) <= known
     assert set(np.unique(found.vertex_instance)) <= known
     assert "floor" in {b.label for b in found.base}

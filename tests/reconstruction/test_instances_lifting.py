@@ -276,11 +276,7 @@ def test_folder_of_id_images(room, tmp_path):
     notes: list[str] = []
     found = find(room, write_masks(room, tmp_path / "masks"), notes)
     assert len(found.objects) == len(THINGS)
-    assert set(np.unique(found.vertex_instance)) <= {
-        0,
-        *(b.id for b in found.base),
-        *(o.id for o in found.objects),
-    }
+    assert set(np.unique(found.vertex_instance)) <= {0, *found.static_ids, *(o.id for o in found.objects)}
     assert any("masks of 8 of 8 frames" in note for note in notes)
     picture = next(o for o in found.objects if o.attached_hint)
     np.testing.assert_allclose(picture.extents_m[1:], [0.5, 0.4], atol=0.05)

@@ -12,11 +12,14 @@ from reconstruction.assembly import AssemblyConfig, assemble
 from reconstruction.assets.collision.plates import PLATE_M, plate_parts
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.core.progress import NO_PROGRESS
-from reconstruction.core.types import AssetSet, StructureAsset
+from reconstruction.core.types import AssetSet, InstanceSet, StructureAsset
+from reconstruction.editing.addresses import parse_address
+from reconstruction.editing.anchors import Pointer
 from reconstruction.instances.cut import Cut, Shell, Thing
 from reconstruction.instances.describe import describe
 from reconstruction.instances.structure import find_structure
 from reconstruction.scene_graph import SceneGraphConfig, infer_scene_graph
+from registry.errors import UsageError
 
 GRAY, RED, WHITE = (200, 200, 190), (160, 20, 20), (240, 240, 235)
 FLOOR = floor_sheet(GRAY)
@@ -180,3 +183,18 @@ def test_plates_give_way_to_what_reaches_into_them_from_the_side(plates):
     kept = np.concatenate([p.vertices for p in scene.structure])
     assert kept[:, 2].max() == pytest.approx(0.9, abs=0.005)
     assert distances(np.array([[0.0, 0.3, 0.15]]), scene.structure)[0] > 0.0
+
+
+def test_a_click_on_the_structure_means_it_and_is_no_thing():
+    shell, cut = cut_of(COUNTER, things=(CUP,))
+    structure = find_structure(shell, cut, seen(shell), 0.02)
+    ids = cut.owner.copy()
+    objects = describe(shell.graph, cut.things, shell.base, ids, structure)
+    number = int(ids[structure.vertices[0]])
+    found = InstanceSet(ids, shell.base, objects, np.zeros((0, 1, 1), np.uint16), number)
+    assert found.last_id == number
+    pointer = Pointer(found, surface_from(merged(FLOOR, COUNTER, CUP)))
+    address = parse_address({"at": [0.4, 0.5, 0.9]}, "parent")
+    assert pointer.entity(address).id == number
+    with pytest.raises(UsageError, match=r"the structure \(\d+\)"):
+        pointer.thing(address)
