@@ -37,6 +37,8 @@ def clear_structure(assets: AssetSet, config: AssemblyConfig) -> AssetSet:
             )  # fmt: skip
             kept += left
         plates = kept
+    # Objects may have the structure as their parent, and a body has a shape: one plate stays.
+    plates = plates or assets.structure.collision[:1]
     return replace(assets, structure=replace(assets.structure, collision=tuple(plates)))
 
 

@@ -5,10 +5,8 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree  # pyright: ignore[rep
 
 from reconstruction.core.mesh_graph import MeshGraph
 
-NEAR_REACH_M, _FAR_REACH_M = (
-    0.05,
-    0.3,
-)  # around the foot, in plan; the second where the first finds no support
+# Distances from the foot in plan, of which the second counts where the first finds no support.
+NEAR_REACH_M, _FAR_REACH_M = 0.05, 0.3
 _RISE_M, _DROP_M = 0.03, 0.06  # the support's surface may lie this far above and below the foot
 UP = 0.5  # least z of the normals of a support surface
 _ON_FLOOR_M = 0.05  # a foot below this height stands on the floor

@@ -78,15 +78,13 @@ def _box_on_support(
     bottom = box.center[2] - 0.5 * box.extents_m[2]
     if thing.rests_on is None:
         return with_bottom(box, 0.0) if base[0].observed and _stands_on_floor(graph, box) else box
-    one = thing.rests_on.is_object
+    one = thing.rests_on.is_object  # which may contain the thing, or be hidden by it
     if one and is_inside(graph, thing.rests_on.vertices, thing.vertices, bottom):
         floor = _bottom_of(graph, thing.rests_on, base) + _CONTAINER_FLOOR_M
         return with_bottom(box, float(np.clip(floor, bottom - box.extents_m[2], bottom)))
     under = thing.rests_on.vertices
     flat = box.extents_m[2] < _FLAT * box.extents_m[:2].min()
-    if (
-        one and flat and _covers(box, graph.points[under], graph.areas[under])
-    ):  # it hides the top that it lies on
+    if one and flat and _covers(box, graph.points[under], graph.areas[under]):
         top = quantiles(graph.points[under, 2], graph.areas[under], (0.95,))[0]
         return with_bottom(box, float(np.clip(top, bottom - _HIDDEN_M, bottom)))
     radius = 0.5 * np.linalg.norm(box.extents_m[:2]) + 0.03

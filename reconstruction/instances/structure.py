@@ -24,8 +24,9 @@ _AROUND = 0.25  # least share of a foot with structure beside it: one side of fo
 def find_structure(shell: Shell, cut: Cut, weights: np.ndarray, least_area_m2: float) -> Thing | None:
     """Return the surface of no object and no base plane as a thing that carries objects; None where there is none.
 
-    Surface in the box of an object, and within 3 cm of it, is the object's. A morphological opening by 3 cm removes
-    strips between what was found. `rests_on` of the objects that stand on the rest is set to it, in place.
+    Surface in the box of an object is the object's, but for its lowest 3 cm, where its support may be. A morphological
+    opening by 3 cm removes strips between what was found. `rests_on` of the objects that stand on the rest is set to
+    it, in place.
 
     Args:
         shell: the surface graph and its base planes.

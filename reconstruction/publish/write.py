@@ -179,7 +179,7 @@ def _every_base(assets: AssetSet, assembled: AssembledScene, folder: Path) -> li
     for item in assets.base:
         plane = {"plane": [float(x) for x in item.plane], "observed": item.observed}
         entries.append(_base(item, item.label, base_slabs(item), folder) | plane)
-    if assets.structure is not None and assembled.structure:
+    if assets.structure is not None:
         entry = _base(assets.structure, STRUCTURE, assembled.structure, folder)
         entries.append(entry | {"observed": True})
     return entries
