@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from surfaces import Patchwork, floor_sheet, merged, sheet, solid_box, surface_from
 
 from reconstruction.assembly import AssemblyConfig, assemble
+from reconstruction.assembly.structure import clear_structure
 from reconstruction.assets.collision.plates import PLATE_M, plate_parts
 from reconstruction.assets.config import AssetsConfig
 from reconstruction.core.progress import NO_PROGRESS
@@ -198,3 +199,21 @@ def test_a_click_on_the_structure_means_it_and_is_no_thing():
     assert pointer.entity(address).id == number
     with pytest.raises(UsageError, match=r"the structure \(\d+\)"):
         pointer.thing(address)
+
+
+@pytest.mark.stage
+@pytest.mark.parametrize("sunk_m", [0.03, 0.08])
+def test_an_object_that_is_sunk_into_a_plate_is_lifted_or_cut_clear(plates, sunk_m):
+    assets = furnished(plates, box(10, (0.12, 0.12, 0.2), (0.1, 0.6, 0.9 - sunk_m)))
+    scene = assemble(assets, infer_scene_graph(assets, SceneGraphConfig()), AssemblyConfig())
+    assert scene.physics_report["spawn_penetration_mm"] <= 1.0
+    assert scene.physics_report["stable_rate"] == 1.0
+    top = scene.placed[0].world_from_object[2, 3] + 0.2
+    assert 1.1 - sunk_m - 0.005 <= top <= 1.1 + 0.005
+
+
+def test_plates_never_vanish_altogether(plates):
+    assets = furnished(plates[:1], box(10, (1.2, 0.3, 1.0), (0.0, 0.3, 0.0)))
+    kept = clear_structure(assets, AssemblyConfig()).structure
+    assert kept is not None
+    assert len(kept.collision) == 1
