@@ -25,8 +25,8 @@ def find_structure(shell: Shell, cut: Cut, weights: np.ndarray, least_area_m2: f
     """Return the surface of no object and no base plane as a thing that carries objects; None where there is none.
 
     Surface in the box of an object is the object's, but for its lowest 3 cm, where its support may be. A morphological
-    opening by 3 cm removes strips between what was found. `rests_on` of the objects that stand on the rest is set to
-    it, in place.
+    opening by 3 cm removes strips between what was found, and free strips narrower than 6 cm are dropped. `rests_on` of
+    the objects that stand on the rest is set to it, in place.
 
     Args:
         shell: the surface graph and its base planes.
@@ -66,8 +66,16 @@ def _wide_surface(graph: MeshGraph, taken: np.ndarray, unfit: np.ndarray, least_
     if not core.any():
         return free[:0]
     wide = free[cKDTree(points[core]).query(points, distance_upper_bound=_RIM_M)[0] <= _RIM_M]
-    large = [part for part in pieces(graph, np.sort(wide)) if graph.areas[part].sum() >= least_area_m2]
-    return np.sort(np.concatenate(large)) if large else free[:0]
+    parts = [part for part in pieces(graph, np.sort(wide)) if graph.areas[part].sum() >= least_area_m2]
+    parts = [part for part in parts if _width_m(graph.points[part]) > 2 * _RIM_M]
+    return np.sort(np.concatenate(parts)) if parts else free[:0]
+
+
+def _width_m(points: np.ndarray) -> float:
+    """Return the second largest extent of points (n, 3) along their principal axes: that of a strip is its width."""
+    offset = points - points.mean(axis=0)
+    axes = np.linalg.eigh(offset.T @ offset)[1]
+    return float(np.sort(np.ptp(offset @ axes, axis=0))[1])
 
 
 def _stand_on(graph: MeshGraph, things: list[Thing], structure: Thing) -> None:
