@@ -14,6 +14,9 @@ from reconstruction.instances.cut import Cut, Shell, Thing
 
 # Narrower strips are rims of the objects beside them, which depth smears over their outlines: half of a superpoint.
 _RIM_M = 0.03
+_STRIP_M = (
+    0.1  # free strips up to this wide are smears along edges; 1 to 3 % of the structure of two real rooms
+)
 # Views that support a vertex. Of what is left in 21 generated rooms (numbers 70000 to 70061) this keeps 67 % of the
 # true surface and 40 % of the artifacts, the largest difference.
 _LEAST_VIEWS = 6
@@ -25,8 +28,8 @@ def find_structure(shell: Shell, cut: Cut, weights: np.ndarray, least_area_m2: f
     """Return the surface of no object and no base plane as a thing that carries objects; None where there is none.
 
     Surface in the box of an object is the object's, but for its lowest 3 cm, where its support may be. A morphological
-    opening by 3 cm removes strips between what was found, and free strips narrower than 6 cm are dropped. `rests_on` of
-    the objects that stand on the rest is set to it, in place.
+    opening by 3 cm removes strips between what was found, and free strips narrower than 10 cm are dropped. Of the
+    objects that stand on the rest, `rests_on` is set to it, in place.
 
     Args:
         shell: the surface graph and its base planes.
@@ -67,7 +70,7 @@ def _wide_surface(graph: MeshGraph, taken: np.ndarray, unfit: np.ndarray, least_
         return free[:0]
     wide = free[cKDTree(points[core]).query(points, distance_upper_bound=_RIM_M)[0] <= _RIM_M]
     parts = [part for part in pieces(graph, np.sort(wide)) if graph.areas[part].sum() >= least_area_m2]
-    parts = [part for part in parts if _width_m(graph.points[part]) > 2 * _RIM_M]
+    parts = [part for part in parts if _width_m(graph.points[part]) > _STRIP_M]
     return np.sort(np.concatenate(parts)) if parts else free[:0]
 
 

@@ -76,7 +76,7 @@ def test_a_bed_beside_a_ledge_of_its_height_does_not_stand_on_it():
 
 def test_rims_around_objects_and_crumbs_are_no_structure():
     rim = sheet((0.1, -0.9, 0.4), (0.03, 0, 0), (0, 0.4, 0), (120, 80, 50))  # beside the table's top
-    crumb = sheet((0.6, 0.6, 0.5), (0.1, 0, 0), (0, 0.1, 0), RED)
+    crumb = sheet((0.6, 0.6, 0.5), (0.12, 0, 0), (0, 0.12, 0), RED)
     strip = sheet((0.6, -0.9, 0.4), (0.05, 0, 0), (0, 0.6, 0), RED)
     shell, cut = cut_of(rim, crumb, strip, things=(TABLE,))
     assert find_structure(shell, cut, seen(shell), 0.02) is None
