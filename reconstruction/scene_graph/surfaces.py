@@ -74,6 +74,10 @@ def sample_surface(
     return points, cross[face] / double_area[face, None], float(np.sqrt(total / count))
 
 
+def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(np.percentile(points, [_BOTTOM_PERCENTILE, 100 - _BOTTOM_PERCENTILE], axis=0))
+
+
 def sample_object(asset: ObjectAsset, world_from_object: np.ndarray | None = None) -> SampledObject:
     """Sample an object at its reconstructed pose, or at `world_from_object`."""
     m = asset.world_from_object if world_from_object is None else world_from_object
@@ -82,8 +86,7 @@ def sample_object(asset: ObjectAsset, world_from_object: np.ndarray | None = Non
     points, normals = points @ m[:3, :3].T + m[:3, 3], normals @ m[:3, :3].T
     if len(points) == 0:
         raise ValueError(f"scene graph: object {asset.id} ({asset.label}) has a mesh without area")
-    low = np.percentile(points, _BOTTOM_PERCENTILE, axis=0)
-    high = np.percentile(points, 100 - _BOTTOM_PERCENTILE, axis=0)
+    low, high = _box(points)
     cell = float(np.clip((high - low)[:2].max() / 24, 0.006, 0.03))
     index = np.floor((points[:, :2] - low[:2]) / cell).astype(np.int64)
     _, where = np.unique(index[:, 0] * 100_003 + index[:, 1], return_inverse=True)
@@ -114,8 +117,7 @@ def sample_structure(asset: StructureAsset) -> SampledObject:
     """Sample the structure, an open surface, as an object without underside: it carries, and stands on nothing."""
     mesh = asset.visual
     points, normals, spacing = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), closed=False)
-    low = np.percentile(points, _BOTTOM_PERCENTILE, axis=0)
-    high = np.percentile(points, 100 - _BOTTOM_PERCENTILE, axis=0)
+    low, high = _box(points)
     return SampledObject(
         id=asset.id,
         name=f"{STRUCTURE} {asset.id}",

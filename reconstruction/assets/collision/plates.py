@@ -7,8 +7,6 @@ hull is hardly larger than theirs together (hierarchical approximate convex deco
 import heapq
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from reconstruction.assets.collision.build import hull_part
@@ -21,10 +19,8 @@ PLATE_M = 0.015
 _SMOOTHING = 10  # rounds of Taubin's smoothing: noise of a few millimetres turns normals
 _CELL_M = 0.12  # side of the cells of a patch, two superpoints
 _LEAST_AREA_M2 = 1e-3  # smaller patches are noise, or the border of a cell
-_EMPTY_SHARE, _EMPTY_M3 = (
-    0.5,
-    1e-3,
-)  # most empty space in a merged hull: share of its patches, and that of 25x25 cm
+# Most empty space in a merged hull: share of its patches, and the volume of a plate of 25x25 cm.
+_EMPTY_SHARE, _EMPTY_M3 = 0.5, 1e-3
 
 
 def plate_parts(vertices: np.ndarray, faces: np.ndarray, config: AssetsConfig) -> tuple[ConvexPart, ...]:
@@ -52,7 +48,6 @@ class _Patches:
         label, links = _split(corners.mean(axis=1), cross, faces)
         self.hulls: dict[int, np.ndarray] = {}
         self.volumes: dict[int, float] = {}
-        self.near: dict[int, set[int]] = {}
         order = np.argsort(label, kind="stable")
         for own in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
             normal = cross[own].sum(axis=0)
@@ -64,8 +59,8 @@ class _Patches:
             if hull is not None:
                 key = int(label[own[0]])
                 self.hulls[key], self.volumes[key] = hull
-        self.solid = dict(self.volumes)
-        self.near = {key: set() for key in self.hulls}
+        self.solid = dict(self.volumes)  # of the patches that a hull is made of
+        self.near: dict[int, set[int]] = {key: set() for key in self.hulls}
         for a, b in links.tolist():
             if a in self.near and b in self.near:
                 self.near[a].add(b)
@@ -109,12 +104,15 @@ def _split(centers: np.ndarray, cross: np.ndarray, faces: np.ndarray) -> tuple[n
 
     Small patches, at the border of a cell, join the largest that they touch of the same direction.
     """
+    from trimesh.graph import connected_component_labels, face_adjacency
+
     axis = np.abs(cross).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(cross, axis[:, None], axis=1)[:, 0] > 0)
     key = np.column_stack([np.floor(centers / _CELL_M).astype(np.int64), side])
     key = np.unique(key, axis=0, return_inverse=True)[1].ravel()
-    first, second = _adjacent(faces)
-    label = _components(len(faces), first, second, key[first] == key[second])
+    touching = np.asarray(face_adjacency(faces))
+    first, second = touching.T
+    label = connected_component_labels(touching[key[first] == key[second]], len(faces))
     area = np.bincount(label, weights=0.5 * np.linalg.norm(cross, axis=1))
     own = np.concatenate([first, second])
     other = np.concatenate([second, first])
@@ -122,27 +120,10 @@ def _split(centers: np.ndarray, cross: np.ndarray, faces: np.ndarray) -> tuple[n
     small, large = label[own[joins]], label[other[joins]]
     order = np.lexsort((large, -area[large], small))
     small, chosen = np.unique(small[order], return_index=True)
-    label = _components(len(area), small, large[order][chosen])[label]
-    links = np.sort(np.column_stack([label[first], label[second]]), axis=1)
+    joined = np.column_stack([small, large[order][chosen]])
+    label = connected_component_labels(joined, len(area))[label]
+    links = np.sort(label[touching], axis=1)
     return label, np.unique(links[links[:, 0] != links[:, 1]], axis=0)
-
-
-def _adjacent(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows (k,) and (k,) of faces that share an edge."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    owner = np.tile(np.arange(len(faces)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-    return owner[order][:-1][same], owner[order][1:][same]
-
-
-def _components(
-    count: int, first: np.ndarray, second: np.ndarray, linked: np.ndarray | slice = slice(None)
-) -> np.ndarray:
-    """Return the connected component (count,) of each node of a graph."""
-    rows, columns = first[linked], second[linked]
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
 
 
 def _hull(points: np.ndarray) -> tuple[np.ndarray, float] | None:
